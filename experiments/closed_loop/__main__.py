@@ -205,14 +205,18 @@ def draw(
     for domain in (each.name for each in DOMAINS):
         for file, caption, drawing in (
             ("errors", "Position RMSE of all seeds", partial(figures.errors, rows, domain)),
-            ("gap", "Share of the gap to the true vehicle", partial(figures.shares, rows, domain)),
+            (
+                "gap",
+                "Position RMSE before and after adaptation",
+                partial(figures.shares, rows, domain),
+            ),
             ("paths", "Flights of seed 0", partial(flown_paths, flown, domain, followed)),
             ("ablation", "Ablation of the invariant residual", partial(figures.errors, ablated, domain, True)),
         ):
             if file != "ablation" or len(ablated):
                 wanted[f"{file}_{domain}"] = f"{caption}, {label(domain)}", drawing
     costs = partial(figures.open_loop_costs, rows, (nominal, *sources, *adapted, ORACLE))
-    wanted["open_loop_costs"] = "Predicted and actual open-loop cost of plans", costs
+    wanted["open_loop_costs"] = "Actual over predicted open-loop cost of plans", costs
     wanted["away"] = "The same flights away from home", partial(figures.away_from_home, rows)
     wanted["strip"] = "Hover in the wind; the red mark is the reference", partial(rendered, flown, few)
     made, missing = {}, []

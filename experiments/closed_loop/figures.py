@@ -1,4 +1,4 @@
-"""Figures of closed-loop flight: errors, shares of the gap, open-loop costs, and flights away from home.
+"""Figures of closed-loop flight: errors, before and after adaptation, open-loop costs, flights away from home.
 
 Each raises ValueError if the rows hold nothing to draw.
 """
@@ -15,12 +15,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.closed_loop.claims import COST_TOLERANCE
-from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, Agent, away, by_agent, gaps
+from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, SOURCES, Agent, away, by_agent, gaps
 from experiments.flying.scenario import REFERENCES
 from experiments.reporting import plots
 from experiments.reporting.plots import COLOURS, STYLE, Line, legend_below, name_lines, note, subplots
 from experiments.reporting.results import Results
-from experiments.reporting.statistics import Interval
 
 COLOURS_OF = {
     "nominal": "0.45",
@@ -32,8 +31,6 @@ COLOURS_OF = {
     "oracle": "black",
 }
 PALE = {"hybrid": "#7FC4EA", "invariant": "#E9C6D9"}  # source models beside adapted ones
-MARKERS = dict(zip(REFERENCES, "os^Dv*", strict=True))
-SHARES = (-25.0, 125.0)  # %: shares outside are marked at the edge
 SMALLEST_ERROR = 0.01  # cm: smaller errors are drawn here; with the true model a hovering vehicle does not move
 SMALLEST_COST = 1e-3
 XLABEL = "position RMSE [cm]  (log scale)"
@@ -129,44 +126,45 @@ def away_from_home(rows: Results) -> Figure:
 
 @mpl.rc_context(STYLE)
 def shares(rows: Results, domain: str) -> Figure:
-    """The share of the gap to the true vehicle that each way to adapt closes, a panel per reference."""
+    """Position error before and after each way to adapt, and of the true vehicle [cm], a panel per reference."""
     found = gaps(rows, domain)
     names = [name for name in REFERENCES if any(name in line for line in found.values())]
     if not names:
         raise ValueError(f"rows must hold a source model and the true vehicle in {domain}")
-    figure, panels = _grid(len(names), [agent.name for agent in found], width=1.8)
+    figure, panels = _grid(len(names), [agent.name for agent in found])
+    at_home = rows.where(domain=domain, distance=0.0)
     for axes, name in zip(panels, names, strict=False):
-        axes.set(xlim=SHARES, xticks=[0, 50, 100], xlabel="share of the gap closed [%]")
-        axes.set_title(REFERENCES[name], pad=16)
+        flown = by_agent(at_home.where(reference=name))
+        errors = {agent: 100 * group.spread(ERROR).mean for agent, group in flown.items()}
+        axes.axvline(errors[ORACLE], color="0.4", linestyle=":", label="true vehicle in the mean wind")
+        for y, agent in enumerate(found):
+            before, after = errors[Agent(SOURCES[agent.model])], errors.get(agent, math.inf)
+            axes.plot([before, after], [y, y], color=COLOURS_OF[agent.model], linewidth=1)
+            axes.plot(before, y, "o", color=COLOURS_OF[agent.model], markerfacecolor="white", label="not adapted")
+            axes.plot(after, y, "o", color=COLOURS_OF[agent.model], label="adapted")
+        axes.set(title=REFERENCES[name], xlabel="position RMSE [cm]", xlim=(0, None))
         name_lines(axes, [agent.name for agent in found])
-        for x, words in ((0.0, "source"), (100.0, "true vehicle")):
-            axes.axvline(x, color="0.4", linestyle=":", linewidth=1)
-            axes.text(x, -0.66, words, fontsize=7, color="0.4", ha="center", va="bottom")
-        for y, (agent, line) in enumerate(found.items()):
-            _draw_share(axes, y, line.get(name, Interval()), COLOURS_OF[agent.model])
-    what = "share of the gap from source to true vehicle (bar: 95 %; hollow: gap not significant)"
-    figure.suptitle(f"{DOMAINS[domain].capitalize()}: {what}")
-    return figure
+    known = {label: Line2D([], [], color="0.3", marker="o", linestyle="") for label in ("not adapted", "adapted")}
+    known["not adapted"].set_markerfacecolor("white")
+    return legend_below(
+        figure, f"{DOMAINS[domain].capitalize()}: how closely it flies (lower is better)", entries=known
+    )
 
 
 @mpl.rc_context(STYLE)
 def open_loop_costs(rows: Results, agents: Sequence[Agent]) -> Figure:
-    """Actual against predicted cost of plans, mean over seeds: a panel per domain, a marker per reference."""
+    """Actual over predicted cost of plans: a panel per domain, a line per model, a dot per reference (mean)."""
     found = {domain: rows.where(domain=domain, distance=0.0) for domain in DOMAINS if domain in rows["domain"]}
     if not any(agent in by_agent(group) for group in found.values() for agent in agents):
         raise ValueError("rows must hold one of the agents: there is nothing to draw")
-    figure, (panels,) = subplots((2.5 * len(found) + 1.9, 3.2), 1, len(found), sharex=True, sharey=True)
+    size = plots.PAGE, 1.3 + 0.22 * len(agents)
+    figure, (panels,) = subplots(size, 1, len(found), sharex=True, sharey=True)
     for axes, (domain, group) in zip(panels, found.items(), strict=True):
+        axes.axvspan(1 - COST_TOLERANCE, 1 + COST_TOLERANCE, color="0.85", label="within 10 %")
         _draw_costs(axes, group, agents)
-        axes.set(title=DOMAINS[domain].capitalize(), xlabel="predicted cost of a plan", ylabel="actual cost, open loop")
-    entries = [(agent.name, _shade(agent), "o") for agent in agents]
-    flown = {name for group in found.values() for name in group["reference"]}
-    entries += [(REFERENCES[name], "0.5", MARKERS[name]) for name in REFERENCES if name in flown]
-    handles = [Line2D([], [], color=c, marker=m, linestyle="", label=label) for label, c, m in entries]
-    figure.legend(handles=handles, loc="outside right center")
-    title = "Predicted and actual cost of plans, open loop for 1 s (grey: within 10 %; below 0.001 drawn there)"
-    figure.suptitle(title)
-    return figure
+        axes.set(title=DOMAINS[domain].capitalize(), xlabel="actual / predicted cost", xscale="log")
+        name_lines(axes, [agent.name for agent in agents])
+    return legend_below(figure, "Do plans cost what they predict? (a dot is a reference; 1 is best)")
 
 
 def floor_note(smallest: float, floor: float, before: str, after: str = "") -> str:
@@ -209,34 +207,13 @@ def _draw_away(axes: Axes, home: Mapping[Agent, Results], there: Mapping[Agent, 
     return min(values)
 
 
-def _draw_share(axes: Axes, y: int, share: Interval, colour: str) -> None:
-    value, low, high = (100 * number for number in share)
-    if math.isnan(value):
-        axes.text(50.0, y, "no gap", fontsize=8, color="0.4", ha="center", va="center")
-        return
-    if not math.isnan(low):
-        axes.plot(np.clip([low, high], *SHARES), [y, y], color=colour, linewidth=2)
-    x = float(np.clip(value, *SHARES))
-    marker = "o" if x == value else "<" if value < x else ">"
-    filled = "white" if math.isnan(low) else colour
-    axes.plot(x, y, marker, color=colour, markersize=5, clip_on=False, markerfacecolor=filled)
-    if x != value:
-        offset, side = ((6, 3), "left") if value < x else ((-6, 3), "right")
-        note(axes, f"{value:.0f}", (x, y), offset, va="bottom", ha=side)
-
-
 def _draw_costs(axes: Axes, rows: Results, agents: Sequence[Agent]) -> None:
-    axes.set(xscale="log", yscale="log")
-    drawn = []
-    for reference, group in rows.group("reference").items():
+    for group in rows.group("reference").values():
         flown = by_agent(group.where(lambda row: bool(row["promised"] and row["realised"]), crashed=False))
-        for agent in filter(flown.__contains__, agents):
-            means = [max(flown[agent].spread(column).mean, SMALLEST_COST) for column in ("promised", "realised")]
-            axes.plot(*means, MARKERS[reference], color=_shade(agent), markersize=6, alpha=0.8)
-            drawn += means
-    ends = np.array([min(drawn, default=SMALLEST_COST) / 2, max(drawn, default=SMALLEST_COST) * 2])
-    axes.fill_between(ends, (1 - COST_TOLERANCE) * ends, (1 + COST_TOLERANCE) * ends, color="0.85", zorder=0)
-    axes.plot(ends, ends, color="0.6", linewidth=1, zorder=0)
+        for y, agent in enumerate(agents):
+            if agent in flown:
+                costs = [max(flown[agent].spread(column).mean, SMALLEST_COST) for column in ("promised", "realised")]
+                axes.plot(costs[1] / costs[0], y, "o", color=_shade(agent), markersize=5, alpha=0.8)
 
 
 def _shade(agent: Agent) -> str:

@@ -143,7 +143,7 @@ def described(design: Excitation) -> dict[str, Any]:
 def interval_figure(rows: Results) -> Figure:
     """A panel per parameter, a line per flight; what is wider than `WIDEST` is a triangle there."""
     names = rows.unique("parameter")
-    figure, panels = subplots((PAGE, 2.1), 1, len(names), sharex=True, sharey=True)
+    figure, panels = subplots((PAGE, 2.4), 1, len(names), sharex=True, sharey=True)
     for axes, name in zip(panels[0], names, strict=True):
         for y, flight in enumerate(FLIGHTS):
             found = rows.where(parameter=name, flight=flight).numbers("half_width")
@@ -156,6 +156,7 @@ def interval_figure(rows: Results) -> Figure:
         axes.set(title=name, xscale="log", xlabel="half-width [%], log scale")
     name_lines(panels[0][0], FLIGHTS)
     tick_errors(panels[0][0].xaxis, *panels[0][0].get_xlim())
+    figure.suptitle(f"How wide is the 95 % interval? (dot: a seed, bar: mean, ▷: beyond {WIDEST:g} %; lower is better)")
     return figure
 
 

@@ -18,7 +18,6 @@ from experiments.paper.lanes import MODELS, THETA, Cell, adapted_sizes, by_domai
 from experiments.paper.tables import UNITS, value_label
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.plots import (
-    COLUMN,
     DRAWABLE,
     PAGE,
     STYLE,
@@ -37,8 +36,8 @@ MARKERS = {FINE_TUNED: "o", TARGET_ONLY: "s", SOURCE_ONLY: ""}
 LOWEST_RHO = -1.0
 DECADES = 6  # of error, from the smallest mean up
 LARGEST_BIAS = 100.0  # % of a parameter
-HOME, FLOOR = "on source flights", "floor"  # errors of the source there, and of every model
-MEANING, SOME_FAILED = "mean ± std over seeds", "hollow: of the finite ones"
+HOME, FLOOR = "hybrid before the change", "no model can do better"  # errors on source flights, and of every model
+MEANING, SOME_FAILED = "mean and std over seeds", "hollow: some seeds failed"
 
 
 class _Curve(NamedTuple):
@@ -59,15 +58,16 @@ _Curves = dict[tuple[str, str], _Curve]  # by model and mode
 @mpl.rc_context(STYLE)
 def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     """Figs. 3 and 5: test error, above a floor that no model can get below, and ρ against N; mean ± std over seeds."""
-    figure, ((upper,), (lower,)) = subplots((COLUMN, 5.4), 2, 1, sharex=True, height_ratios=(1.25, 1))
+    figure, ((upper, lower),) = subplots((PAGE, 3.9), 1, 2)
     curves = _curves(rows, "test_mse")
     _draw_errors(upper, curves, floor)
     _draw_home(upper, rows.where(lambda row: "source_mse" in row))
     gains = _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain)
     _draw_gains(lower, gains)
     sizes = adapted_sizes(rows)
-    lower.set_xlabel("N, target trajectories trained on")
-    lower.set_xticks(sizes, [str(n) for n in sizes])
+    for axes in (upper, lower):
+        axes.set_xlabel("N, target trajectories trained on")
+        axes.set_xticks(sizes, [str(n) for n in sizes])
     return _legend(figure, title, [curves, gains])
 
 
@@ -86,7 +86,7 @@ def _legend(figure: Figure, title: str, drawn: Sequence[_Curves]) -> Figure:
     hollow = any(((curve.failed > 0) & (curve.failed < curve.seeds)).any() for curve in marked)
     meaning = f"{MEANING}; {SOME_FAILED}" if hollow else MEANING
     figure.suptitle(title)
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=2, title=meaning)
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=4, title=meaning)
     return figure
 
 
@@ -170,7 +170,7 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
     means = means[means > 1 / DRAWABLE]
     lowest = min(means, default=1.0)
     limits = lowest / 2, min(2 * max(means, default=1.0), lowest * 10.0**DECADES)
-    axes.set(yscale="log", ylabel="test error $L^T_{MSE}$ (log scale)")
+    axes.set(yscale="log", ylabel="mean squared error over 1 s (log; lower is better)")
     # One std may reach below 0, which a log axis has not; the whisker then ends at the best seed.
     curves = {key: c._replace(low=np.where(c.low > 0, c.low, c.smallest)) for key, c in curves.items()}
     trained = {key: curve for key, curve in curves.items() if key[1] != SOURCE_ONLY}
@@ -197,7 +197,7 @@ def _draw_gains(axes: Axes, curves: _Curves) -> None:
     lows = np.concatenate([curve.low for curve in curves.values()] or [np.zeros(1)])
     lowest = max(LOWEST_RHO, min(lows[np.isfinite(lows)], default=0.0))
     axes.axhline(0.0, color="0.4", linestyle=":")
-    axes.set(ylabel="gain ρ (0: none, 1: perfect)")
+    axes.set(ylabel="gain ρ (1 is perfect, ▽: off the scale)")
     _draw_curves(axes, curves, min(lowest, 0.0) - 0.1, 1.08, lost_at_top=False)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from experiments.reporting.names import HYBRID, label
 from experiments.reporting.plots import COLOURS, DRAWABLE, PAGE, STYLE, colour, legend_below
@@ -18,7 +17,6 @@ MIN_HALF_WIDTH = 0.2  # m, of a view: a hovering vehicle is not magnified beyond
 VIEW_RATIO = 1.3  # width of a view over the extent of the truth
 SMALLEST = 1e-6  # m, of an error on a log axis
 DECADES = 4  # of errors that are shown
-DASH = 1.2  # line widths
 MOST = 100.0  # m: no error beyond it is shown
 
 States = Float[np.ndarray, "t+1 13"]
@@ -29,30 +27,29 @@ Flights = Float[np.ndarray, "n t+1 13"]
 def predictions(
     predicted: Mapping[int, Mapping[str, Flights]], truth: Flights, shown: int, dt: float, title: str
 ) -> Figure:
-    """Figs. 2 and 4: how the position error of many flights grows, by N and model, and one flight in space.
+    """Figs. 2 and 4: one flight from above, and how the position error of many flights grows, by N and model.
 
     Args:
         predicted: N → model → predicted states (flights, t + 1, 13).
         truth: the states of the same flights.
-        shown: index of the flight that is drawn in space, as predicted with the smallest N.
+        shown: index of the flight that is drawn from above.
     """
     sizes = sorted(predicted)
-    figure = Figure(figsize=(PAGE, 6.2), layout="constrained")
-    grid = figure.add_gridspec(2, len(sizes), height_ratios=(1, 1.7))
+    figure = Figure(figsize=(PAGE, 5.0), layout="constrained")
+    grid = figure.add_gridspec(2, len(sizes), height_ratios=(1.3, 1))
     first = None
     for column, n in enumerate(sizes):
-        first = axes = figure.add_subplot(grid[0, column], sharey=first)
+        above = figure.add_subplot(grid[0, column])
+        _draw_from_above(above, truth[shown], {name: states[shown] for name, states in predicted[n].items()})
+        above.set(title=f"N = {n}", xlabel="x [m]", ylabel="" if column else "one flight from above\ny [m]")
+        first = axes = figure.add_subplot(grid[1, column], sharey=first)
         _draw_growth(axes, predicted[n], truth, dt)
-        axes.set(title=f"N = {n}", xlabel="time [s]", yscale="log")
+        axes.set(xlabel="time [s]", yscale="log", ylabel="" if column else "position error [m]")
         axes.tick_params(labelleft=column == 0)
     assert first is not None
-    figure.axes[0].set_ylabel("position error [m]")
     top = min(first.get_ylim()[1], MOST)
     first.set_ylim(top / 10.0**DECADES, top)
-    space = figure.add_subplot(grid[1, :], projection="3d")
-    models = {name: states[shown] for name, states in predicted[sizes[0]].items()}
-    _draw_predicted_paths(space, truth[shown], models, f"one of these flights, N = {sizes[0]}")
-    meaning = "line: median flight; band: 10 to 90 % of flights; in space ●: end, ×: where a prediction leaves the box"
+    meaning = "from above ●: end, ×: where a prediction leaves the view; errors: median and 10 to 90 % of flights"
     return legend_below(figure, title, meaning, columns=4)
 
 
@@ -95,27 +92,20 @@ def _draw_growth(axes: Axes, models: Mapping[str, Flights], truth: Flights, dt: 
         axes.fill_between(time, low, high, color=colour(name), alpha=0.15, linewidth=0)
 
 
-def _draw_predicted_paths(axes: Any, truth: States, models: Mapping[str, States], title: str) -> None:
-    """Paths in space, in a box around the truth with one scale; a prediction ends with × where it leaves the box."""
-    path, count = truth[:, POSITION], len(models)
-    centre, half = (path.min(axis=0) + path.max(axis=0)) / 2, VIEW_RATIO * np.ptp(path, axis=0) / 2
-    half = np.maximum(half, max(MIN_HALF_WIDTH, half.max() / 2))
-    axes.plot(*path.T, color="0.8", linewidth=7, label="truth", solid_capstyle="round")  # wide, so that none hides it
+def _draw_from_above(axes: Axes, truth: States, models: Mapping[str, States]) -> None:
+    """Paths in x and y, in a square around the truth; a prediction ends with × where it leaves it."""
+    path = truth[:, POSITION][:, :2]
+    centre, extent = (path.min(axis=0) + path.max(axis=0)) / 2, np.ptp(path, axis=0).max()
+    half = max(MIN_HALF_WIDTH, VIEW_RATIO * extent / 2)
+    axes.plot(*path.T, color="0.8", linewidth=6, label="truth", solid_capstyle="round")  # wide, so that none hides it
     axes.plot(*path[:1].T, "o", color="black", markerfacecolor="white", label="start")
-    for i, (name, states) in enumerate(models.items()):
-        inside = np.all(np.abs(states[:, POSITION] - centre) <= half, axis=1)
+    for name, states in models.items():
+        drawn = states[:, POSITION][:, :2]
+        inside = np.all(np.abs(drawn - centre) <= half, axis=1)
         end = len(inside) if inside.all() else int(np.argmin(inside))
-        drawn = states[:end, POSITION].T
-        # Dashes of different places, so that of paths that agree each is seen.
-        dashes: Any = (DASH * i, (DASH, DASH * (count - 1))) if count > 1 else "-"
-        axes.plot(*drawn, color=colour(name), linewidth=2, linestyle=dashes)
-        axes.plot(*drawn[:, -1:], "o" if end == len(inside) else "x", color=colour(name), markersize=6)
-    low, high = centre - half, centre + half
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    for axis, share in zip((axes.xaxis, axes.yaxis, axes.zaxis), half / half.max(), strict=True):
-        axis.set_major_locator(MaxNLocator(max(2, round(4 * share))))  # labels of a short axis would lie on each other
-    axes.set_box_aspect(half, zoom=0.76)  # room for the labels
+        axes.plot(*drawn[:end].T, color=colour(name), linewidth=1.5)
+        axes.plot(*drawn[max(end - 1, 0)], "o" if end == len(inside) else "x", color=colour(name), markersize=5)
+    axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half), aspect="equal")
 
 
 def _draw_space(axes: Any, states: States) -> None:

@@ -146,7 +146,7 @@ def draw(
     title = label(domain.name).capitalize()
     flight = random_flights(domain, 1, FLIGHT_SECONDS, jax.random.key(config.data_seed))
     example = example_flight(np.asarray(flight.states[0]), np.asarray(flight.inputs[0]), DT)
-    lines = "On source flights: the source's error before the change. Floor: error that no model here can see"
+    lines = "Dash-dotted: the error before the change, and the error that no model here can avoid"
     figures = {
         "scores": (scores(found.rows, title, floor), f"Test error and gain against N (paper, Figs. 3, 5). {lines}"),
         "example_flight": (example, "A flight like those of the data (paper, Fig. 7)"),
@@ -159,7 +159,7 @@ def draw(
 
 
 def paths(title: str, found: Study) -> Figure:
-    """Test flights as every fine-tuned model of the first seed predicts them; in space that of the first's median."""
+    """Test flights as every fine-tuned model of the first seed predicts them; from above that of the first's median."""
     tuned = [lanes for lanes in found.lanes if lanes.mode == FINE_TUNED and lanes.model != PHYSICS_ONLY]
     test = found.target.splits["test"][:DRAWN_FLIGHTS]
     sizes = {row["n_train"] for row in tuned[0].rows}

@@ -74,7 +74,7 @@ def spectra(shown: Shown) -> Figure:
 
 @mpl.rc_context(STYLE)
 def scores(rows: Results) -> Figure:
-    """Mean error of each way of learning, a panel for each change; bars reach from the smallest to the largest seed."""
+    """Median error of each way of learning, a panel for each change; a dot is a seed."""
     groups = rows.group("shift")
     figure, axes = subplots((PAGE, 3.2), 1, len(groups), sharey=True)
     for panel, (shift, own) in zip(axes[0], groups.items(), strict=True):
@@ -83,22 +83,21 @@ def scores(rows: Results) -> Figure:
             mine = own.where(model=model, mode=mode)
             tint = TINTS.get(mode, colour(model)) if model == HYBRID else colour(model)
             if mode == SOURCE_ONLY:
-                panel.axhline(mine.spread("mse").mean, color=tint, linestyle=":", label=_way(model, mode))
+                panel.axhline(mine.spread("mse").median, color=tint, linestyle=":", label=_way(model, mode))
                 continue
             if not len(mine):
                 continue
             values = [mine.where(n=n).numbers("mse") for n in sizes]
-            means = [value.mean() for value in values]
-            reach = np.array([[m - v.min(), v.max() - m] for m, v in zip(means, values, strict=True)]).T
-            panel.errorbar(
-                sizes, means, reach, fmt=STYLES[mode], color=tint, capsize=2, markersize=4, label=_way(model, mode)
-            )
+            medians = [float(np.median(value)) for value in values]
+            panel.plot(sizes, medians, STYLES[mode], color=tint, markersize=4, label=_way(model, mode))
+            for n, value in zip(sizes, values, strict=True):
+                panel.plot([n] * len(value), value, ".", color=tint, alpha=0.35, markersize=3)
         panel.set(xscale="log", yscale="log", title=SHIFT_WORDS[shift], xlabel="target trajectories N")
         panel.set_xticks(sizes, [str(n) for n in sizes])
         panel.minorticks_off()
     axes[0, 0].set_ylabel("mean squared error")
     tick_errors(axes[0, 0].yaxis, *axes[0, 0].get_ylim())
-    return legend_below(figure, meaning="mean over seeds; bars: smallest and largest", columns=3)
+    return legend_below(figure, meaning="line: median over seeds; dot: a seed; lower is better", columns=3)
 
 
 def _forecast(shown: Shown, name: str) -> np.ndarray:

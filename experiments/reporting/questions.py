@@ -57,7 +57,7 @@ QUESTIONS = {
         "Does adaptation make a vehicle fly better?",
         ("Yes in a steady wind, with a network that does not read the position; add a disturbance observer.",),
         "less is better), external force",
-        "errors_external_force.png",
+        "gap_external_force.png",
     ),
     "online": Asked(
         "The vehicle changes in the air: how soon does it fly well again?",

@@ -119,20 +119,20 @@ def test_theta_is_relative_to_the_truth_in_percent():
         assert curve.get_color() == COLOURS["hybrid"]
 
 
-def test_predictions_show_quantiles_of_flights_and_one_flight_in_a_box_around_the_truth():
+def test_predictions_show_quantiles_of_flights_and_one_flight_from_above():
     truth = np.stack([straight_flight()] * 5)
     near, off, lost = truth.copy(), truth.copy(), truth.copy()
     near[:, 1:, 1] += 0.1 * np.arange(5)[:, None]  # of the flights 0 … 0.4 m off
     off[:, 5:, 1] = 1e30
     lost[:, 3:] = math.nan
     predicted = {100: {"no_physics": off, "hybrid": near}, 1000: {"hybrid": lost}}
-    few, many, space = predictions(predicted, truth, 0, 0.1, "Flights").axes
+    above, few, _, many = predictions(predicted, truth, 0, 0.1, "Flights").axes
     curves = {line.get_label(): line.get_ydata() for line in few.lines}
     assert curves["hybrid"] == pytest.approx(np.full(10, 0.2))
     assert few.get_ylim() == many.get_ylim()
     assert few.get_ylim()[1] <= 100
-    assert np.ptp(space.get_xlim()) == pytest.approx(1.3)
-    ends = [line.get_marker() for line in space.lines if line.get_marker() in "ox" and line.get_label()[0] == "_"]
+    assert np.ptp(above.get_xlim()) == pytest.approx(1.3)
+    ends = [line.get_marker() for line in above.lines if line.get_marker() in "ox" and line.get_label()[0] == "_"]
     assert ends == ["x", "o"]  # where a prediction leaves the box, and where it ends
 
 
