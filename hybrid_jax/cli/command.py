@@ -83,9 +83,10 @@ def _answer_at_once(program: str) -> None:
     signal.signal(signal.SIGINT, lambda *_: None)
 
     def listen() -> None:
-        if os.read(ear, 1)[0] == signal.SIGINT:
-            os.write(2, f"{program}: {INTERRUPTED}\n".encode())
-            os._exit(128 + signal.SIGINT)
+        while os.read(ear, 1)[0] != signal.SIGINT:
+            pass
+        os.write(2, f"{program}: {INTERRUPTED}\n".encode())
+        os._exit(128 + signal.SIGINT)
 
     threading.Thread(target=listen, daemon=True).start()
 

@@ -1,4 +1,4 @@
-"""The script is called in this process, whose devices are fixed by now."""
+"""The script is called in this process, whose devices are fixed by now, and whose signals are not the script's."""
 
 from unittest import mock
 
@@ -9,7 +9,7 @@ from hybrid_jax.cli import main
 
 @pytest.fixture(scope="session", autouse=True)
 def devices():
-    with mock.patch("hybrid_jax.cli.command.configure"):
+    with mock.patch("hybrid_jax.cli.command.configure"), mock.patch("hybrid_jax.cli.command._answer_at_once"):
         yield
 
 
