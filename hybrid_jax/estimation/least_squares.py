@@ -5,7 +5,8 @@ physics' own parametrisation: for a `RigidBody` the log-ratios.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -81,14 +82,28 @@ def fit_least_squares(
         scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
 
     Raises:
-        ValueError: the physics has no parameter, or windows that are malformed or not of this field.
+        ValueError: the physics has no parameter, windows that are malformed or not of this field, or an implicit solver
+            finds no step.
     """
     windows = check_windows(field, windows)
     checks.count("max_steps", max_steps)
-    found = _fit_and_compare(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
+    with solver_errors(solver):
+        found = _fit_and_compare(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
     if not checks.is_traced(found.discretisation):
         warn_of_steps(float(found.discretisation), "a solver with more substeps, such as RK4(substeps=2)")
     return found
+
+
+@contextmanager
+def solver_errors(solver: Solver) -> Iterator[None]:
+    """Say in a line what an implicit solver says in a hundred where its equations are not finite."""
+    try:
+        yield
+    except eqx.EquinoxRuntimeError:
+        name = type(solver).__name__
+        raise ValueError(
+            f"solver: {name} finds no step where the search went; start nearer, or bound the field"
+        ) from None
 
 
 def warn_of_steps(discretisation: float, remedy: str) -> None:

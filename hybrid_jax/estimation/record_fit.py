@@ -22,7 +22,7 @@ from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
 from hybrid_jax.estimation.elimination import End, descend, reduced
-from hybrid_jax.estimation.least_squares import FINE, Solver, ravel_parameters, warn_of_steps
+from hybrid_jax.estimation.least_squares import FINE, Solver, ravel_parameters, solver_errors, warn_of_steps
 from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.estimation.record_search import TINY
 from hybrid_jax.estimation.shooting import Problem
@@ -115,7 +115,7 @@ def fit_records(
         level: confidence of the intervals, between 0 and 1.
 
     Raises:
-        ValueError: a record without a signal of the model, too many unknowns, or no finite error at the start.
+        ValueError: a record without a signal of the model, too many unknowns, or an implicit solver that finds no step.
     """
     records = checks.list_of("records", records, Record)
     if not records:
@@ -128,7 +128,7 @@ def fit_records(
     if any(model.process) and segment is None:
         raise ValueError("segment must be given with process noise: it acts between segments")
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), solver_errors(solver):
         model = _in_double(model)
         y = {name: np.concatenate([each.y[name] for each in gridded]) for name in gridded[0].y}
         deviation = {name: np.maximum(each.std(axis=0), TINY) for name, each in y.items()}

@@ -100,7 +100,9 @@ def covariance_of(
     windows = least_squares.check_windows(field, windows)
     fitted = ravel_parameters(field)[0].size if free is None else jnp.sum(free)
     if not checks.is_traced(fitted):
-        least_squares.check_determined(field, len(windows), int(fitted))
+        # White noise makes each number of a window an observation; otherwise each window is one.
+        n = windows.x.size if kind == "homoscedastic" else len(windows)
+        least_squares.check_determined(field, n, int(fitted))
     checks.count("chunk", chunk)
     checks.count("cluster", cluster)
     if kind not in Kind.__args__:

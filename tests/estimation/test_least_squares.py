@@ -2,6 +2,7 @@
 
 import warnings
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -73,6 +74,13 @@ def test_a_step_that_biases_a_parameter_is_said(substeps, biased):
     off = abs(float(found.field.log_inductance) - np.log(0.015)) / error
     assert (off > 4) == biased == bool(said)
     assert float(found.discretisation) == pytest.approx(off, rel=0.5) if biased else found.discretisation < 0.1
+
+
+def test_an_implicit_solver_that_finds_no_step_ends_in_a_line():
+    windows = Trajectories(np.zeros((2, 1)), np.ones((2, 3, 1)), np.zeros((2, 3, 1)), 0.01)
+    with pytest.raises(ValueError, match="solver: ImplicitEuler finds no step where the search went") as said:
+        fit_least_squares(Coil(jnp.array(-1e3)), windows, solver=diffrax.ImplicitEuler())
+    assert len(str(said.value).splitlines()) == 1
 
 
 def test_the_residual_of_a_hybrid_is_held():

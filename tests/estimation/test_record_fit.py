@@ -34,10 +34,10 @@ def angle(x, u):
     return x[0]
 
 
-def record(field, start, length=8.0, samples=80, seed=0, drop=(), noise=NOISE):
-    """Inputs every 0.1 s, and a noisy angle at irregular times."""
+def record(field, start, length=8.0, samples=80, seed=0, drop=(), noise=NOISE, interval=0.1):
+    """Inputs at intervals [s], and a noisy angle at irregular times."""
     random = np.random.default_rng(seed)
-    t = np.arange(0.0, length, 0.1)
+    t = np.arange(0.0, length, interval)
     inputs = Record.of("inputs", torque=(t, 2 * random.normal(size=len(t))))
     times = np.sort(random.uniform(0, length, samples))
     times = times[~((times > drop[0]) & (times < drop[1]))] if drop else times
@@ -54,7 +54,9 @@ def model_of(field, d=2, **options):
 
 @pytest.fixture(scope="module")
 def records():
-    return [record(pendulum(), (0.5, 0.0), seed=1), record(pendulum(), (-0.4, 1.0), 6.0, 60, seed=2, drop=(2.0, 3.5))]
+    """Of different intervals, one with a gap."""
+    second = record(pendulum(), (-0.4, 1.0), 6.0, 60, seed=2, drop=(2.0, 3.5), interval=0.25)
+    return [record(pendulum(), (0.5, 0.0), seed=1), second]
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +102,7 @@ def test_a_burst_of_outliers_is_set_aside(records):
     signal = records[0].signals["angle"]
     spoiled = signal.values.copy()
     spoiled[20:24] += 3.0
+    spoiled[50] = np.nan  # what is no number is left out
     torque = records[0].signals["torque"]
     bad = [Record.of("bad", torque=(torque.t, torque.values), angle=(signal.t, spoiled)), records[1]]
     start = model_of(pendulum(1.0, 0.1))

@@ -133,6 +133,10 @@ def test_parameters_that_no_window_tells_apart_have_no_interval_and_others_have_
     np.testing.assert_allclose(variances[2], known[2, 2] * factor, rtol=1e-3)
 
 
+def test_one_long_record_has_an_interval_if_its_noise_is_white():
+    assert 0 < float(covariance_of(pendulum(), SWINGS[:1], kind="homoscedastic")[0, 0]) < np.inf
+
+
 def test_what_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match=r"windows: 1 are too few for the 1 parameters of Pendulum, at least 2"):
         covariance_of(pendulum(), SWINGS[:1])
