@@ -82,7 +82,7 @@ def raw_logs(folder: Path, read: Callable[[Path], Any]) -> tuple[list[tuple[Path
     if not folder.exists():
         raise ValueError(f"{folder}: no such file or folder")
     paths, others = find_logs(folder) if folder.is_dir() else ([folder], {})
-    left = [f"{path.name}: left: {why.replace('FILE', path.name)}" for path, why in others.items()]
+    left = [f"{path.name}: left: {why}" for path, why in others.items()]
     if not paths:
         raise ValueError(f"{folder}: holds no logs, only {'; '.join(left) or 'nothing'}")
     return [(path, read(path)) for path in paths], left

@@ -163,7 +163,7 @@ def read_folder(
     """
     paths, left = find_logs(folder)
     if not paths:
-        others = "; ".join(f"{path.name}: {why.replace('FILE', path.name)}" for path, why in [*left.items()][:5])
+        others = "; ".join(f"{path.name}: {why}" for path, why in [*left.items()][:5])
         found = f"; it holds {others}" if left else ""
         raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
     columns = _column_map(columns)
@@ -201,21 +201,20 @@ def _column_map(columns: ColumnMap | str | Path | None) -> ColumnMap | None:
     return load_column_map(columns) if isinstance(columns, str | Path) else columns
 
 
-def format_of(path: str | Path) -> str:
-    """The format of a file or folder, by its first bytes, else by its suffix; empty if it is none that is read."""
+def format_of(path: str | Path) -> tuple[str, str]:
+    """The format of a file or folder, by its first bytes, else by its suffix; or "" and why it is not read."""
     path = Path(path)
     if path.is_dir():
-        return ROSBAG if (path / BAG).is_file() else ""
+        return (ROSBAG, "") if (path / BAG).is_file() else ("", "a folder; give it by itself")
     if not path.is_file():
-        return ""
-    head = _head(path)
+        return "", "no regular file"
+    head, name = _head(path), path.name.lower()
     if is_crazyflie(head):
-        return CRAZYFLIE
-    if any(head.startswith(magic) for magic in UNREAD if isinstance(magic, bytes)):
-        return ""
-    found = [kind for magic, kind in MAGICS.items() if head.startswith(magic)]
-    named = [kind for suffix, kind in SUFFIXES.items() if path.name.lower().endswith(suffix)]
-    return (found or named or [""])[0]
+        return CRAZYFLIE, ""
+    for mark, told in (MAGICS | UNREAD | SUFFIXES).items():
+        if head.startswith(mark) if isinstance(mark, bytes) else name.endswith(mark):
+            return ("", told.replace("FILE", path.name)) if mark in UNREAD else (told, "")
+    return "", OTHER if head or path.stat().st_size else "empty"
 
 
 def _head(path: Path) -> bytes:
@@ -225,16 +224,6 @@ def _head(path: Path) -> bytes:
             return file.read(32)
     except (OSError, EOFError, zlib.error):
         return b""
-
-
-def why_unread(path: Path) -> str:
-    """Why a file is none that is read, and the way out of formats that are known."""
-    if not path.is_file():
-        return "no regular file"
-    head, name = _head(path), path.name.lower()
-    known = [why for key, why in UNREAD.items() if isinstance(key, str) and name.endswith(key)]
-    known += [why for key, why in UNREAD.items() if isinstance(key, bytes) and head.startswith(key)]
-    return next(iter(known), OTHER if head or path.stat().st_size else "empty")
 
 
 def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
@@ -249,15 +238,14 @@ def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
     folder, logs, left = Path(folder), [], {}
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder")
-    if format_of(folder):
+    if format_of(folder)[0]:
         return [folder], {}
-    for path in sorted(folder.iterdir()):
-        if path.name.startswith("."):
-            continue
-        if format_of(path):
+    for path in (path for path in sorted(folder.iterdir()) if not path.name.startswith(".")):
+        kind, why = format_of(path)
+        if kind:
             logs.append(path)
         else:
-            left[path] = "a folder; give it by itself" if path.is_dir() else why_unread(path)
+            left[path] = why
     return logs, left
 
 
@@ -278,7 +266,7 @@ def read_recording(
     Raises:
         ValueError: file, topic or column, time and what was expected, in one line.
     """
-    kind = format_of(path)
+    kind, why = format_of(path)
     if not Path(path).exists():
         raise ValueError(f"{path}: no such file")
     if kind == CSV:
@@ -290,9 +278,8 @@ def read_recording(
     elif kind:
         found = {ULOG: read_ulog, CRAZYFLIE: read_crazyflie, BLACKBOX: read_blackbox}[kind](path)
     else:
-        why = why_unread(Path(path))
         why = f"is none of {', '.join(dict.fromkeys(SUFFIXES.values()))}, {CRAZYFLIE}" if why == OTHER else why
-        raise ValueError(f"{path}: {why.replace('FILE', Path(path).name)}")
+        raise ValueError(f"{path}: {why}")
     return reordered(found, motor_order) if len(motor_order) else found
 
 

@@ -79,7 +79,8 @@ def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
     for row in np.flatnonzero(t[1:] <= t[:-1])[:1] + 1:
         times = f"{t[row]:.6g} {'repeats' if t[row] == t[row - 1] else 'goes back from'} {t[row - 1]:.6g}"
         yield row, "t", f"time {times}; sort the samples, drop doubles, split restarted clocks"
-    for row, norm in wrong_norms(x[:, QUATERNION]):
+    for row in np.flatnonzero(unlike_one(x[:, QUATERNION]))[:1].tolist():
+        norm = np.linalg.norm(x[row, QUATERNION])
         advice = "cut out samples without an attitude" if norm == 0 else "are these the four quaternion columns?"
         yield row, "qw qx qy qz", f"norm is {norm:.4g}, not 1; {advice}"
     for row, column in np.argwhere(u < 0)[:1].tolist():
@@ -90,12 +91,6 @@ def unlike_one(q: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
     """Which quaternions are not of norm 1."""
     with np.errstate(over="ignore", invalid="ignore"):  # an infinite norm is refused too
         return ~(np.abs(np.linalg.norm(q, axis=1) - 1) <= NORM_TOLERANCE)
-
-
-def wrong_norms(q: Float[np.ndarray, "n 4"]) -> list[tuple[int, float]]:
-    """Index and norm of the first quaternion, if any, that is not of norm 1."""
-    with np.errstate(over="ignore"):
-        return [(int(row), float(np.linalg.norm(q[row]))) for row in np.flatnonzero(unlike_one(q))[:1]]
 
 
 def _canonical(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:

@@ -41,7 +41,7 @@ def test_the_flight_to_two_metres_is_one_at_ten_hz():
 
 
 def test_all_crazyflie_logs_are_whole():
-    paths = [path for path in sorted(FOLDER.rglob("*.gz")) if format_of(path) == CRAZYFLIE]
+    paths = [path for path in sorted(FOLDER.rglob("*.gz")) if format_of(path)[0] == CRAZYFLIE]
     assert paths
     for path in paths:
         recording = read_recording(path)

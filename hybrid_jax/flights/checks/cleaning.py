@@ -131,13 +131,12 @@ def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
     return log[flying], f"{len(log) - flying.sum()} samples on the ground cut out"
 
 
-def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[FlightLog, str]:
-    """Filter states and motors with the same second-order Butterworth filter, segment by segment.
+def low_pass(log: FlightLog, cutoff: float) -> tuple[FlightLog, str]:
+    """Filter states and motors with the same Butterworth filter, forward and back, segment by segment.
 
     Args:
         log: the flight, with even samples.
-        cutoff: −3 dB frequency [Hz] (−6 dB at zero phase, where the filter runs forward and back).
-        causal: filter forward only, as on board; slow signals are delayed by √2 / (2π cutoff).
+        cutoff: frequency of half the amplitude [Hz].
 
     Raises:
         ValueError: the cutoff is not between 0 and half the sampling frequency, or samples are not evenly spaced.
@@ -150,15 +149,10 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     x, u = log.x.copy(), log.u.copy()
     for part in even_segments(log):
         both = np.concatenate([x[part], u[part]], axis=1)
-        if causal:
-            start = scipy.signal.sosfilt_zi(sections)[..., None] * both[0]
-            both, _ = scipy.signal.sosfilt(sections, both, axis=0, zi=start)
-        else:
-            both = scipy.signal.sosfiltfilt(sections, both, axis=0, padlen=min(9, len(both) - 1))
+        both = scipy.signal.sosfiltfilt(sections, both, axis=0, padlen=min(9, len(both) - 1))
         x[part], u[part] = both[:, :STATE_SIZE], np.maximum(both[:, STATE_SIZE:], 0.0)
     x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
-    phase = f"causal, {1000 * np.sqrt(2) / (2 * np.pi * cutoff):.1f} ms late" if causal else "zero phase"
-    done = f"low-pass of second order at {cutoff:g} Hz, {phase}, states and motors"
+    done = f"low-pass of second order at {cutoff:g} Hz, zero phase, states and motors"
     return FlightLog(log.t, x, u, log.name), f"{done}; {all_samples - len(log)} repeated samples left out"
 
 

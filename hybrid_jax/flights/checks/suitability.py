@@ -79,18 +79,13 @@ def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
     who = "the vehicle file has" if vehicle is not None else "the airframe has"
     mend = "log all motors"
     if found > expected or found > MOST_ROTORS:
-        moving = [i for signal in _all_motors(recording) for i in range(found) if np.ptp(signal.values[:, i]) > 0]
-        named = (
-            tuple(dict.fromkeys(moving)) if vehicle is None and not stated else tuple(dict.fromkeys(moving))[:expected]
-        )
+        signals = [recording.signals[name] for name in ROTOR_UNITS if name in recording.signals]
+        moving = tuple(i for i in range(found) if any(np.ptp(signal.values[:, i]) > 0 for signal in signals))
+        named = moving if vehicle is None and not stated else moving[:expected]
         mend = f"name those of the rotors, which change: motor_order={named}"
     advice = f"{found} motors are logged, {who} {expected}: {mend}, or correct the vehicle file"
     fits = found == expected and found <= MOST_ROTORS
     return judged("number of motors", found, "motors", expected, "" if fits else advice)
-
-
-def _all_motors(recording: Recording) -> Iterator[Signal]:
-    return (recording.signals[name] for name in ROTOR_UNITS if name in recording.signals)
 
 
 def _motors(recording: Recording) -> Signal | None:
