@@ -1,4 +1,4 @@
-"""From the command line to the report: python -m experiments.real_flight --help."""
+"""How well models predict recorded flights that they were not trained on: python -m experiments.real_flight --help."""
 
 import sys
 from collections.abc import Sequence

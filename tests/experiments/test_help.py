@@ -18,3 +18,9 @@ def test_the_command_line_is_explained_or_refused_in_one_line(name, arguments, c
     said = capsys.readouterr()
     assert f"usage: python -m experiments.{name}" in said.out if code == 0 else said.err.startswith(f"{name}: ")
     assert len(said.err.splitlines()) == (code != 0)
+
+
+def test_all_programs_are_listed(capsys):
+    import_module("experiments.__main__").main()
+    said = capsys.readouterr().out
+    assert all(f"\n{name} " in f"\n{said}" for name in ("changes", "real_flight", "identification.nanobench"))
