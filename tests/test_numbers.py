@@ -102,3 +102,14 @@ def test_the_most_informative_flight():
                 assert width > 100
             else:
                 assert float(cell.strip("±* %")) == pytest.approx(width, rel=0.05), (flight, name)
+
+
+def test_adapting_in_flight():
+    page, rows = (ROOT / "docs/howto/online.md").read_text(), committed("online").where(agent="online")
+    low = rows.where(reference="low_pass").group("change")
+    shares = [100 * np.mean([[*row["inside"].values()] for row in own]) for own in low.values()]
+    assert f"only {min(shares):.0f} to {max(shares):.0f} %" in page
+    alarms = sum(row["alarms"] > 0 for row in low["nothing"])
+    assert f"false alarm in {alarms} of {len(low['nothing'])} flights" in page
+    fast = rows.where(change="inertia", reference="fast_figure_eight")
+    assert f"true value in {100 * fast.spread('inside.Ix').mean:.0f} % of the time" in page

@@ -1,7 +1,8 @@
-"""What mkdocs does beyond its plugins: mathematics as MathML, which needs no script, and the list of changes."""
+"""What mkdocs does beyond its plugins: mathematics as MathML, which needs no script, changes, and an index of names."""
 
 import html
 import re
+from importlib import import_module
 from pathlib import Path
 
 from latex2mathml.converter import convert
@@ -16,6 +17,17 @@ def on_files(files, config):
     text = (ROOT / "CHANGELOG.md").read_text().replace("](docs/", "](../")
     files.append(File.generated(config, "about/changes.md", content=text))
     return files
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Add all public names in the order of the alphabet to the first page of the reference."""
+    if page.file.src_uri != "api/index.md":
+        return markdown
+    packages = (f"hybrid_jax.{path.parent.name}" for path in sorted((ROOT / "hybrid_jax").glob("*/__init__.py")))
+    names = {name: package for package in packages for name in import_module(package).__all__}
+    names["rigid_body"] = "hybrid_jax.dynamics.rigid_body"  # as its module is called
+    entries = [f"[`{name}`][{names[name]}.{name}]" for name in sorted(names, key=str.lower) if name[0] != "_"]
+    return f"{markdown}\n\n## All names\n\n{' · '.join(entries)}\n"
 
 
 def on_page_content(content, page, config, files):
