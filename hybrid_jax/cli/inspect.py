@@ -180,7 +180,7 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
     return page.Page(
         f"Do the logs of {printable(str(options.folder))} suffice for a model?",
         f"{ready} of {len(logs)} logs are ready for a model.",
-        _overview(worst[:LINES]),
+        page.Table("Logs", ("log", "result"), [(log.name, log.result) for log in worst[:LINES]]),
         [
             (f"{log.name}: its signals; grey: gaps", _drawn(log.recording))
             for log in read[:PICTURED]
@@ -191,7 +191,7 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
         if not ready
         else [f"Learn from them: {learn}"],
         [
-            *([_overview(logs)] if len(logs) > LINES else []),
+            _overview(logs),
             page.Table("What to do", ("log", "check", "what it found, and what mends it"), mends),
             _signals(read),
             *_checks(read),
@@ -207,7 +207,7 @@ def _overview(logs: Sequence[Inspected]) -> page.Table:
         told = (found.facts.get(key, EMPTY) if found else EMPTY for key in ("format", "vehicle", "airframe", "program"))
         size = (f"{found.duration:.1f}", str(found.rotors)) if found else (EMPTY, EMPTY)
         lines.append((log.name, log.result, *told, *size))
-    return page.Table("Logs", ("log", "result", "format", "vehicle", "airframe", "program", "s", "motors"), lines)
+    return page.Table("All logs", ("log", "result", "format", "vehicle", "airframe", "program", "s", "motors"), lines)
 
 
 def _signals(logs: Sequence[Inspected]) -> page.Table:
