@@ -62,7 +62,7 @@ error that is gone. Test error: L^T_MSE over 1 s of other flights.
 - **source**: not adapted. **theta**: Ix, Iy and k by least squares
 - **force**, **torque**, **drag**, **efficiency**, and several of these: fitted with Ix, Iy, k; efficiency is that of
   each rotor, and k stays as it is
-- **last_layer**, **network**: from the candidate that was taken, also the network's output layer or all of its weights,
+- **network**: from the candidate that was taken, also the network's weights,
   by a ridge Gauss–Newton step of low rank that holds them at the source's
 - For comparison, no candidates: **fine_tune**, as in the paper; **fine_tune_offset**, its output bias at a rate of 0.3;
   **l2_sp**, fine-tuning with a penalty on the distance from the source's parameters (L2-SP)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
-from hybrid_jax.adaptation.auto import NETWORKS, Auto, Choice, has_network
+from hybrid_jax.adaptation.auto import NETWORK, Auto, Choice, has_network
 from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.selection import correlated, geometric_mean, longest_chain, overlap
@@ -266,7 +266,7 @@ def adapt(
     space = state_space(field, windows.x0.shape[-1])
     choice = {} if solution.choice is None else _chosen(solution.choice, train, space)
     status = Status(int(solution.status))
-    without = None if exact and choice.get("chosen") not in NETWORKS else NOT_LEAST_SQUARES
+    without = None if exact and choice.get("chosen") != NETWORK else NOT_LEAST_SQUARES
     without = NOT_FINITE if status == Status.DIVERGED else without
     free = None if solution.choice is None else _fitted(solution.choice, adapted)
     found = disturbance_of(adapted)

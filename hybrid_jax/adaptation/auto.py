@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, with_change
+from hybrid_jax.adaptation.anchored import fit_anchored, with_change
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, groups_of
 from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, fit_candidates, simplest
@@ -41,7 +41,7 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "all": ("theta", "force", "torque", "drag", "efficiency"),
 }
 PLAUSIBLE = Plausible()
-NETWORKS = ("last_layer", "network")  # candidates that change the network
+NETWORK = "network"  # the candidate that changes the network
 CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
 
@@ -75,7 +75,7 @@ class Auto(Method):
 
     Of a rigid body: the source as it is; θ_p; with them steady forces and torques, drag and the rotors' efficiencies.
     Of another system: the source, θ_p, θ_p and a constant disturbance. Then, starting from the one that was taken, the
-    output layer of the network, and the whole network, both held at the source's weights.
+    network, held at the source's weights.
 
     Attributes:
         networks: whether the network may change.
@@ -173,25 +173,22 @@ def has_network(field: AbstractVectorField) -> bool:
 def _with_network(
     larger, choice: Choice, sizes: np.ndarray, windows, solver, scale, blocks, starts, expected: Unchanged
 ) -> Choice:
-    """The choice with two more candidates: the one taken so far with its output layer or its network changed."""
-    adapted, parts = candidate(larger, choice, choice.taken), parts_of(larger)
-    steps = fit_anchored(adapted, windows, np.stack([*parts.values()]), solver, scale, blocks=blocks, starts=starts)
+    """The choice with one more candidate: the one taken so far with its network changed."""
+    steps = fit_anchored(candidate(larger, choice, choice.taken), windows, solver, scale, blocks=blocks, starts=starts)
     # Penalties are in the order of their strength, so that the first of several as good changes least.
-    order = np.arange(steps.errors.mse.shape[1])
-    best = jnp.stack([simplest(errors, order) for errors in steps.errors.mse])
-    steps = jax.tree.map(lambda leaf: leaf[np.arange(len(parts)), best], steps)
+    best = simplest(steps.errors.mse, np.arange(len(steps.removed)))
+    steps = jax.tree.map(lambda leaf: leaf[best][None], steps)
     errors = jax.tree.map(lambda *both: jnp.concatenate(both), choice.errors, steps.errors)
     supported = jnp.concatenate([choice.supported, expected.supports(steps.removed, steps.fitted)])
-    sizes = np.concatenate([sizes, sizes.max() + 1 + np.arange(len(parts))])
     zeros = jnp.zeros((len(choice.names), steps.changes.shape[1]), steps.changes.dtype)
 
     def repeated(values):
-        return jnp.concatenate([values, jnp.broadcast_to(values[choice.taken], (len(parts), *values.shape[1:]))])
+        return jnp.concatenate([values, values[choice.taken][None]])
 
     return Choice(
-        (*choice.names, *parts),
+        (*choice.names, NETWORK),
         errors,
-        taken_of(errors, supported, sizes),
+        taken_of(errors, supported, np.append(sizes, sizes.max() + 1)),
         supported,
         choice.parameters,
         repeated(choice.free),

@@ -9,7 +9,7 @@ import tyro
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import Adaptation, Parameter, adapt
-from hybrid_jax.adaptation.auto import NETWORKS
+from hybrid_jax.adaptation.auto import NETWORK
 from hybrid_jax.cli import errors, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
 from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, windows_of
@@ -55,7 +55,7 @@ def run(options: Options) -> int:
         found = adapt(known.field, windows)
         told(f"chose {found.chosen}")
     changed = _changed(known, found)
-    same = not changed and found.chosen not in NETWORKS
+    same = not changed and found.chosen != NETWORK
     if not same:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
@@ -85,7 +85,7 @@ def _page(options: Options, known: Known, flights: Flights, found: Adaptation, c
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
     told = f"Changed: {what}." if own else "These flights differ from the model, and no parameter of its own says how."
     todo = [f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."]
-    if not changed and found.chosen not in NETWORKS:
+    if not changed and found.chosen != NETWORK:
         told = "Nothing changed that these flights can tell."
         todo = ["Keep the model; if something did change, fly what excites the vehicle more."]
     rows = [(name, f"{value:.4g}", str(one)) for name, value, one in [*own, *lacked][:SHOWN]]

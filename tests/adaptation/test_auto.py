@@ -13,7 +13,7 @@ from pushes import Push, pushes
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation import Auto, FineTune, adapt
-from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, weights_of, with_change
+from hybrid_jax.adaptation.anchored import fit_anchored, with_change
 from hybrid_jax.adaptation.auto import CANDIDATES, extended, free_parameters
 from hybrid_jax.adaptation.selection import blocks_of, correlated, fit_candidates, predict_block, simplest
 from hybrid_jax.dynamics.disturbance import disturbed
@@ -168,29 +168,18 @@ def test_a_changed_network_is_found_where_physics_cannot_explain_it():
     whole = adapt(hybrid(), flown(truth))
     test = flown(truth, seed=3, noise=0.0)
     assert rollout_mse(whole.field, test) < 1.1 * rollout_mse(physics, test)
-    assert whole.chosen in ("disturbance", "last_layer", "network")
+    assert whole.chosen in ("disturbance", "network")
 
 
 def test_a_step_of_the_network_is_held_by_its_penalty():
-    windows, parts = flown(hybrid(0.65)), parts_of(hybrid())
-    whole = parts["network"][None]
-    found = fit_anchored(hybrid(), windows, whole, penalties=(1e6, 1.0, 1e-2), blocks=5)
-    sizes = np.linalg.norm(found.changes[0], axis=1)
+    windows = flown(hybrid(0.65))
+    found = fit_anchored(hybrid(), windows, penalties=(1e6, 1.0, 1e-2), blocks=5)
+    sizes = np.linalg.norm(found.changes, axis=1)
     assert sizes[0] < 1e-4 * sizes[2]
     assert (np.diff(sizes) > 0).all()
-    errors = [float(rollout_mse(with_change(hybrid(), change), windows)) for change in found.changes[0]]
+    errors = [float(rollout_mse(with_change(hybrid(), change), windows)) for change in found.changes]
     assert errors[2] < errors[1] < errors[0]
     np.testing.assert_allclose(errors[0], rollout_mse(hybrid(), windows), rtol=1e-3)
-
-
-def test_a_step_of_the_last_layer_leaves_the_others():
-    parts = parts_of(hybrid())
-    found = fit_anchored(hybrid(), flown(hybrid(0.65)), parts["last_layer"][None], penalties=(1e-2,), blocks=5)
-    changed = with_change(hybrid(), found.changes[0, 0]).residual
-    np.testing.assert_array_equal(changed.weight_in, hybrid().residual.weight_in)
-    assert (changed.weight_out != hybrid().residual.weight_out).any()
-    assert parts["last_layer"].sum() == hybrid().residual.weight_out.size + hybrid().residual.bias_out.size
-    assert len(parts["network"]) == weights_of(hybrid())[0].size
 
 
 def test_candidates_of_a_rigid_body_fit_what_their_names_say():

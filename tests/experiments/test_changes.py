@@ -70,7 +70,7 @@ def test_the_command_writes_a_row_for_every_candidate_and_method(tmp_path):
     assert run.returncode == 0, run.stderr
     report = json.loads((tmp_path / "out" / "changes" / "report.json").read_text())
     names = {row["candidate"] for row in report["rows"]}
-    assert {"source", "theta", "efficiency", "all", "last_layer", "network", "fine_tune"} <= names
+    assert {"source", "theta", "efficiency", "all", "network", "fine_tune"} <= names
     assert sum(row["taken"] for row in report["rows"]) == 1
     assert [each["id"] for each in report["claims"]] == ["A1", "A2", "A3", "A4"]
     assert [each["id"] for each in report["not_judged"]] == ["A5"]  # with one draw there is no other flight
