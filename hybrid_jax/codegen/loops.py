@@ -90,18 +90,18 @@ def folding(out: str, name: str, operand: Expression, shape: tuple[int, int]) ->
     return Loop(0, shape[0], (Variable("s", first, constant=False), inner, Assign(Element(out, 0, (1,)), total)))
 
 
-def stores(out: str, entries: np.ndarray) -> tuple[Statement, ...]:
-    """Entries are written into an array: the same number, and runs of another array, by loops."""
+def stores(out: str, entries: np.ndarray, begin: int = 0) -> tuple[Statement, ...]:
+    """Entries are written into an array, from `begin` on: the same number, and runs of another array, by loops."""
     statements, i = [], 0
     while i < len(entries):
         first, (run, step) = entries[i], _run(entries[i:])
         if run >= LOOPED:
             in_array = isinstance(first, Entry) and first.index is not None
             source = Element(first.name, first.index or 0, (step,)) if in_array else first
-            statements.append(Loop(0, run, (Assign(Element(out, i, (1,)), source),)))
+            statements.append(Loop(0, run, (Assign(Element(out, begin + i, (1,)), source),)))
         else:
             run = 1
-            statements.append(Assign(Entry(out, i), first))
+            statements.append(Assign(Entry(out, begin + i), first))
         i += run
     return tuple(statements)
 

@@ -7,6 +7,7 @@ physics thus become straight code, and layers of a network loops over tables and
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
+from itertools import repeat
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -138,9 +139,12 @@ class CTranslation(Translation[np.ndarray]):
         given = loops.address(self.tables, self._gathered(entries), stride * size)
         return _Passed(Entries(inside, shape), Parameter(name, logical, array=True), given)
 
-    def body(self, results: Sequence[np.ndarray], outs: Sequence[str]) -> tuple[Statement, ...]:
-        """The statements of a function that fills some arrays with these results."""
-        end = [one for out, result in zip(outs, results, strict=True) for one in loops.stores(out, result)]
+    def body(
+        self, results: Sequence[np.ndarray], outs: Sequence[str], begins: Iterable[int] = repeat(0)
+    ) -> tuple[Statement, ...]:
+        """The statements of a function that fills some arrays with these results, from some places on."""
+        filled = zip(outs, results, begins, strict=False)
+        end = [one for out, result, begin in filled for one in loops.stores(out, result, begin)]
         return arranged(self.steps, frozenset().union(*(names(tuple(one)) for one in results)), end)
 
     def fold(self, name, rows):

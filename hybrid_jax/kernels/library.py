@@ -26,7 +26,7 @@ from hybrid_jax import runtime
 
 SWITCH = "HYBRID_JAX_NATIVE"
 SOURCES = Path(__file__).parent / "cpp"
-HANDLERS = "forward", "backward", "predict"
+HANDLERS = "forward", "backward"
 # Errors and exceptions of the square root are not asked for: without them several are taken at once.
 OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
 LONGEST = 300  # s to compile

@@ -11,9 +11,8 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.integrate import RK4, Solver, integrate
 from hybrid_jax.kernels import library
-from hybrid_jax.kernels.fields import Kernel, kernel_of, layer_of
-from hybrid_jax.networks.activations import ACTIVATIONS
-from hybrid_jax.networks.normalised_layer import normalised_layer
+from hybrid_jax.kernels.fields import Kernel, kernel_of
+from hybrid_jax.networks.normalised_layer import row_means
 
 Shaped = Array | np.ndarray | jax.ShapeDtypeStruct
 VECTOR = 16  # numbers in a vector, at most: of windows the kernels take at least so many
@@ -28,29 +27,15 @@ def trained(field, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float,
     """The trajectories (t, d, b) of a minibatch in training mode, or None if no kernel is for them."""
     if (kernel := _kernel(field, x0, u, solver, substeps, -1, True)) is None:
         return None
-    layer = [jnp.zeros(0, jnp.float32)] * 5
-    if (network := layer_of(field)) is not None:
-        norm = network.norm
-        layer = [network.weight_in, norm.gain, norm.shift, network.weight_out, network.bias_out]  # pyright: ignore[reportAttributeAccessIssue]
-    return _rollout((kernel, float(dt)), kernel.weights(field), *layer, x0, u)
+    return _rollout((kernel, float(dt)), kernel.weights(field), jnp.asarray(x0), jnp.asarray(u))
 
 
 def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, solver: Solver):
     """The trajectories (n, t, d) of windows x0 (n, d), u (n, t, m) in inference mode, or None without a kernel."""
     if (kernel := _kernel(field, x0, u, solver, 1, 0, False)) is None:
         return None
-    x0, u = jnp.asarray(x0), jnp.asarray(u)
-    states, layer = jax.ShapeDtypeStruct((*u.shape[:2], x0.shape[1]), x0.dtype), [jnp.zeros(0, jnp.float32)] * 5
-
-    def kept(*arrays):
-        return library.call(kernel.prefix + "predict", states, *arrays, numbers=[dt, 0.0])
-
-    def plain(weights, *arrays):
-        *layer, x0, u = arrays
-        whole = _plain((kernel, dt), weights, *layer, jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1))
-        return jnp.moveaxis(whole, -1, 0)
-
-    return library.with_derivative(kept, plain)(kernel.weights(field), *layer, x0, u)
+    last = jnp.moveaxis(jnp.asarray(x0), 0, -1), jnp.moveaxis(jnp.asarray(u), 0, -1)
+    return jnp.moveaxis(_called((kernel, float(dt)), 0, kernel.weights(field), *last)[0], -1, 0)
 
 
 def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, substeps: int, axis: int, training: bool) -> Kernel | None:
@@ -68,26 +53,30 @@ def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, substeps: int, axis: i
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _rollout(kernel_and_dt: tuple[Kernel, float], *arrays: Array) -> Float[Array, "t d b"]:
     """`_plain`, each way in one call."""
-    return _forward(kernel_and_dt, *arrays)[0]
+    return _called(kernel_and_dt, 0, *arrays)[0]
 
 
-def _plain(kernel_and_dt: tuple[Kernel, float], weights: Array, *arrays: Array):
-    (kernel, dt), (*layers, x0, u) = kernel_and_dt, arrays
+def _plain(kernel_and_dt: tuple[Kernel, float], weights: Array, x0: Array, u: Array):
+    kernel, dt = kernel_and_dt
+
+    def evaluate(x, u, n):
+        return jax.vmap(partial(kernel.evaluate, weights), in_axes=-1, out_axes=-1)(x, u, n)
 
     def field(x, u):
-        y = jnp.zeros((kernel.sizes.returns, x.shape[1]), x.dtype)
-        over_samples = jax.vmap(partial(kernel.evaluate, weights), in_axes=-1, out_axes=-1)
-        if kernel.sizes.returns:
-            y = normalised_layer(kernel.epsilon, ACTIVATIONS["relu"], *[*layers, over_samples(x, u, y)[1]])
-        return over_samples(x, u, y)[0]
+        n = jnp.zeros((kernel.sizes.units, x.shape[1]), x.dtype)
+        if len(n):
+            _, z, weight, gain, shift = evaluate(x, u, n)
+            h = weight[..., 0] @ (z - row_means(z)[:, None])
+            q = jax.lax.rsqrt(row_means(jnp.square(h)) + kernel.epsilon)
+            n = gain * q[:, None] * h + shift
+        return evaluate(x, u, n)[0]
 
     return integrate(field, x0, u, dt, RK4())
 
 
-def _forward(kernel_and_dt: tuple[Kernel, float], *arrays: Array):
+def _called(kernel_and_dt: tuple[Kernel, float], kept: int, *arrays: Array) -> list[Array]:
+    """The states, and what is kept of each evaluation for the way back: so many numbers."""
     (kernel, dt), x0, u = kernel_and_dt, *arrays[-2:]
-    sizes, padded = kernel.sizes, -(-x0.shape[1] // VECTOR) * VECTOR
-    kept = len(u) * 4 * (padded * (sizes.d + sizes.returns) + sizes.units) + VECTOR  # see cpp/rollout.h
     results = [jax.ShapeDtypeStruct(shape, x0.dtype) for shape in ((len(u), *x0.shape), (kept,))]
 
     def call(*arrays):
@@ -96,8 +85,19 @@ def _forward(kernel_and_dt: tuple[Kernel, float], *arrays: Array):
     def plain(*arrays):
         return [_plain(kernel_and_dt, *arrays), jnp.zeros(kept, x0.dtype)]
 
-    states, saved = library.with_derivative(call, plain)(*arrays)
+    return library.with_derivative(call, plain)(*arrays)
+
+
+def _forward(kernel_and_dt: tuple[Kernel, float], *arrays: Array):
+    (d, _, _, units), (x0, u) = kernel_and_dt[0].sizes, arrays[-2:]
+    kept = len(u) * 4 * (_whole(x0.shape[1]) * d + _whole(units)) + VECTOR  # see cpp/rollout.h
+    states, saved = _called(kernel_and_dt, kept, *arrays)
     return states, (*arrays, saved)
+
+
+def _whole(count: int) -> int:
+    """A number of numbers in whole vectors."""
+    return -(-count // VECTOR) * VECTOR
 
 
 def _backward(kernel_and_dt: tuple[Kernel, float], saved: tuple[Array, ...], d_states: Float[Array, "t d b"]):

@@ -1,20 +1,34 @@
 """The C++ of a field: programs of one sample, for a vector of samples at a time, before cpp/rollout.h."""
 
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Container, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
 
 from hybrid_jax.codegen import loops, nodes
-from hybrid_jax.codegen.nodes import Address, Call, Element, Entry, Operation
-from hybrid_jax.codegen.operations import CTranslation, column
+from hybrid_jax.codegen.nodes import (
+    Address,
+    Assign,
+    Call,
+    Element,
+    Entry,
+    Expression,
+    Operation,
+    Statement,
+    arranged,
+    nested,
+)
+from hybrid_jax.codegen.operations import LOGICAL, CTranslation, column
 from hybrid_jax.codegen.printer import MATH, CPrinter
 from hybrid_jax.codegen.tables import Tables
 from hybrid_jax.codegen.translation import Entries, Value
 from hybrid_jax.kernels.trace import Products, Program, Shape, Split, split, traced, with_factors
 
 LONGEST = 4000  # statements of a function: GCC takes long for more, and a program of XLA does as well
+CHEAP = {"add", "sub", "mul", "neg", "max", "min", "select_n", "convert_element_type", *LOGICAL}
+INLINED = 12  # operations of an entry that are done again wherever it is needed, at most
 LARGEST = 8192  # numbers of arrays that a function holds for each sample
 
 
@@ -37,8 +51,19 @@ class SampleTranslation(CTranslation):
             place = loops.indexed(self.tables, self._gathered(a.ravel()), a.shape)
             assert isinstance(place, Element)  # contiguous
         vector = loops.address(self.tables, self._gathered(b.ravel(), b.shape))
-        sizes = (Address(place.name, place.corner), *place.steps, vector)
-        return self._filled(m, lambda out: Call("dense", (*sizes, Address(out), m, k))).reshape(m, 1)
+        given = (Address(place.name, place.corner), *place.steps, vector)
+        return self._filled(m, lambda out: Call(f"dense<{m}, {k}>", (*given, Address(out)))).reshape(m, 1)
+
+    def body(self, results, outs, begins):
+        """Loops over entries have in them what is cheap to compute, in place of arrays of it."""
+        filled = zip(outs, results, begins, strict=False)
+        end = [one for out, result, begin in filled for one in loops.stores(out, result, begin)]
+        known: dict[tuple[int, ...], dict[Any, Expression]] = {}  # shape → entry of an array → what it is
+        steps = [
+            replace(step, code=tuple(_inlined(one, known, step.makes) for one in step.code)) for step in self.steps
+        ]
+        end = _merged([_inlined(one, known) for one in end])
+        return arranged(steps, nodes.names(tuple(end)), end)
 
     def columns(self, program: Program, arguments: Sequence[Value]) -> list[np.ndarray]:
         """The outputs of a program."""
@@ -49,6 +74,37 @@ class SampleTranslation(CTranslation):
             found = self._results(step.equation, [values[one] for one in step.inputs])
             values.update(zip(step.outputs, found, strict=True))
         return [self._column(values[one]) for one in program.outputs]
+
+
+def _inlined(statement: Statement, known: dict[tuple[int, ...], dict[Any, Expression]], makes: str = "") -> Statement:
+    """A loop over entries with known ones written out; what it makes is known then, if it is cheap."""
+    shape, inner = [], statement
+    while isinstance(inner, nodes.Loop) and len(inner.body) == 1 and not inner.start:
+        shape, inner = [*shape, inner.stop], inner.body[0]
+    if not shape or not isinstance(inner, Assign):
+        return statement
+    entries = known.setdefault(tuple(shape), {})
+
+    def written(value: Expression) -> Expression:
+        if isinstance(value, Operation):
+            return replace(value, operands=tuple(map(written, value.operands)))
+        return entries.get(value, value) if isinstance(value, Element) else value
+
+    inner = replace(inner, value=written(inner.value))
+    operations = [one.name for one in nodes.walk(inner.value) if isinstance(one, Operation)]
+    if inner.target.name == makes and len(operations) <= INLINED and CHEAP.issuperset(operations):
+        entries[inner.target] = inner.value
+    return nested(shape, inner)
+
+
+def _merged(statements: Sequence[Statement]) -> list[Statement]:
+    """Loops of the same length as one."""
+    bodies: dict[int, list[Statement]] = {}
+    for one in statements:
+        if isinstance(one, nodes.Loop):
+            bodies.setdefault(one.stop, []).extend(one.body)
+    single = [one for one in statements if not isinstance(one, nodes.Loop)]
+    return [*single, *(nodes.Loop(0, stop, tuple(body)) for stop, body in bodies.items())]
 
 
 class SamplePrinter(CPrinter):
@@ -82,78 +138,77 @@ class SamplePrinter(CPrinter):
         return super().statement(node)
 
 
-WEIGHTS, SAMPLE = "const float *w", "const Vec *x, const Vec *u"
+GIVEN = "const float *__restrict w, const Vec *__restrict x, const Vec *__restrict u, "
+INPUTS = ("dx", 0), ("du", 0), ("dn", 0)
 
 
 class Source:
-    """The functions of a field, of its weights and of one sample: x, u, and what its layer returned.
-
-    Attributes:
-        order: of the weights; those whose derivative is summed number by number come first.
-    """
+    """The functions of a field, of its weights and of one sample: x, u, and n; see cpp/rollout.h."""
 
     def __init__(self, forward: Split, of_sample: Sequence[Shape]):
         self.forward, self.of_sample = forward, list(of_sample)
-        self.sizes = [int(np.prod(one.shape)) for one in forward.shapes]
-        self.order = tuple(range(len(self.sizes)))
         self.tables = Tables(double=False)
         self.bodies: list[tuple[nodes.Statement, ...]] = []
         self.functions: list[str] = []
-        self.products: dict[str, list[tuple[int, int, int]]] = {}  # rows, columns and place of each, by function
+        self.factors = 1
 
     def add_forward(self) -> None:
-        """`slope` and `read`, as cpp/rollout.h needs them."""
-        program, places = self.forward.program, self.places()
-        for name, output in zip(("slope", "read"), program.outputs, strict=True):
-            given = f"{WEIGHTS}, {SAMPLE}, const Vec *y, Vec *out"
-            self._add(name, given, program.of([output]), places, ("x", "u", "y"), ["out"])
+        """`slope` and `read`."""
+        program, places = self.forward.program, _places(self.forward.shapes)
+        slope, read, *_ = program.outputs
+        self._add(
+            "slope",
+            "const Vec *__restrict n, Vec *out",
+            program.of([slope]),
+            places,
+            "xun",
+            [("out", 0)],
+        )
+        self._add("read", "Vec *out", program.of([read]), places, "xun", [("out", 0)])
 
     def add_backward(self) -> Split:
-        """`slope_back` and `read_back`, and what they take for weights, as a function of the weights."""
-        count, program = len(self.sizes), self.forward.program
-        slope, read = (program.of([output]) for output in program.outputs)
+        """`slope_back`, `products` and `read_back`, and what they take for weights, as a function of the weights."""
+        program, count = self.forward.program, len(self.forward.shapes)
+        slope, read = (program.of([output]) for output in program.outputs[:2])
         samples = [*self.of_sample, self.of_sample[0], program.shapes[program.outputs[1]]]
 
         def pulled_back(*arrays):
             *arrays, d_slope, d_read = arrays
             parts = jax.vjp(lambda *arrays: slope(*arrays)[0], *arrays)[1](d_slope)
-            return [*parts, *(jax.vjp(lambda *arrays: read(*arrays)[0], *arrays)[1](d_read) if d_read.size else parts)]
+            return [*parts, *jax.vjp(lambda *arrays: read(*arrays)[0], *arrays)[1](d_read)]
 
         back = split(traced(pulled_back, *self.forward.shapes, *samples), count)
-        ways = {"slope_back": back.program.outputs[: count + 3], "read_back": back.program.outputs[count + 3 :]}
-        programs = {name: with_factors(back.program.of(outputs), count) for name, outputs in ways.items()}
-        # Without a layer there is nothing to read, and `read_back` is never called.
-        used = programs if samples[-1].size else {"slope_back": programs["slope_back"]}
-        whole = set.intersection(*(set(found) for _, found in used.values()))
-        self.order = tuple(sorted(range(count), key=lambda i: i in whole))
-        self.summed = sum(size for i, size in enumerate(self.sizes) if i not in whole)
-        for name, (program, products) in programs.items():
-            self._add_backward(name, program, products, _places([int(np.prod(one.shape)) for one in back.shapes]))
+        ways, places = back.program.outputs, _places(back.shapes)
+        whole, products = with_factors(back.program.of(ways[: count + 3]), count)
+        outputs = [*self._sums(products), *INPUTS, *self._factors(products)]
+        given = "const Vec *__restrict n, const Vec *__restrict d_slope, Vec *dx, Vec *du, Vec *dn, Sums s, Vec *f"
+        self._add("slope_back", given, whole, places, ("x", "u", "n", "d_slope", "d_read"), outputs)
+        outputs = [*self._sums(()), *INPUTS[:2]]
+        of_reading = back.program.of(ways[count + 3 : -1])
+        given, inputs = "const Vec *d_read, Vec *dx, Vec *du, Sums s", ("x", "u", "n", "d_slope", "d_read")
+        self._add("read_back", given, of_reading, places, inputs, outputs)
         return back
 
-    def _add_backward(self, name: str, program: Program, products: Products, weights: Sequence[int]) -> None:
-        places, at, lines = self.places(), 0, []
-        outputs = [f"s{i}" for i in range(len(self.sizes)) if i not in products] + ["dx", "du", "dy"]
-        lines += [f"const Sums s{i} = sums + {places[i]};" for i in range(len(self.sizes)) if i not in products]
-        self.products[name] = []
+    def _sums(self, without: Container[int]) -> list[tuple[str, int]]:
+        """Where the derivatives begin that are summed number by number."""
+        return [("s", place) for i, place in enumerate(_places(self.forward.shapes)) if i not in without]
+
+    def _factors(self, products: Products) -> list[tuple[str, int]]:
+        """Where the factors of others begin; `products` is the function that multiplies and sums them."""
+        outputs, at, calls = [], 0, []
         for i, pairs in products.items():
             for rows, columns in pairs:
-                lines += [f"const Slots a{at}_ = factors + {at}, b{at}_ = factors + {at + rows};"]
-                outputs += [f"a{at}_", f"b{at}_"]
-                self.products[name].append((rows, columns, places[i]))
+                outputs += [("f", at), ("f", at + rows)]
+                place = _places(self.forward.shapes)[i]
+                where = f"sums + {place}, factors + {at}, F, factors + {at + rows}, F, slots"
+                calls.append(f"    add_products<{rows}, {columns}>({where});")
                 at += rows + columns
-        given = (
-            "const Vec *y, const Vec *d_slope, const Vec *d_read, Vec *dx, Vec *du, Vec *dy, Sums sums, Slots factors"
-        )
-        inputs = "x", "u", "y", "d_slope", "d_read"
-        self._add(name, f"{WEIGHTS}, {SAMPLE}, {given}", program, weights, inputs, outputs, lines)
+        self.factors = at | 1  # an even number of vectors may put all slots into the same lines of the cache
+        head = "void products(Vec *sums, const Vec *factors, int64_t slots) {"
+        self.functions.append("\n".join([head, *calls, "}\n"]))
+        return outputs
 
-    def places(self) -> list[int]:
-        """Where each weight begins."""
-        begins = _places([self.sizes[i] for i in self.order])
-        return [begins[self.order.index(i)] for i in range(len(self.sizes))]
-
-    def _add(self, name, parameters, program, weights, inputs, outputs, lines=()) -> None:
+    def _add(self, name, parameters, program, weights, inputs, outputs) -> None:
         """A function of weights, which begin at these places of `w`, and inputs, that fills the outputs."""
         arguments = []
         for i, variable in enumerate(program.inputs):
@@ -163,26 +218,22 @@ class Source:
         translation = SampleTranslation(self.tables)
         found = translation.columns(program, arguments)
         pairs = zip(outputs, found, strict=True)
-        written = [(out, one) for out, one in pairs if len(one) and not (out[0] == "s" and all(v == 0.0 for v in one))]
-        body = translation.body([one for _, one in written], [out for out, _ in written])
+        written = [(*out, one) for out, one in pairs if len(one) and not (out[0] == "s" and _is_zero(one))]
+        outs, begins, results = zip(*written, strict=True) if written else ((), (), ())
+        body = translation.body(results, outs, begins)
         held = sum(one.size for one in nodes.walk(body) if isinstance(one, nodes.Array))
         if len(body) > LONGEST or held > LARGEST:
             raise ValueError(f"its evaluation takes {len(body)} statements and {held} numbers, too many for kernels")
         self.bodies.append(body)
-        text = [*(f"    {line}" for line in lines), SamplePrinter(double=False).body(body)]
-        self.functions.append(f"void {name}({parameters}) {{\n" + "\n".join(text) + "\n}\n")
+        text = SamplePrinter(double=False).body(body)
+        self.functions.append(f"void {name}({GIVEN}{parameters}) {{\n{text}\n}}\n")
 
     def text(self, constants: dict[str, int], training: bool) -> str:
         """The whole source."""
         printer, read = SamplePrinter(double=False), nodes.names(tuple(self.bodies))
-        head = [f"#define LAYER {int(constants['Z'] > 0)}", f"#define TRAINING {int(training)}"]
-        head += ['#include "samples.h"', "namespace {"]
+        constants = constants | {"F": self.factors}
+        head = [f"#define TRAINING {int(training)}", '#include "samples.h"', "namespace {"]
         head += [f"constexpr int64_t {name} = {value};" for name, value in constants.items()]
-        if training:
-            head.append(f"constexpr int64_t S = {self.summed};")
-        for name, products in self.products.items():
-            listed = ", ".join(f"{{{rows}, {columns}, {place}}}" for rows, columns, place in products)
-            head.append(f"constexpr Outer of_{name}[] = {{{listed}{', ' * bool(products)}{{0, 0, 0}}}};")
         tables = [printer.table(name, numbers) for name, numbers in self.tables.numbers.items() if name in read]
         lines = [*head, *(table.replace("real", "float", 1) for table in tables), *self.functions]
         return "\n".join([*lines, "}  // namespace", '#include "rollout.h"', ""])
@@ -193,5 +244,10 @@ class Source:
         return any(one.name in MATH and one.name not in ("floor", "ceil", "sqrt", "abs", "rem") for one in every)
 
 
-def _places(sizes: Sequence[int]) -> list[int]:
-    return np.cumsum([0, *sizes])[:-1].tolist()
+def _is_zero(entries: np.ndarray) -> bool:
+    return all(isinstance(one, float) and one == 0.0 for one in entries)
+
+
+def _places(shapes: Sequence[Shape]) -> list[int]:
+    """Where each array begins of arrays one after the other."""
+    return np.cumsum([0, *(int(np.prod(one.shape)) for one in shapes)])[:-1].tolist()

@@ -60,6 +60,14 @@ class Split(NamedTuple):
     shapes: list[Shape]  # of the weights
     program: Program
 
+    def place(self, output: int) -> int:
+        """Where among all weights a value begins, 0 if it is of no size; ValueError if it is none of them."""
+        if not self.program.shapes[output].size:
+            return 0
+        if output not in self.weights.outputs:
+            raise ValueError("the weights before its batch normalisation are not learned")
+        return sum(one.size for one in self.shapes[: self.weights.outputs.index(output)])
+
 
 def traced(function: Callable, *shapes: Any) -> Program:
     """The program of a function of arrays that returns a list."""

@@ -109,7 +109,13 @@ def open_folder(tmp_path, monkeypatch):
     (tmp_path / "hybrid_jax" / "kernels").chmod(0o777)
 
 
+def without_avx2(tmp_path, monkeypatch):
+    found = runtime.machine()
+    monkeypatch.setattr(runtime, "machine", lambda: (*found[:-1], "sse4_2"))
+
+
 WITHOUT = {
+    "no AVX2": (without_avx2, "no AVX2"),
     "switched off": (lambda _, patch: patch.setenv(library.SWITCH, "0"), "HYBRID_JAX_NATIVE is 0"),
     "no compiler": (lambda _, patch: patch.setenv("CXX", "no-such-compiler"), "no g++"),
     "a compiler that fails": (lambda _, patch: patch.setenv("CXX", "false"), "could not be compiled"),

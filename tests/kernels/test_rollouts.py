@@ -49,7 +49,7 @@ FIELDS = {
     "the paper's": untrained("hybrid"),
     "physics alone": RigidBody(THETA, ODD),
     "no physics": network(3, 2, hidden=32),
-    "no input": network(5, 0, hidden=96),
+    "no input, a number of units that fills no vector": network(5, 0, hidden=9, activation="tanh"),
     "a force and a torque": Hybrid(RigidBody(THETA, HEXACOPTER, wrench=True), network(13, 6)),
     "a vehicle's terms": Hybrid(
         rigid_body(ODD, ("Ix", "k_rotors", "drag", "centre_of_mass"), Terms(drag=(0.3, 0.2, 0.1))),
@@ -155,8 +155,6 @@ class Own(RigidBody):
 OTHERS = {
     "physics of one's own": (Hybrid(Own(THETA, IRIS), FIELD.residual), {}),
     "few windows": (FIELD, {"b": 9}),
-    "odd hidden units": (Hybrid(FIELD.physics, network(13, 4, hidden=48)), {}),
-    "another activation": (Hybrid(FIELD.physics, network(13, 4, activation="tanh")), {}),
 }
 
 

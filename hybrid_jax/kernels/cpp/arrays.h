@@ -5,6 +5,8 @@
 
 #pragma once
 
+#include <cstdint>
+
 #include "xla/ffi/api/c_api.h"
 
 namespace {
@@ -20,19 +22,12 @@ struct Array {
   }
 };
 
-struct Numbers {
-  const float* at;
-  int64_t size;
-  float operator[](int64_t i) const { return at[i]; }
-};
-
 struct Call {
   const XLA_FFI_CallFrame* frame;
   Array argument(int64_t i) const { return {static_cast<const XLA_FFI_Buffer*>(frame->args.args[i])}; }
   Array result(int64_t i) const { return {static_cast<const XLA_FFI_Buffer*>(frame->rets.rets[i])}; }
-  Numbers numbers() const {
-    const auto* array = static_cast<const XLA_FFI_Array*>(frame->attrs.attrs[0]);
-    return {static_cast<const float*>(array->data), int64_t(array->size)};
+  float number(int64_t i) const {
+    return static_cast<const float*>(static_cast<const XLA_FFI_Array*>(frame->attrs.attrs[0])->data)[i];
   }
 };
 
@@ -56,10 +51,15 @@ bool is_answered(const XLA_FFI_CallFrame* frame) {
   return true;
 }
 
-#define HANDLER(NAME)                                         \
-  extern "C" XLA_FFI_Error* NAME(XLA_FFI_CallFrame* frame) {  \
-    if (!is_answered(frame)) NAME##_call({frame});            \
-    return nullptr;                                           \
+// A kernel of each lane; argument 1 is (…, D, b).
+#define HANDLER(NAME)                                                                       \
+  extern "C" XLA_FFI_Error* NAME(XLA_FFI_CallFrame* frame) {                                \
+    if (is_answered(frame)) return nullptr;                                                 \
+    const Call call{frame};                                                                 \
+    const Array x0 = call.argument(1);                                                      \
+    const int64_t lanes = x0.count() / (D * x0.size(-1));                                   \
+    for (int64_t i = 0; i < lanes; ++i) NAME##_call({call, i, lanes});                      \
+    return nullptr;                                                                         \
   }
 
 }  // namespace

@@ -2,8 +2,6 @@
 
 #pragma once
 
-#include <cmath>
-
 #include "vectors.h"
 
 namespace {
@@ -58,22 +56,6 @@ template <class A, class B> INLINE Vec fmodf(A a, B b) {
   return l;
 }
 
-// out = W v, with W[i, k] at w[i row + k step]; eight rows at a time, whose sums need not wait for each other.
-template <int R, class W, class X>
-INLINE void rows_of(const W* w, int64_t row, int64_t step, const X* v, Vec* out, int columns) {
-  Vec sum[R] = {};
-  for (int k = 0; k < columns; ++k)
-#pragma GCC unroll 8
-    for (int r = 0; r < R; ++r) sum[r] += w[r * row + k * step] * v[k];
-#pragma GCC unroll 8
-  for (int r = 0; r < R; ++r) out[r] = sum[r];
-}
-template <class W, class X>
-INLINE void dense(const W* w, int64_t row, int64_t step, const X* v, Vec* out, int rows, int columns) {
-  int i = 0;
-  for (; i + 8 <= rows; i += 8) rows_of<8>(w + i * row, row, step, v, out + i, columns);
-  for (; i < rows; ++i) rows_of<1>(w + i * row, row, step, v, out + i, columns);
-}
 // out = A B, of m x k and k x n.
 template <class A, class B>
 INLINE void product(const A* a, const B* b, Vec* out, int m, int k, int n) {
@@ -85,19 +67,11 @@ INLINE void product(const A* a, const B* b, Vec* out, int m, int k, int n) {
     }
 }
 
-// Where results go that are added up over samples, and factors whose products are.
+// Where results go that are added up over samples.
 struct Sums {
   Vec* at;
   struct Sum { Vec* at; INLINE void operator=(Vec v) const { *at += v; } };
   INLINE Sum operator[](int64_t i) const { return {at + i}; }
-  INLINE Sums operator+(int64_t i) const { return {at + i}; }
 };
-struct Slots {
-  Vec* at;
-  int64_t step;
-  INLINE Vec& operator[](int64_t i) const { return at[i * step]; }
-  INLINE Slots operator+(int64_t i) const { return {at + i * step, step}; }
-};
-struct Outer { int64_t rows, columns, place; };
 
 }  // namespace
