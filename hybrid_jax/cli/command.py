@@ -142,6 +142,10 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a letter ends no run
+    if sys.stdout is sys.__stdout__:
+        sys.stdout = io.TextIOWrapper(
+            io.BufferedWriter(_Output(program)), sys.stdout.encoding, "replace", line_buffering=True
+        )
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
@@ -151,6 +155,22 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
         _end(program, [in_flags(command, line) for line in failed.args], FAILED_CHECKS)
     except KeyboardInterrupt as stop:
         _end(program, [interrupted], 128 + (stop.args[0] if stop.args else signal.SIGINT))
+
+
+class _Output(io.FileIO):
+    """Standard output that may be full or closed, as by `| head -1`: the files are written all the same."""
+
+    def __init__(self, program: str):
+        super().__init__(sys.stdout.fileno(), "w", closefd=False)
+        self.program = program
+
+    def write(self, text, /) -> int:
+        try:
+            return super().write(text)
+        except OSError as error:
+            print(f"{self.program}: standard output: {error.strerror}; what is left is not shown", file=sys.stderr)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            return memoryview(text).nbytes
 
 
 def _end(program: str, lines: Sequence[str], code: int) -> NoReturn:
