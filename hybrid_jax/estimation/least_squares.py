@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from typing import TypeVar
 
 import diffrax
 import equinox as eqx
@@ -33,6 +34,7 @@ FINE = 1e-3  # of how far the states move: smaller errors do not count as noise 
 Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
 Scale = Float[Array, " d"] | None  # the error of each state that counts as 1; without one, 1 in its own unit
 Theta = Float[Array, " p"]
+Field = TypeVar("Field")
 
 
 class LeastSquaresFit(eqx.Module):
@@ -227,6 +229,11 @@ def _units(jacobian, errors, windows: Trajectories, scale: Scale, free, held) ->
     effect = jnp.linalg.norm(jacobian.reshape(-1, jacobian.shape[-1]), axis=0)
     seen, effect = effect > rounding(windows, scale), jnp.sqrt(jnp.square(effect) + jnp.square(held))
     return jnp.where(seen if free is None else free & seen, size / _nonzero(effect), 0), size
+
+
+def in_double(field: Field) -> Field:
+    """A field or a model with its arrays in double precision, where JAX has that."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
 
 
 def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta], AbstractVectorField]]:

@@ -22,7 +22,7 @@ from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
 from hybrid_jax.estimation.elimination import End, descend, reduced
-from hybrid_jax.estimation.least_squares import FINE, Solver, ravel_parameters, solver_errors, warn_of_steps
+from hybrid_jax.estimation.least_squares import FINE, Solver, in_double, ravel_parameters, solver_errors, warn_of_steps
 from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.estimation.record_search import TINY
 from hybrid_jax.estimation.shooting import Problem
@@ -129,7 +129,7 @@ def fit_records(
         raise ValueError("segment must be given with process noise: it acts between segments")
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
     with jax.enable_x64(True), solver_errors(solver):
-        model = _in_double(model)
+        model = in_double(model)
         y = {name: np.concatenate([each.y[name] for each in gridded]) for name in gridded[0].y}
         deviation = {name: np.maximum(each.std(axis=0), TINY) for name, each in y.items()}
         known = {name: np.full_like(deviation[name], size) for name, size in (noise or {}).items()}
@@ -189,7 +189,7 @@ def simulate(
     """
     gridded = [on_grid(record, model.inputs, tuple(model.outputs), dt, between, begin)]
     with jax.enable_x64(True):
-        model = _in_double(model)
+        model = in_double(model)
         problem = Problem(model, {}, np.inf, dt, RK4() if solver is None else solver, substeps)
         segments = shooting.cut(gridded, len(gridded[0].u))
         x0 = jnp.asarray(model.start if start is None else start, float)[None]
@@ -230,10 +230,6 @@ def predict(
         joined[name] = Signal(t, values, after.axes, after.source)
     options = {"begin": known.times[0, 1], "dt": dt, "between": between} | kept
     return simulate(model, Record(future.name, joined), known.ends[0], **options)[0]
-
-
-def _in_double(model: StateSpaceModel) -> StateSpaceModel:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, model)
 
 
 def _size(errors: Float[np.ndarray, "n k"], robust: float) -> Float[np.ndarray, " k"]:

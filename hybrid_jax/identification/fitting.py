@@ -26,7 +26,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.elimination import descend, reduced
-from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.least_squares import in_double, ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, inverses, masked
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.flights.recording import Recording
@@ -128,7 +128,7 @@ def identify(
     if (n := min(len(windows.start), layout.most)) <= moves.sum():
         raise ValueError(f"{recordings[0].name}: {n} windows for {moves.sum()} parameters; record more")
     with jax.enable_x64(True):
-        field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
+        field = in_double(field)
         theta, unravel = ravel_parameters(field)
         spread = jnp.concatenate([windows.spread, np.tile(layout.disturbance, (len(windows.start), 1))], axis=1)
         problem = Problem(windows, inputs, columns, {name: _first_scale(windows, name) for name in columns}, spread)
@@ -176,7 +176,7 @@ def identify_in_turn(
         layout: how they are cut into windows of torques, by default `Layout()`.
     """
     layout = Layout() if layout is None else layout
-    theta = {*_names(field)}
+    theta = {*dict(_numbers(field))}
     force, torque = tuple(theta & OF_FORCE), tuple(theta - OF_FORCE)
     signals = [each.signals.keys() for each in recordings]
     if not force or not torque or not all({"specific_force", "rates"} <= each for each in signals):
@@ -211,7 +211,7 @@ def prediction_errors(
     told = "command" if isinstance(physics_of(field), Actuated) else "rotor_speed"
     windows, inputs, columns = cut(recordings, layout, told, measured, layout.most)
     with jax.enable_x64(True):
-        field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
+        field = in_double(field)
         problem = Problem(windows, inputs, columns, {name: jnp.ones(1) for name in columns}, jnp.zeros(()))
         zero = jnp.zeros((len(windows.start), TANGENT + 6))
         found = all_errors(field, ravel_parameters(field)[0], zero, problem, layout)
@@ -275,10 +275,11 @@ def _first_scale(windows: Windows, name: str) -> Array:
     return jnp.asarray(np.maximum(spread, 1e-9))
 
 
-def _names(field) -> list[str]:
+def _numbers(field) -> list[tuple[str, int]]:
+    """The parameter that each number of θ belongs to, and its place in that."""
     physics = physics_of(field)
     leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(physics, trainable(physics)))[0]
-    return [jax.tree_util.keystr(path[-1:], simple=True) for path, _ in leaves]
+    return [(jax.tree_util.keystr(path[-1:], simple=True), i) for path, leaf in leaves for i in range(leaf.size)]
 
 
 def _require_voltage(recordings: Sequence[Recording]) -> None:
@@ -290,26 +291,18 @@ def _require_voltage(recordings: Sequence[Recording]) -> None:
 
 def _free(field, names: Sequence[str] | None) -> np.ndarray:
     """Which numbers of θ belong to the named parameters; ValueError for a name that the field does not learn."""
-    physics = physics_of(field)
-    leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(physics, trainable(physics)))[0]
-    own = _names(field)
+    own = _numbers(field)
     for name in names or ():
-        if name.partition("[")[0] not in own:
-            raise ValueError(f"free must be of {', '.join(own)}, got {name!r}")
-    parts = []
-    for name, (_, leaf) in zip(own, leaves, strict=True):
-        single = {i for i in range(leaf.size) if names is not None and f"{name}[{i}]" in names}
-        parts.append([names is None or name in names or i in single for i in range(leaf.size)])
-    return np.concatenate(parts).astype(bool)
+        if name.partition("[")[0] not in dict(own):
+            raise ValueError(f"free must be of {', '.join(dict(own))}, got {name!r}")
+    return np.array([names is None or not {name, f"{name}[{i}]"}.isdisjoint(names) for name, i in own], bool)
 
 
 def _measurable(field, recordings: Sequence[Recording]) -> np.ndarray:
     """Which numbers of θ are not of a velocity that no recording measures: the windows would tell them by chance."""
     measured = {"velocity", "body_velocity", "position"}
     known = all(measured & each.signals.keys() for each in recordings)
-    physics = physics_of(field)
-    sizes = [leaf.size for leaf in jax.tree.leaves(eqx.filter(physics, trainable(physics)))]
-    return np.repeat([known or name not in OF_VELOCITY for name in _names(field)], sizes)
+    return np.array([known or name not in OF_VELOCITY for name, _ in _numbers(field)], bool)
 
 
 def _covariance(equations: NormalEquations, cluster: int, moves, known, measurable) -> Array:

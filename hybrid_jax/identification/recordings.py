@@ -1,6 +1,6 @@
 """Windows of recordings, each with an estimate of its initial state from the samples before it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -214,17 +214,24 @@ def initial_states(
     x[:, QUATERNION.start] = 1
     spread[:, 3:5], spread[:, 6:9], spread[:, 9:] = UNKNOWN["tilt"], UNKNOWN["velocity"], UNKNOWN["rates"]
     if "position" in signals:
-        _fill(x, spread, POSITION, 0, *fitted(signals["position"], starts, layout))
-        _fill(x, spread, VELOCITY, 6, *fitted(signals["position"], starts, layout, slope=True))
+        value, error, slope, slope_error = fitted(signals["position"], starts, layout)
+        _fill(x, spread, POSITION, 0, value, error)
+        _fill(x, spread, VELOCITY, 6, slope, slope_error)
     if "attitude" in signals:
-        q, error, slope, slope_error = _attitudes(signals["attitude"], starts, layout)
-        x[:, QUATERNION], spread[:, 3:6] = q, error
+        every = _rotation(np.asarray(signals["attitude"].values))
+
+        def from_last(part: slice) -> np.ndarray:
+            return (every[part.stop - 1].inv() * every[part]).as_rotvec()
+
+        change, spread[:, 3:6], slope, slope_error = fitted(signals["attitude"], starts, layout, from_last)
+        last = every[np.clip(np.searchsorted(signals["attitude"].t, starts, side="right") - 1, 0, None)]
+        x[:, QUATERNION] = np.roll((last * scipy.spatial.transform.Rotation.from_rotvec(change)).as_quat(), 1, axis=1)
         _fill(x, spread, BODY_RATES, 9, slope, slope_error)
     for name, place, at in (("velocity", VELOCITY, 6), ("rates", BODY_RATES, 9)):
         if name in signals and len(signals[name].axes) == 3:
-            _fill(x, spread, place, at, *fitted(signals[name], starts, layout))
+            _fill(x, spread, place, at, *fitted(signals[name], starts, layout)[:2])
     if "body_velocity" in signals and len(signals["body_velocity"].axes) == 3:
-        value, error = fitted(signals["body_velocity"], starts, layout)
+        value, error, *_ = fitted(signals["body_velocity"], starts, layout)
         _fill(x, spread, VELOCITY, 6, _rotation(x[:, QUATERNION]).apply(value), error)
     return x, spread
 
@@ -237,56 +244,31 @@ def _rotation(q) -> "scipy.spatial.transform.Rotation":
     return scipy.spatial.transform.Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
-def _attitudes(signal: Signal, starts, layout: Layout):
-    """Attitude, its error, its rate in the body and the error of that."""
-    at = np.clip(np.searchsorted(signal.t, starts, side="right") - 1, 0, None)
-    every = _rotation(np.asarray(signal.values))
-    found = [
-        _of_one(signal, starts[i], layout, (every[int(k)].inv() * every[_before(signal, t, layout)]).as_rotvec())
-        for i, (k, t) in enumerate(zip(at, starts, strict=True))
-    ]
-    value, slope, variance = (np.array(part) for part in zip(*found, strict=True)) if found else np.zeros((3, 0, 3))
-    noise = np.sqrt(np.median(variance[:, :3], axis=0)) if len(found) else np.zeros(3)
-    q = np.roll((every[at] * scipy.spatial.transform.Rotation.from_rotvec(value.reshape(-1, 3))).as_quat(), 1, axis=1)
-    here, slopes = (np.median([_gains(signal, t, layout)[i] for t in starts] or [0.0]) for i in (0, 1))
-    return q, 0 * noise if layout.initial == "sample" else noise * here, slope.reshape(-1, 3), noise * slopes
+def fitted(signal: Signal, starts: Float[np.ndarray, " n"], layout: Layout, numbers: Callable | None = None):
+    """Value (n, k), its standard deviation (k), slope and its deviation, of a quadratic through the samples before.
 
+    They are those of `layout.span`, at least six, or as many as there are. With `initial="sample"` the value is that of
+    the last one, taken as exact.
 
-def fitted(signal: Signal, starts, layout: Layout, slope: bool = False):
-    """Value or slope of a signal at each time (n, k), and the standard deviation of its error (k)."""
-    found = [_of_one(signal, t, layout, np.asarray(signal.values)[_before(signal, t, layout)]) for t in starts]
+    Args:
+        numbers: what stands for the samples of a slice of the signal (s, k), by default their values.
+    """
+    found = []
+    for t in starts:
+        end = int(np.searchsorted(signal.t, t, side="right"))
+        part = slice(max(0, min(int(np.searchsorted(signal.t, t - layout.span)), end - 6)), max(end, 1))
+        values = np.asarray(signal.values)[part] if numbers is None else numbers(part)
+        past = signal.t[part] - t
+        basis = past[:, None] ** np.arange(3 if len(past) > 4 else 2)
+        weights = np.linalg.lstsq(basis, values, rcond=None)[0]
+        variance = ((values - basis @ weights) ** 2).sum(axis=0) / max(len(basis) - basis.shape[1], 1)
+        gains = np.sqrt(np.diagonal(np.linalg.pinv(basis.T @ basis)))[:2]
+        found.append((values[-1], *weights[:2], variance, gains))
     if not found:
-        return np.zeros((0, len(signal.axes))), np.zeros(len(signal.axes))
-    value, rate, variance = (np.array(part) for part in zip(*found, strict=True))
-    gains = np.median([_gains(signal, t, layout) for t in starts], axis=0)
-    noise = np.sqrt(np.median(variance, axis=0))
-    if layout.initial == "sample" and not slope:
-        return value, 0 * noise
-    return (rate, noise * gains[1]) if slope else (value, noise * gains[0])
-
-
-def _before(signal: Signal, t: float, layout: Layout) -> slice:
-    """The samples of the span before a time, at least six, or as many as there are."""
-    end = int(np.searchsorted(signal.t, t, side="right"))
-    return slice(max(0, min(int(np.searchsorted(signal.t, t - layout.span)), end - 6)), max(end, 1))
-
-
-def _of_one(signal: Signal, t: float, layout: Layout, values):
-    """Value and slope at t of a quadratic through the samples before, or the last sample, and the variance about it."""
-    basis = _basis(signal, t, layout)
-    weights, *_ = np.linalg.lstsq(basis, values, rcond=None)
-    left = max(len(basis) - basis.shape[1], 1)
-    variance = ((values - basis @ weights) ** 2).sum(axis=0) / left
-    return values[-1] if layout.initial == "sample" else weights[0], weights[1], variance
-
-
-def _basis(signal: Signal, t: float, layout: Layout):
-    past = signal.t[_before(signal, t, layout)] - t
-    return past[:, None] ** np.arange(3 if len(past) > 4 else 2)
-
-
-def _gains(signal: Signal, t: float, layout: Layout) -> tuple[float, float]:
-    """Standard deviation of value and slope for samples of deviation 1."""
-    basis = _basis(signal, t, layout)
-    covariance = np.linalg.pinv(basis.T @ basis)
-    return float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[1, 1]))
+        none = np.zeros((0, 3 if numbers else len(signal.axes)))
+        return none, none.sum(axis=0), none, none.sum(axis=0)
+    last, value, slope, variance, gains = (np.array(part) for part in zip(*found, strict=True))
+    noise, (of_value, of_slope) = np.sqrt(np.median(variance, axis=0)), np.median(gains, axis=0)
+    if layout.initial == "sample":
+        value, of_value = last, 0.0
+    return value, noise * of_value, slope, noise * of_slope
