@@ -30,7 +30,7 @@ QUESTIONS = {
         "Which method adapts to one flight of ten seconds?",
         (
             "Start with the defaults of `hj.adapt`; do not fine-tune a network on ten seconds of data.",
-            "The flights move. After a hover the data determine too little, and no method can know what changed.",
+            "The flights move. A hover determines too little, and no method can know what changed.",
         ),
     ),
     "coverage": Asked(
