@@ -144,7 +144,7 @@ def test_damaged_files_are_refused(flight, written, tmp_path):
     refusal(lambda: load_log(written(packed[:500] + b"\0" * 400 + packed[900:], "b.csv.gz")), "b.csv.gz")
     refusal(lambda: load_log(written(b"\xff\xfe\0\1", "c.csv")), "c.csv", "not text")
     refusal(lambda: load_log(tmp_path / "none.csv"), "none.csv", "no such file")
-    refusal(lambda: load_log(tmp_path), "no regular file")
+    refusal(lambda: load_log(tmp_path), "a folder")
 
 
 def test_too_many_rows_are_refused(flight, written):

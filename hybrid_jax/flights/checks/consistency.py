@@ -91,7 +91,7 @@ def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
     skip = max(0, (len(log) - MAX_SAMPLES) // 2)
     log = log[skip : skip + MAX_SAMPLES]
     lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
-    clock = "the time is in ms or µs: declare its unit"
+    clock = "the time is in ms, µs or ns: declare its unit"
     split = "windows stop at each; resample=… with longest_gap=… bridges short ones"
     moved = _compare(log, "dp/dt against v", mistakes.velocities(log), LEAST_MOTION["velocity"])
     pushed = mistakes.accelerations(log)
@@ -231,7 +231,8 @@ def _compare_means(log: FlightLog, name: str, pairs: Pairs, least: float, span: 
         return Check(name, math.nan, "relative error", limit, UNKNOWN, MORE_FLIGHT)
     value, advice = _relative_error(a, b), _nearer(pairs, limit, least)
     doubtful = (not advice and name == THRUST) or ((" s late" in advice or " s early" in advice) and value <= limit)
-    doubtful |= mistakes.HEADING in advice  # an attitude turned about z is all that this check sees of it
+    # An attitude turned about z, or a mirrored world, is all that this check sees of it.
+    doubtful |= mistakes.HEADING in advice or mistakes.HANDED in advice
     advice = advice or (UNUSUAL if value > limit else "")
     if name == THRUST and advice == UNUSUAL:
         advice = f"{UNUSUAL}; {CHANGED}"

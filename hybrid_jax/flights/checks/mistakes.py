@@ -13,6 +13,7 @@ from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 NOTHING = "nothing to correct"  # the log as it is
 LATE = (0.1, 0.2)  # delays and advances that are tried [s]
 WORLD = 'velocity is in the world, read as the body\'s: velocity = "world", or for a bag topics={"velocity": "TOPIC"}'
+HANDED = "the world is left-handed: "
 HEADING = "the heading is counted from another axis than x, off by"
 BODY = 'velocity is in the body frame (FLU): set velocity = "body"'
 UP = np.array([0.0, 0.0, 1.0])
@@ -37,6 +38,8 @@ def velocities(log: FlightLog) -> Pairs:
         "velocity has y and z the other way round than position: flip the signs of vy and vz": v * [1, -1, -1],
         "velocity is in mm/s or position in km: set the units": v * 1e-3,
         "velocity is in cm/s: set its unit": v * 1e-2,
+        "velocity is in km/h: set its unit": v / 3.6,
+        "position is in feet: set its unit": v / 0.3048,
         "position is in mm: set its unit": v * 1e3,
         "position is in cm: set its unit": v * 1e2,
     } | {f"velocity is about {words}": v[rows] for words, rows in _shifted(log)}
@@ -64,6 +67,7 @@ def rates(log: FlightLog) -> Pairs:
         "body rates are in rad/s, declared deg/s: declare rad/s": (turned, omega * 180 / np.pi),
         "body rates are in the world frame: rotate them into the body": (turned, back.apply(omega)),
         "body rates and attitude differ in body frame: convert the one that is FRD": (turned, omega @ BODIES["FRD"]),
+        "x and y of the body rates are exchanged: name their columns so": (turned, omega[:, [1, 0, 2]]),
         "body rates have the opposite sign": (turned, -omega),
     }
     found |= {
@@ -95,6 +99,8 @@ def accelerations(log: FlightLog) -> Pairs:
         'the body is FRD in a world with z up: set body = "FRD"': (quaternion_from_matrix(frd), v),
         BODY: (q, attitude.apply(v)),
     }
+    stated[f"{HANDED}flip the signs of py and vy"] = q, v * [1, -1, 1]
+    stated[f"{HANDED}exchange x and y of position and velocity"] = q, v[:, [1, 0, 2]]
     for degrees in (90, -90, 180):
         stated[f"{HEADING} {degrees}°: add that to yaw"] = _turn(np.full(len(q), np.deg2rad(degrees)), q), v
     # Other mistakes of attitudes rotate thrust about z only, which wind or a load may do as well.

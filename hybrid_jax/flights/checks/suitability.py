@@ -20,6 +20,7 @@ SLOW_ROTOR = 100.0  # rad/s; the rotors of every multirotor turn faster than 955
 STILL = 5.0  # rad/s, below which a rotor stands
 MOVED = 0.5  # m of height that only flight explains
 BEYOND = 0.02  # share by which a motor may exceed the largest
+MOSTLY = 0.5  # share of samples beyond a limit from which on their unit is wrong
 JUMP = 0.5  # share of the whole time that one gap may last
 USED = ("position", "velocity", "body_velocity", "attitude", "rates")
 
@@ -133,6 +134,8 @@ def _limits(recording: Recording, vehicle: Vehicle | None) -> Check:
             wrap = name == "command" and -0.51 < signal.values.min() < 0 and signal.values.max() < 0.51
             mend = "a 16-bit number wrapped: log it without sign" if wrap else "cut these samples out"
             mend += " or raise max_rotor_speed of the vehicle file" if name == "rotor_speed" and value > 0 else ""
+            if share > MOSTLY and not wrap:
+                mend = "most are: are they in another unit, such as PWM in µs? declare it"
             where = f"{name} of motor {column} is {value:.4g} at {signal.t[row]:.4g} s, must be from 0 to {most:.4g}"
             return judged("motors within limits", share, "share of samples", 0.0, f"{where}: {mend}")
     return judged("motors within limits", 0.0, "share of samples", 0.0, "")
@@ -160,7 +163,7 @@ def _flown(recording: Recording, vehicle: Vehicle | None) -> Check:
     advice = ""
     if speeds and STILL < value < SLOW_ROTOR:
         told = f"rotor speeds up to {value:.3g} rad/s ({value * 30 / np.pi:.4g} rpm) are too slow for flight"
-        advice = f"{told}: are they rad/s or rev/s, read as rpm? correct their unit"
+        advice = f"{told}: are they percent of a command, or rad/s or rev/s, read as rpm? correct their unit"
     elif value < limit and climbed > MOVED:
         told = f"the motors of {motors.source} rest, and yet the height changes by {climbed:.2g} m"
         advice = f"{told}: the vehicle's own are in another topic, instance or column: name or log those"

@@ -194,6 +194,8 @@ def _in_order(where: str, ticks: np.ndarray, tick: float) -> tuple[np.ndarray, l
         raise ValueError(f"{where}: time goes back from {times}: {why}; split the file there")
     rising = np.append(True, t[kept][1:] > latest[:-1])
     late, repeated = int((back > 0).sum()), int((~rising & (back == 0)).sum())
+    if late > LOST * len(kept):
+        raise ValueError(f"{where}: {late} of {len(kept)} samples are out of order: sort them by time")
     lines += [f"{late} samples out of order by up to {back[row]:.2g} s"] if late else []
     return kept[rising], lines + ([f"{repeated} samples that repeat a time"] if repeated else [])
 
