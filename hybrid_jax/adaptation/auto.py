@@ -21,7 +21,7 @@ from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
-from hybrid_jax.runtime import FAST_COMPILE, jit_with
+from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.status import ended
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
@@ -131,7 +131,7 @@ class Auto(Method):
         return Solution(candidate(larger, choice, choice.taken), fits.steps[own], status, choice)
 
 
-_compiled, _errors_of = jit_with(FAST_COMPILE)(Auto._solution), jit_with(FAST_COMPILE)(errors_of)
+_compiled, _errors_of = jit_with(FASTEST_COMPILE)(Auto._solution), jit_with(FASTEST_COMPILE)(errors_of)
 
 
 def taken_of(errors: BlockErrors, supported: Bool[Array, " c"], sizes: np.ndarray) -> Int[Array, ""]:
