@@ -226,7 +226,7 @@ def coverage_figure(rows: Results) -> Figure:
             note(axes, parameter, (min(shares.values()), y), (-6, 0), va="center", ha="right", color="0.4")
         axes.set(title="without noise" if noise == "none" else "with sensor noise", xlim=(60, 100.5))
         axes.set_xlabel("intervals that contain the true value [%]")
-        name_lines(axes, [CHANGES_SHOWN.get(name, name.replace("_", " ")) for name in changes])
+        name_lines(axes, [CHANGES_SHOWN.get(name) or str(name).replace("_", " ") for name in changes])
     return legend_below(figure, "Do 95 % intervals contain the true value?")
 
 

@@ -153,11 +153,15 @@ def library_map(path: str | Path) -> ColumnMap:
     """The map of a file with the library's columns t, px … wz, u0 …; errors as of `read_table`."""
     names, motors = header_of(path), input_names(MOST_ROTORS)
     count = max([FEWEST_ROTORS, *(i + 1 for i, name in enumerate(motors) if name in names)])
-    parts = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
-    units = {"position": "m", "attitude": "wxyz", "velocity": "m/s", "body_rates": "rad/s"}
-    stated = {name: Columns(STATE_NAMES[part], units[name]) for name, part in parts.items()}
-    frames, time = Frames("ENU", "FLU", "world"), Columns(("t",), "s")
-    return ColumnMap(frames, time, **stated, motors=Columns(motors[:count], "rad/s"))
+    return ColumnMap(
+        Frames("ENU", "FLU", "world"),
+        Columns(("t",), "s"),
+        position=Columns(STATE_NAMES[POSITION], "m"),
+        attitude=Columns(STATE_NAMES[QUATERNION], "wxyz"),
+        velocity=Columns(STATE_NAMES[VELOCITY], "m/s"),
+        body_rates=Columns(STATE_NAMES[BODY_RATES], "rad/s"),
+        motors=Columns(motors[:count], "rad/s"),
+    )
 
 
 def read_mapped(path: str | Path, column_map: ColumnMap | None = None) -> Recording:
