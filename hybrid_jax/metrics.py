@@ -7,11 +7,11 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.chunks import in_chunks
-from hybrid_jax.dynamics.base import AbstractVectorField, check_windows
+from hybrid_jax.dynamics.base import AbstractVectorField, continuous
 from hybrid_jax.integrate import Solver
 from hybrid_jax.rollouts import predict
 from hybrid_jax.runtime import entry
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, check
 
 CHUNK = 1000  # windows predicted at once
 
@@ -61,7 +61,7 @@ def window_mse(
         solver: by default `RK4`.
         chunk: windows predicted at a time.
     """
-    windows = check_windows(field, windows)
+    windows = continuous(field, check(windows, "windows"))
     checks.count("chunk", chunk)
     checks.count("every", every)
     if every > windows.horizon:

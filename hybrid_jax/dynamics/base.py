@@ -143,8 +143,13 @@ def check_windows(field: AbstractVectorField, windows: Trajectories, name: str =
     space = state_space(field, windows.x0.shape[-1])
     for part, states in (("x0", windows.x0), ("x", windows.x)):
         space.check(f"{name}: {part}", states)
+    return continuous(field, windows)
+
+
+def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectories:
+    """As `check_windows`, without a look at the states."""
     windows = _as_precise(field, windows)
-    x = space.continuous(windows.x0, windows.x)
+    x = state_space(field, windows.x0.shape[-1]).continuous(windows.x0, windows.x)
     return windows if x is windows.x else replace(windows, x=x)
 
 

@@ -140,14 +140,14 @@ def test_flights_not_seen_are_predicted_better(method, left):
 
 
 def test_a_mapped_run_is_the_run_alone():
-    fields, trains = [source(seed) for seed in range(3)], [gusty(seed) for seed in (0, 2, 3)]
+    fields, trains, held_out = [source(seed) for seed in range(3)], [gusty(seed) for seed in (0, 2, 3)], gusty(1)
 
     def one(field, train):
-        return fit_ridge(last_layer, field, train, gusty(1))
+        return fit_ridge(last_layer, field, train, held_out)
 
     lanes = jax.device_get(eqx.filter_jit(eqx.filter_vmap(one))(stack(fields), stack(trains)))
     for i, (field, train) in enumerate(zip(fields, trains, strict=True)):
-        here, alone = lane(lanes, i), _fit_ridge(last_layer, field, train, gusty(1))
+        here, alone = lane(lanes, i), _fit_ridge(last_layer, field, train, held_out)
         # Float32 defects carry 1e-7 / dt, and neighbours in the grid may predict equally well.
         np.testing.assert_allclose(here.mse, alone.mse, rtol=1e-3)
         np.testing.assert_allclose(derivatives(here.field, train), derivatives(alone.field, train), rtol=0, atol=1e-2)
