@@ -24,7 +24,7 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     constants = nominal_values(vehicle, terms) | theta
     q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
     thrust, torque = _wrench(vehicle, constants, u)
-    gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
+    gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], jnp.result_type(thrust)), (3,) + (1,) * thrust.ndim)
     acceleration = (thrust / constants["mass"][0]) * rotation.body_z(q) + gravity
     attitude = rotation.matrix(q)
     velocity = [dot(column, v) for column in zip(*attitude, strict=True)]

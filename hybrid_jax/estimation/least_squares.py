@@ -46,14 +46,14 @@ class LeastSquaresFit(eqx.Module):
         steps: evaluations of the residuals and their Jacobian.
         status: how it ended, a `Status`.
         discretisation: by how many standard errors half the solver's step would move the parameter that it moves most;
-            NaN where this was not looked at.
+            -1 where this was not looked at.
     """
 
     field: AbstractVectorField
     mse: Float[Array, ""]
     steps: Int[Array, ""]
     status: Int[Array, ""]
-    discretisation: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(jnp.nan))
+    discretisation: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(-1.0))
 
     @property
     def converged(self) -> Bool[Array, ""]:

@@ -166,7 +166,7 @@ def test_failed_checks_end_with_exit_code_3(vehicle, tmp_path):
 @pytest.mark.slow
 def test_bad_log_is_refused_with_file_row_and_field(vehicle, tmp_path):
     source = write(tmp_path / "source", LOGS[:3])
-    rows = ("0,0,0,1,1,0,0,0,0,0,0,0,0,0,600,600,600,600", "0.01,0,0,1,1,0,0,0,nan,0,0,0,0,0,600,600,600,600")
+    rows = ("0,0,0,1,1,0,0,0,0,0,0,0,0,0,600,600,600,600", "0.01,0,0,1,1,0,0,0,fast,0,0,0,0,0,600,600,600,600")
     (source / "bad.csv").write_text("\n".join(["t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3", *rows]))
     options = ("--vehicle", str(vehicle), "--source", str(source))
     line = refused(command("real_flight", *options, folder=tmp_path), "real_flight")
