@@ -44,9 +44,10 @@ QUESTIONS = {
     "tested on windows of 0.1 s (Sec. 4.7 and Table 2 of the paper, and baselines that the paper does not have).",
 }
 RATE_NOTE = (
-    "C8 and C10 depend on the rate of θ_p in fine-tuning, --rates.physics-fine-tuning, which cannot be read in the "
-    "paper. The mean error with N = 100 over that with 1000 is 1.22 with 1e-1, 1.34 with 3e-2, 1.65 with 1e-2 (the "
-    "default) and 3.3 with 1e-3, where Ix ends 20 % too low and Iy 31 % too high (three seeds)."
+    "C8 and C10 depend on the rate of θ_p in fine-tuning, --rates.physics-fine-tuning, an option whose "
+    "value in the paper we could not confirm. The mean error with N = 100 over that with 1000 is 1.22 with 1e-1, "
+    "1.34 with 3e-2, 1.65 with 1e-2 (the default) and 3.3 with 1e-3, where Ix ends 20 % too low and Iy "
+    "31 % too high (three seeds)."
 )
 ABOUT = {
     names.HYBRID: "rigid-body physics f_p(x, u; θ_p) plus a small network f_d(x, u; θ_d), both trained",
