@@ -14,7 +14,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import tyro
 
+from hybrid_jax.cli.command import exit_codes
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
 from hybrid_jax.flights.checks.cleaning import in_flight
 from hybrid_jax.flights.checks.consistency import FAILS, UNKNOWN, WARNS, Check, check_log
@@ -237,10 +239,13 @@ def count_alarms(folder: Path) -> int:
     return alarms
 
 
-def main() -> int:
-    if folders := [Path(each) for each in sys.argv[1:]]:
-        return int(sum(map(count_alarms, folders)) > 0)
-    return matrix()
+def main(folders: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
+    """Count the checks that fail on sound logs; without a folder, plant mistakes in simulated flights and name them.
+
+    Args:
+        folders: logs, also in folders below, in which nothing is wrong.
+    """
+    return int(sum(map(count_alarms, folders)) > 0) if folders else matrix()
 
 
 def matrix() -> int:
@@ -265,4 +270,5 @@ def matrix() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    with exit_codes("benchmarks.log_mistakes", "", "interrupted"):
+        raise SystemExit(tyro.cli(main, prog="python -m benchmarks.log_mistakes"))
