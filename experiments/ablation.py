@@ -141,13 +141,13 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
         config=config.described(),
         environment=environment(seconds),
         rows=rows,
-        figures=save_figures(out, drawn, config.paper),
+        figures=save_figures(out, drawn),
         notes=NOTES,
         head=HEAD,
         conclusion=conclusion(rows),
         tables=ablation_tables(rows, TRUTH),
     )
-    write_report(out, report, paper=config.paper)
+    write_report(out, report)
 
 
 class Effect(NamedTuple):

@@ -113,7 +113,7 @@ def experiment(config: ChangesConfig, console: Console) -> None:
             environment=environment(stages.seconds),
             rows=rows,
             claims=verdicts,
-            figures=save_figures(out, draw(rows), config.paper),
+            figures=save_figures(out, draw(rows)),
             notes=stages.notes(),
             head=HEAD.strip(),
             conclusion=conclusion(rows),
@@ -123,7 +123,7 @@ def experiment(config: ChangesConfig, console: Console) -> None:
                 error_table(rows),
             ],
         )
-        write_report(out, report, Console(), config.paper)
+        write_report(out, report, Console())
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:

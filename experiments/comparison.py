@@ -91,11 +91,11 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
     drawn = ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
     caption = "Test errors of all seeds of every method (paper, Table 2)"
-    figures = save_figures(out, {"standings": (drawn, caption)}, config.paper)
+    figures = save_figures(out, {"standings": (drawn, caption)})
     notes = [*stages.notes(), GIVEN_NETWORK]
     true, extra = {each.name: nominal(each.vehicle) for each in DOMAINS}, {"flights": flights}
     report = paper_report(NAME, config, stages.seconds, rows, true, figures, notes, floor, extra)
-    write_report(out, report, Console(), config.paper)
+    write_report(out, report, Console())
 
 
 def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, Fit], Fit | None]:

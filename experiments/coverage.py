@@ -116,14 +116,14 @@ def experiment(config: CoverageConfig, console: Console) -> None:
         environment=environment(stages.seconds),
         rows=rows,
         claims=verdicts,
-        figures=save_figures(config.out / NAME, draw(rows), config.paper),
+        figures=save_figures(config.out / NAME, draw(rows)),
         notes=stages.notes(),
         head=HEAD.strip(),
         conclusion=conclusion(rows),
         tables=tables,
         extra={"known_body": known.rows},
     )
-    write_report(config.out / NAME, report, Console(), config.paper)
+    write_report(config.out / NAME, report, Console())
 
 
 def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig, stages: Stages) -> list[Row]:

@@ -183,7 +183,7 @@ def write(
         environment=environment(seconds),
         rows=rows,
         claims=verdicts,
-        figures=save_figures(out, drawn, config.paper),
+        figures=save_figures(out, drawn),
         notes=[*missing, *notes],
         extra={"ablation": ablated.rows, "speed": timed},
         head=head(config),
@@ -191,7 +191,7 @@ def write(
         tables=[*titled, speed_table(timed)],
         more_rows=ablated,
     )
-    write_report(out, report, Console(), config.paper)
+    write_report(out, report, Console())
 
 
 def draw(

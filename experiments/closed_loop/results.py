@@ -117,8 +117,7 @@ def tables(rows: Results) -> list[Table]:
         lines = {agent.name: own for agent, own in by_agent(group).items()}
         columns = {label: {"reference": name} for name, label in REFERENCES.items() if name in group["reference"]}
         for title, text in list(titles.items())[: 1 if distance else None]:
-            table = cross_table(f"{title}, {DOMAINS[domain]}{away(distance)}", lines, columns, text)
-            made.append(table._replace(best="column" if "less is better" in title else ""))
+            made.append(cross_table(f"{title}, {DOMAINS[domain]}{away(distance)}", lines, columns, text))
     return made
 
 

@@ -133,14 +133,14 @@ def experiment(config: ExcitationConfig, console: Console) -> None:
         environment=environment(stages.seconds),
         rows=rows,
         claims=verdicts,
-        figures=save_figures(out, figures, config.paper),
+        figures=save_figures(out, figures),
         notes=stages.notes(),
         head=HEAD.strip(),
         tables=[verdict_table(verdicts, "Hypotheses"), *tables(rows), margin_table(design, evidence)],
         extra={"design": described(design)},
         conclusion=conclusion(rows),
     )
-    write_report(out, report, Console(), config.paper)
+    write_report(out, report, Console())
 
 
 def designed(config: ExcitationConfig) -> Excitation:

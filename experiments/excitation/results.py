@@ -115,7 +115,7 @@ def tables(rows: Results) -> list[Table]:
     }
     head = ("flight", "parameter")
     return [
-        widths._replace(best="column"),
+        widths,
         tabulate("Intervals, their prediction and errors", rows.group(*head), more, head),
     ]
 

@@ -57,13 +57,13 @@ def experiment(config: OnlineConfig, console: Console) -> None:
         environment=environment(stages.seconds),
         rows=rows,
         claims=verdicts,
-        figures=save_figures(out, drawn, config.paper) | notes,
+        figures=save_figures(out, drawn) | notes,
         notes=[f"One step of the filter: {step:.3f} ms of processor time on one core, in a compiled loop."],
         extra={"step_ms": step},
         head=HEAD.strip(),
         tables=[verdict_table(verdicts, "Goals"), *tables(rows)],
     )
-    write_report(out, report, Console(), config.paper)
+    write_report(out, report, Console())
 
 
 def draw(run: Run, own: Setup, config: OnlineConfig, out: Path):

@@ -88,7 +88,7 @@ def tables(rows: Results) -> list[Table]:
                 return text if len(own) else EMPTY
 
             title = f"RMSE of the position [cm], {CHANGE_NAMES[change]}, {title} (mean over seeds; less is better)"
-            made.append(cross_table(title, lines, columns, cell)._replace(best="column"))
+            made.append(cross_table(title, lines, columns, cell))
     return [*made, *_found(rows), *_coverage(rows)]
 
 

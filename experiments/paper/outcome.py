@@ -80,13 +80,13 @@ def adapt_and_report(experiment: str, domain: Domain, floor: float, config: Adap
         return
     out, truth, rows = config.out / experiment, nominal(domain.vehicle), found.rows
     save_models(out / "models", found.lanes, rows)
-    figures = save_figures(out, draw(domain, config, found, truth, floor), config.paper)
+    figures = save_figures(out, draw(domain, config, found, truth, floor))
     lowest = np.digitize(lowest_altitude(found.target.splits["test"]), BAND_EDGES)
     counted = ", ".join(f"{np.sum(lowest == i)} {band}" for i, band in enumerate(BANDS.values()))
     notes = [*found.notes, f"Test windows by lowest altitude: {counted}."]
     extra = {"flights": {"source": found.source.metadata, "target": found.target.metadata}}
     report = paper_report(experiment, config, found.seconds, rows, truth, figures, notes, floor, extra)
-    write_report(out, report, Console(), config.paper)
+    write_report(out, report, Console())
 
 
 def paper_report(

@@ -150,7 +150,7 @@ def error_table(rows: Results) -> Table:
         return f"{of_each_case(own, name).mean():.3g}"
 
     lines = [(name, *(text(own, name) for own in groups.values())) for name in (AUTO, *rows.unique("candidate"))]
-    return Table("Mean test error L^T_MSE (less is better)", ("method", *groups), lines, "column")
+    return Table("Mean test error L^T_MSE (less is better)", ("method", *groups), lines)
 
 
 @mpl.rc_context(STYLE)

@@ -53,8 +53,8 @@ def by_size(rows: Results) -> list[Table]:
         modes = {FINE_TUNED: (FINE_TUNED, SOURCE_ONLY), TARGET_ONLY: (TARGET_ONLY,)}
         columns = {
             label(model, mode): {"model": model, "mode": seen}
-            for model in MODELS
             for mode, seen in modes.items()
+            for model in MODELS
             if len((trained or group).where(model=model, mode=seen))
         }
         capped = "; *: the cap on epochs ended a run" * ("capped" in group.unique("status"))
@@ -65,7 +65,7 @@ def by_size(rows: Results) -> list[Table]:
             sizes = own.sort(n_train=None).group("n_train")
             lines = {str(n) if n else f"none ({label(SOURCE_ONLY)})": cell for n, cell in sizes.items()}
             table = cross_table(title, lines, columns, text, "N, target trajectories")
-            tables.append(table._replace(best="line") if text is error_text else table)
+            tables.append(table)
     return tables
 
 
@@ -126,7 +126,7 @@ def altitudes(rows: Results) -> list[Table]:
     columns = {"": "all", **{f"_{name}": title for name, title in BANDS.items()}}
     lines = [(*key, *(text(f"{column}{end}", group) for end in columns)) for key, (column, group) in groups.items()]
     title = f"Test error by the lowest altitude of the window, and its floor ({mean_over_seeds(own)})"
-    return [Table(title, ("model", "mode", "N", *columns.values()), lines, "column", labels=3)]
+    return [Table(title, ("model", "mode", "N", *columns.values()), lines, labels=3)]
 
 
 def ranking(rows: Results) -> list[Table]:
@@ -153,7 +153,7 @@ def ranking(rows: Results) -> list[Table]:
             smallest = f"{values.smallest:.3g}".replace("inf", "∞")
             lines.append((method_label(cell), str(cell[2] or EMPTY), smallest, error_text(of_cell), own, *paper))
         of = f"experiment {[*PAPER].index(domain) + 1} of the paper; {over_seeds(group)}; less is better"
-        tables.append(Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, lines, "column", labels=2))
+        tables.append(Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, lines, labels=2))
     return tables
 
 

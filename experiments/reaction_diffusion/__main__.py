@@ -70,12 +70,12 @@ def experiment(config: Config, console: Console) -> None:
         environment=environment(stages.seconds),
         rows=results,
         claims=verdicts,
-        figures=save_figures(out, draw(results, shown, patterns, DT), config.paper),
+        figures=save_figures(out, draw(results, shown, patterns, DT)),
         notes=stages.notes(),
         head=HEAD.strip(),
         tables=[verdict_table(verdicts, "Goals, and the paper's claims for a PDE"), *tables(results)],
     )
-    write_report(out, report, Console(), config.paper)
+    write_report(out, report, Console())
 
 
 ABOUT = (

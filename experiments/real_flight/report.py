@@ -60,14 +60,14 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
         "outside": {flight: each for flight, (_, each) in shares.items()},
         "logs": {label: logs.records for label, logs in experiment.logs.items()},
     }
-    figures = save_figures(out, make_figures(experiment, outputs), experiment.config.paper)
+    figures = save_figures(out, make_figures(experiment, outputs))
     given = (experiment.config.described(), environment(stages.seconds), rows, claims, figures)
     head = introduction(name, experiment, outputs)
     tables = [*log_tables(records), main[0], outside_table(shares), *main[1:], *more]
     notes = [*stages.notes(), *NOTES]
     warned = warnings_of(shares)
     made = report.Report(name, *given, notes, extra, head, tables, conclusion=conclusion(outputs), warnings=warned)
-    report.write_report(out, made, paper=experiment.config.paper)
+    report.write_report(out, made)
     print_tables(console, [table for table in main if not (made.meaningless and table.verdicts)])
     for line in (*warned, *made.conclusions()):
         console.print(line, highlight=False, soft_wrap=True, style="yellow" * (line in warned), markup=False)
@@ -195,10 +195,7 @@ def score_tables(rows: Results, dt: float) -> list[Table]:
     if SUM in score_labels(rows):
         titles[SUM] = "Mean error of steps 1 to 50, summed"
     named, of = {cell_name(*cell): group for cell, group in cells(rows).items()}, mean_over_seeds(rows)
-    return [
-        tabulate(f"{at}; {of}, test windows of all folds", named, _errors(label))._replace(best="column")
-        for label, at in titles.items()
-    ]
+    return [tabulate(f"{at}; {of}, test windows of all folds", named, _errors(label)) for label, at in titles.items()]
 
 
 def fold_tables(rows: Results) -> list[Table]:

@@ -63,32 +63,16 @@ def subplots(size: tuple[float, float], rows: int, columns: int, **options: Any)
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def save_figure(figure: Figure, path: str | Path, paper: bool = False) -> list[Path]:
-    """Write `path`.png, and .pdf for a paper, the same bytes for the same figure; returns the paths."""
-    paths = []
-    for suffix, metadata in (("png", {}), ("pdf", {"CreationDate": None}))[: 1 + paper]:
-        content = io.BytesIO()
-        with mpl.rc_context(STYLE):
-            figure.savefig(content, format=suffix, dpi=DPI, metadata=metadata)
-            figure.set_layout_engine("none")  # the second file keeps the layout of the first, which saves half the time
-        paths.append(Path(f"{path}.{suffix}"))
-        write_atomic(paths[-1], with_palette(content) if suffix == "png" else content.getvalue())
-    return paths
-
-
-def with_palette(png: io.BytesIO) -> bytes:
-    """The picture in few colours, which look the same and take a third of the bytes."""
-    content = io.BytesIO()
-    PIL.Image.open(png).convert("RGB").quantize(SHADES, dither=PIL.Image.Dither.NONE).save(
-        content, "png", optimize=True
-    )
-    return content.getvalue()
-
-
-def save_figures(out: Path, figures: Mapping[str, tuple[Figure, str]], paper: bool = False) -> dict[str, str]:
-    """Write figures, given with their captions by name; returns the captions by file, as a report takes them."""
+def save_figures(out: Path, figures: Mapping[str, tuple[Figure, str]]) -> dict[str, str]:
+    """Write figures, given with their captions by name, the same bytes for the same figure, in few colours, which look
+    the same and take a third of the bytes; returns the captions by file, as a report takes them."""
     for name, (figure, _) in figures.items():
-        save_figure(figure, out / name, paper)
+        drawn, content = io.BytesIO(), io.BytesIO()
+        with mpl.rc_context(STYLE):
+            figure.savefig(drawn, format="png", dpi=DPI)
+        picture = PIL.Image.open(drawn).convert("RGB").quantize(SHADES, dither=PIL.Image.Dither.NONE)
+        picture.save(content, "png", optimize=True)
+        write_atomic(out / f"{name}.png", content.getvalue())
     return {f"{name}.png": caption for name, (_, caption) in figures.items()}
 
 

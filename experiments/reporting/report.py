@@ -2,39 +2,116 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.text import Text
 
-from experiments.reporting import claims, latex
-from experiments.reporting.contents import Report
-from experiments.reporting.results import leaves
-from experiments.reporting.tables import Table, markdown, plain, print_tables
+from experiments.reporting import claims
+from experiments.reporting.claims import Verdict
+from experiments.reporting.questions import QUESTIONS, Asked
+from experiments.reporting.results import Results, leaves
+from experiments.reporting.tables import Table, markdown, narrowed, plain, print_tables
 from hybrid_jax.cli.page import Page, document
 from hybrid_jax.cli.page import Table as Cells
-from hybrid_jax.io.files import json_text, json_value, write_atomic
+from hybrid_jax.io.files import json_value, write_atomic
 
-FORMAT = 2  # of report.json; 1 had no key "format", and rows of some experiments without all their tags
+FORMAT = 2  # of report.json
 JSON_NAME, CSV_NAME, PAGE_NAME, HTML_NAME = "report.json", "rows.csv", "report.md", "report.html"
-PAPER = "paper"  # the subfolder of LaTeX tables
+MEANINGLESS = "The smoke preset only shows that everything works: its numbers mean nothing, so no hypothesis is judged."
 
 
-def write_report(out: str | Path, report: Report, console: Console | None = None, paper: bool = False) -> None:
+@dataclass(frozen=True)
+class Report:
+    """What a report holds, whatever it is written as.
+
+    Attributes:
+        figures: path relative to the report → caption.
+        notes: sentences for the end of the page.
+        extra: further keys of report.json.
+        head: title and introduction of the page, Markdown.
+        tables: of the page and the terminal.
+        more_rows: of rows.csv; report.json holds them in `extra`.
+        conclusion: sentences before that on hypotheses.
+        warnings: what a reader must know before any number.
+    """
+
+    experiment: str
+    config: Mapping[str, Any]
+    environment: Mapping[str, Any]
+    rows: Results
+    claims: Sequence[Verdict] = ()
+    figures: Mapping[str, str] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    head: str = ""
+    tables: Sequence[Table] = ()
+    more_rows: Results = field(default_factory=Results)
+    conclusion: Sequence[str] = ()
+    warnings: Sequence[str] = ()
+
+    @property
+    def meaningless(self) -> bool:
+        return self.config.get("preset") == "smoke"
+
+    @property
+    def asked(self) -> Asked:
+        return QUESTIONS.get(self.experiment, Asked(self.experiment))
+
+    def ordered(self) -> list[tuple[str, str]]:
+        """Path and caption of each figure, the main one first."""
+        return sorted(self.figures.items(), key=lambda figure: figure[0] != self.asked.figure)
+
+    def conclusions(self) -> list[str]:
+        """What the page begins with."""
+        return [MEANINGLESS] if self.meaningless else [*self.conclusion, *claims.summary(self.claims)]
+
+    def shown(self) -> list[Table]:
+        """The tables of the page; numbers that mean nothing have no verdicts."""
+        return [table for table in self.tables if not (self.meaningless and table.verdicts)]
+
+    def page(self, folder: Path) -> Page:
+        """Question, answer, one figure, one table of few columns and what they mean; the rest is folded."""
+        asked, (_, _, introduction) = self.asked, self.head.partition("\n")
+        said = [" ".join(re.sub(r"[*`]", "", each).split()) for each in re.split(r"\n\s*\n|\n- ", introduction)]
+        plainly = [table for table in self.shown() if not (table.verdicts or table.folded)]
+        named = [table for table in plainly if asked.table in table.title] or plainly
+        main = narrowed(named[0]) if named else None
+        tables = [Cells("The question, the models and the measures", ("",), [(each,) for each in said if each])]
+        tables += [_cells(table) for table in self.shown() if table != main]
+        for name, each in {"Environment": self.environment, "Configuration": self.config}.items():
+            lines = [(key, json.dumps(value, ensure_ascii=False)) for key, value in leaves(each, ", ")]
+            tables.append(Cells(name, ("", ""), lines))
+        pictures = [(caption, (folder / path).read_bytes()) for path, caption in self.ordered()]
+        return Page(
+            asked.question,
+            " ".join(self.conclusions()),
+            _cells(main) if main else None,
+            pictures,
+            [*self.warnings, *asked.meaning],
+            details=[table for table in tables if table.lines],
+            notes=self.notes,
+        )
+
+
+def write_report(out: str | Path, report: Report, console: Console | None = None) -> None:
     """Write report.html, report.md, rows.csv and report.json into the folder `out`, each atomically, report.json last.
 
-    The tables, the notes and where the report is are printed to the console, if any. `paper`: also LaTeX tables.
+    The tables, the notes and where the report is are printed to the console, if any: of the hypotheses of a quick run
+    those alone that it decides.
     """
     out, record = Path(out), lines_of(to_json(report))
-    tables = {f"{PAPER}/{latex.file_name(table)}.tex": latex.latex(table) for table in report.shown() if paper}
-    contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: page(report)} | tables
-    contents |= {HTML_NAME: document(shown_page(report, out)), JSON_NAME: record}
+    page = report.page(out)
+    contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: markdown_page(page, report)}
+    contents |= {HTML_NAME: document(page), JSON_NAME: record}
     for name, content in {name: content.encode() for name, content in contents.items()}.items():
         write_atomic(out / name, content)
     if console is not None:
-        print_tables(console, report.printed())
+        quick = report.config.get("preset") == "quick"
+        print_tables(console, [claims.decided(t) if quick and t.verdicts else t for t in report.shown()])
         for line in (*report.notes, *report.warnings, *report.conclusions()):
             console.print(Text(line))
         console.print(Text(f"Report: {out / HTML_NAME}"), soft_wrap=True)
@@ -61,63 +138,30 @@ def lines_of(record: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(f"{text(name)}: {entry(value)}" for name, value in record.items()) + "\n}\n"
 
 
-def shown_page(report: Report, out: Path) -> Page:
-    """report.html as the console script writes its pages; figures are read from `out`."""
-    _, _, introduction = report.head.partition("\n")
-    said = [" ".join(re.sub(r"[*`]", "", each).split()) for each in re.split(r"\n\s*\n|(?:^|\n)- ", introduction)]
-    main, tables = report.main_table(), [_cells(table) for table in report.folded_tables()]
-    about = {"Environment": report.environment, "Configuration": report.config}
-    known = [
-        Cells(name, ("", ""), [(key, json.dumps(value, ensure_ascii=False)) for key, value in leaves(each, ", ")])
-        for name, each in about.items()
-    ]
-    asked = Cells("The question, the models and the measures", ("",), [(each,) for each in said if each])
-    return Page(
-        report.asked.question,
-        " ".join(report.conclusions()),
-        _cells(main) if main else None,
-        [(caption, (out / path).read_bytes()) for path, caption in report.figures_in_order().items()],
-        [*report.warnings, *report.asked.meaning],
-        details=[*([asked] if asked.lines else []), *tables, *known],
-        notes=report.notes,
-    )
-
-
 def _cells(table: Table) -> Cells:
     return Cells(table.title, table.header, table.lines)
 
 
-def page(report: Report) -> str:
-    """report.md: question, answer, one figure, one table and what they mean; the rest is folded."""
-    _, _, introduction = report.head.partition("\n")
-    figures = [f"![{plain(text)}]({path})\n\n*{plain(text)}*" for path, text in report.figures_in_order().items()]
-    answer, main = " ".join(map(plain, report.conclusions())), report.main_table()
+def markdown_page(page: Page, report: Report) -> str:
+    """report.md: the same page; what is folded opens on a click, in a site and in a forge."""
+    figures = [f"![{plain(caption)}]({path})\n\n*{plain(caption)}*" for path, caption in report.ordered()]
+    more = {table.title: markdown(table) for table in page.details}
+    more |= {"More figures": "\n\n".join(figures[1:]), "Notes": _bullets(page.notes)}
     parts = [
-        f"# {report.asked.question}",
-        f"**{answer}**" if answer else "",
-        *map(plain, report.warnings),
+        f"# {page.question}",
+        f"**{plain(page.answer)}**" * bool(page.answer),
         *figures[:1],
+        f"## {plain(page.table.title)}\n\n{markdown(page.table)}" if page.table else "",
+        f"## What this means for you\n\n{_bullets(page.meaning)}" if page.meaning else "",
+        f"## Details\n\nThis is the report of `experiments.{report.experiment}`.",
+        *(
+            f'<details markdown="1"><summary>{plain(title)}</summary>\n\n{content}\n\n</details>'
+            for title, content in more.items()
+            if content
+        ),
     ]
-    parts += [f"## {plain(main.title)}", markdown(main)] if main else []
-    parts += ["## What this means for you", bullets(report.asked.meaning)] if report.asked.meaning else []
-    parts += ["## Details", f"This is the report of `experiments.{report.experiment}`."]
-    parts += [folded("Question, models and measures", introduction.strip())] if introduction.strip() else []
-    parts += [folded(plain(table.title), markdown(table)) for table in report.folded_tables()]
-    parts += [folded("More figures", "\n\n".join(figures[1:]))] if figures[1:] else []
-    parts += [folded("Notes", bullets(report.notes))] if report.notes else []
-    lines = []
-    for name, value in leaves(report.environment, ", "):
-        shown = ", ".join(str(item) for item in value) if isinstance(value, list) else str(value)
-        lines.append((name + (" [s]" if name.startswith("seconds, ") else ""), shown))
-    config = f"```json\n{json_text(report.config)}```"
-    parts += [folded("Environment", markdown(Table("", ("", ""), lines))), folded("Configuration", config)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def bullets(lines: Sequence[str]) -> str:
+def _bullets(lines: Sequence[str]) -> str:
     return "\n".join(f"- {plain(line)}" for line in lines)
-
-
-def folded(title: str, content: str) -> str:
-    """Markdown that opens on a click, in a site and in a forge."""
-    return f'<details markdown="1"><summary>{title}</summary>\n\n{content}\n\n</details>'

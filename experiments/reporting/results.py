@@ -132,27 +132,10 @@ class Results:
         return list(zip(self["seed"], self["draw"], strict=True))
 
     def to_csv(self) -> str:
-        """CSV. A nested column becomes one per entry: theta.Ix is `Ix`, and its theta_interval `Ix_low` and `Ix_high`.
-
-        A number that is not finite is `null`; a cell is empty where a row has no such number.
-        """
-        nested = {name for row in self.rows for name, value in row.items() if isinstance(value, dict)}
-        names: dict[str, Any] = {}
-        lines = []
-        for row in self.rows:
-            line: dict[str, Any] = {}
-            for name, value in row.items():
-                if (of := name.removesuffix("_interval")) not in nested:
-                    line[name] = value
-                elif of == name:
-                    line |= leaves(value or {}, " ")
-                else:  # columns for all entries, also of a row without intervals
-                    names |= line | _ends(dict.fromkeys(row[of] or {}))
-                    line |= _ends(value or {})
-            names |= line
-            lines.append({name: "null" if value is None else value for name, value in line.items()})
+        """CSV; a nested column becomes one per entry, as theta.Ix, and a cell is empty where a row has no number."""
+        lines = [dict(leaves(row, ".")) for row in self.rows]
         text = io.StringIO()
-        writer = csv.DictWriter(text, names, lineterminator="\n")
+        writer = csv.DictWriter(text, dict.fromkeys(name for line in lines for name in line), lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines)
         return text.getvalue()
@@ -172,8 +155,3 @@ def leaves(tree: Mapping[str, Any], between: str, prefix: str = "") -> Iterator[
             yield from leaves(value, between, f"{prefix}{name}{between}")
         else:
             yield f"{prefix}{name}", value
-
-
-def _ends(intervals: Mapping[str, Any]) -> dict[str, Any]:
-    pairs = {name: pair or (None, None) for name, pair in intervals.items()}
-    return {f"{name}_{end}": pair[i] for name, pair in pairs.items() for i, end in enumerate(("low", "high"))}

@@ -1,11 +1,9 @@
-"""Tables of text, the same for a page of Markdown and for a terminal."""
+"""Tables of text, the same for a page and for a terminal."""
 
 import math
-import re
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -19,24 +17,25 @@ EMPTY = "–"
 STYLES = {"✓ holds": "green", "✗ fails": "bold red"}
 SMALLEST, LARGEST = -3, 5  # powers of ten between which numbers are written without an exponent
 BETWEEN = 3  # characters between two printed columns, and one more in all
-NEAR = re.compile(
-    r"(?<=[±✓✗]) | (?=±)|(?<=\bN) (?==)|(?<=\bN =) |(?<=^–) |(?<=\d) (?=%|m\b|s\b|ms\b|Hz\b|kg\b|m/s|rad/s)"
-)  # spaces that no line may end at
-TIED = "\0"
-NUMBER = re.compile(r"\(?(?P<number>[-+]?\d+\.?\d*(?:e[-+]?\d+)?)(?:[^(]*\)(?P<power>e[-+]?\d+))?")
+FEW = 6  # columns of the table that a page shows first
 Cell = Callable[[Results], str]  # the text of a cell, of the rows that belong to it
 
 
 class Table(NamedTuple):
-    """Header and lines of cells, all text, under a title."""
+    """Header and lines of cells, all text, under a title.
+
+    Attributes:
+        labels: columns that say what a line is of.
+        verdicts: whether these are verdicts, which a smoke run must not show.
+        folded: whether a page shows it on a click alone.
+    """
 
     title: str
     header: Sequence[str]
     lines: Sequence[Sequence[str]]
-    best: Literal["", "line", "column"] = ""  # the smallest number of each line or column is the best
-    labels: int = 1  # columns that say what a line is of
-    verdicts: bool = False  # whether these are verdicts, which a smoke run must not show
-    folded: bool = False  # whether a page shows it on a click alone
+    labels: int = 1
+    verdicts: bool = False
+    folded: bool = False
 
 
 def tabulate(
@@ -110,103 +109,47 @@ def mean_over_seeds(results: Results) -> str:
     return seeds if seeds == "one seed" else f"mean ± std over {seeds}"
 
 
-def number_in(text: str) -> float | None:
-    """The number that a cell begins with, if any: 0.067 of "0.067 ± 0.009", 3.2e-4 of "(3.2 ± 0.2)e-04"."""
-    if (text := text.replace("−", "-").strip()).startswith(("∞", "-∞")):
-        return math.inf if text[0] == "∞" else -math.inf
-    found = NUMBER.match(text)
-    return float(found["number"] + (found["power"] or "")) if found else None
+def narrowed(table: Table) -> Table:
+    """The table with its first columns alone, at most FEW."""
+    return table._replace(header=table.header[:FEW], lines=[line[:FEW] for line in table.lines])
 
 
-def best_cells(table: Table) -> set[tuple[int, int]]:
-    """Line and column of each cell that holds the smallest number of its line or column, if that is the best."""
-    numbers = {(i, j): number_in(text) for i, line in enumerate(table.lines) for j, text in enumerate(line)}
-    axis = {"line": 0, "column": 1}.get(table.best)
-    groups: dict[int, dict[tuple[int, int], float]] = {}
-    for place, number in numbers.items():
-        if axis is not None and number is not None and math.isfinite(number) and place[1] >= table.labels:
-            groups.setdefault(place[axis], {})[place] = number
-    return {place for own in groups.values() if len(own) > 1 for place in own if own[place] == min(own.values())}
-
-
-def narrowed(table: Table, most: int = 6) -> Table:
-    """The table with its labels, its best columns and the first of the others, in at most so many columns."""
-    best = [column for _, column in sorted(best_cells(table), key=lambda place: place[1])]
-    wanted = list(dict.fromkeys([*range(table.labels), *best, *range(len(table.header))]))[:most]
-    kept = sorted(wanted)
-    lines = [[line[i] for i in kept] for line in table.lines]
-    return (
-        table if len(kept) == len(table.header) else table._replace(header=[table.header[i] for i in kept], lines=lines)
-    )
-
-
-def markdown(table: Table) -> str:
+def markdown(table: Any) -> str:
+    """The header and lines of a table of texts."""
     lines = [table.header, ["---"] * len(table.header), *table.lines]
     return "\n".join(f"| {' | '.join(plain(cell) for cell in line)} |" for line in lines)
 
 
 def print_tables(console: Console, tables: Sequence[Table]) -> None:
-    """Print tables so that no word and no number is broken; one that is too wide comes in parts below each other."""
+    """Print tables so that no word is broken; one that is too wide comes in parts, each with the labels."""
     for table in tables:
-        for i, columns in enumerate(parts := columns_of_parts(table, console.width)):
-            of = f" ({i + 1} of {len(parts)})" if len(parts) > 1 else ""
-            console.print(_printed(table, columns, console.width, table.title + of))
+        columns = list(zip(table.header, *table.lines, strict=True))
+        least = [max(len(word) for cell in column for word in [*cell.split(), ""]) for column in columns]
+        parts = columns_of_parts([width + BETWEEN for width in least], table.labels, console.width - 1)
+        for number, own in enumerate(parts, 1):
+            of = f" ({number} of {len(parts)})" if len(parts) > 1 else ""
+            # As Text, or the brackets of a unit would be read as markup.
+            printed = RichTable(title=Text(table.title + of), title_justify="left", title_style="bold", box=SIMPLE_HEAD)
+            more = {i: max(map(len, columns[i])) - least[i] for i in own}  # that a column would take to wrap nothing
+            left = max(0, console.width - 1 - sum(least[i] + BETWEEN for i in own))
+            for after, i in enumerate(sorted(own, key=more.__getitem__)):  # rich itself would break words
+                more[i] = min(more[i], left // (len(own) - after))
+                left -= more[i]
+            for i in own:
+                printed.add_column(Text(table.header[i]), width=least[i] + more[i])
+            for line in table.lines:
+                printed.add_row(*(Text(line[i], style=STYLES.get(line[i], "")) for i in own))
+            console.print(printed)
 
 
-def columns_of_parts(table: Table, width: int) -> list[list[int]]:
-    """The columns of each part of a table, each part with the labels, such that its longest words fit."""
-    least = [min(least, width // 2) for least, _ in _widths(table)]
-    labels = list(range(table.labels))
-    if sum(least[: table.labels]) + BETWEEN * table.labels > width // 2:
-        labels = labels[:1]
-    alone = width - 1 - sum(least[i] + BETWEEN for i in labels)
-    parts, room = [labels], alone
-    for i in range(len(labels), len(least)):
-        if least[i] + BETWEEN > room and len(parts[-1]) > len(labels):
-            parts.append(labels)
-            room = alone
-        parts[-1] = [*parts[-1], i]
-        room -= least[i] + BETWEEN
-    return parts
-
-
-def _printed(table: Table, columns: Sequence[int], width: int, title: str) -> RichTable:
-    # As Text, or the brackets of a unit would be read as markup.
-    printed = RichTable(title=Text(title), title_justify="left", title_style="bold", box=SIMPLE_HEAD)
-    known = [_widths(table)[i] for i in columns]
-    widths = dict(zip(columns, _shared(known, width - BETWEEN * len(columns) - 1), strict=True))
-    for i, own in widths.items():
-        printed.add_column(Text(_wrapped(table.header[i], own)), width=own, no_wrap=True, overflow="ellipsis")
-    for line in table.lines:
-        printed.add_row(*(Text(_wrapped(line[i], own), style=STYLES.get(line[i], "")) for i, own in widths.items()))
-    return printed
-
-
-def _widths(table: Table) -> list[tuple[int, int]]:
-    """Of each column the lengths of its longest word and of its longest cell."""
-    columns = zip(table.header, *table.lines, strict=True)
-    return [(max(len(word) for cell in own for word in _words(cell)), max(map(len, own))) for own in columns]
-
-
-def _shared(widths: Sequence[tuple[int, int]], room: int) -> list[int]:
-    """Room for each column: first the longest words, then whole cells, the shortest first."""
-    given = [min(least, room // 2) for least, _ in widths]
-    left = room - sum(given)
-    for after, i in enumerate(order := sorted(range(len(widths)), key=lambda i: widths[i][1] - given[i])):
-        more = min(widths[i][1] - given[i], left // (len(order) - after))
-        given[i] += more
-        left -= more
-    return given
-
-
-def _words(text: str) -> list[str]:
-    """The parts that no line may end within: a mean stays with its deviation, and a number with its unit."""
-    return NEAR.sub(TIED, text).split(" ")
-
-
-def _wrapped(text: str, width: int) -> str:
-    lines = textwrap.wrap(NEAR.sub(TIED, text), width, break_long_words=False, break_on_hyphens=False)
-    return "\n".join(lines).replace(TIED, " ")
+def columns_of_parts(least: Sequence[int], labels: int, width: int) -> list[list[int]]:
+    """The columns of each part of a table, each with those of the labels, such that the least widths fit."""
+    parts: list[list[int]] = [[]]
+    for i in range(labels, len(least)):
+        if parts[-1] and sum(least[:labels]) + sum(least[j] for j in [*parts[-1], i]) > width:
+            parts.append([])
+        parts[-1].append(i)
+    return [[*range(labels), *part] for part in parts]
 
 
 def plain(text: str) -> str:

@@ -23,7 +23,7 @@ else:  # the command line offers what the registry holds
     Activation = Literal[tuple(ACTIVATIONS)]
 
 # Options that do not affect the results.
-UNFIXED = ("out", "cache", "fresh", "paper", "saving", "distributed", "coordinator", "processes", "process_id")
+UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id")
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,6 @@ class Run:
     JAX_COMPILATION_CACHE_DIR."""
     fresh: bool = False
     """Start anew: earlier results in --out and unfinished sweeps are moved to a backup; nothing is deleted."""
-    paper: bool = False
-    """Also write every table as LaTeX (booktabs), to the subfolder `paper` of the results, and every figure as PDF."""
     saving: float = 0.02
     """Largest share of a sweep's time spent on saving checkpoints; a smaller share means more work lost by a kill."""
     seeds: Count = 10

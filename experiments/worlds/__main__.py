@@ -72,7 +72,7 @@ def experiment(config: WorldsConfig, console: Console) -> None:
             conclusion=conclusion(rows),
             tables=[verdict_table(verdicts, "Hypotheses"), *(table(rows) for table in TABLES)],
         )
-        write_report(config.out / NAME, report, Console(), config.paper)
+        write_report(config.out / NAME, report, Console())
 
 
 TABLES = ratio_table, coverage_table, expectation_table, method_table

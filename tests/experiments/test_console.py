@@ -12,8 +12,7 @@ from smoke import ROOT
 
 from experiments.coverage import pooled_table
 from experiments.paper.known_body import known_body_table
-from experiments.reporting.contents import MEANINGLESS
-from experiments.reporting.report import write_report
+from experiments.reporting.report import MEANINGLESS, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import Table, columns_of_parts, print_tables
 from experiments.runner.progress import Line
@@ -30,16 +29,14 @@ def tables_of(page):
         yield Table(title, header, lines)
 
 
-@pytest.mark.parametrize("terminal", [True, False])
-@pytest.mark.parametrize("width", [80, 120])
-@pytest.mark.parametrize("page", REPORTS, ids=lambda page: page.parent.name)
-def test_no_word_and_no_number_is_broken(page, width, terminal):
-    for table in tables_of(page):
-        assert_whole(table, width, terminal)
+@pytest.mark.parametrize(("width", "terminal"), [(80, True), (120, False)])
+def test_no_word_is_broken(width, terminal):
+    for page in REPORTS:
+        for table in tables_of(page):
+            assert_whole(table, width, terminal)
 
 
-@pytest.mark.parametrize("terminal", [True, False])
-@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize(("width", "terminal"), [(80, True), (120, False)])
 def test_nor_in_the_tables_of_coverage(width, terminal):
     """Of which no report is kept: the longest names and numbers that it can have."""
     tags = {"domain": "load_and_wind", "noise": "1", "parameter": "k", "draw": 0}
@@ -59,15 +56,11 @@ def assert_whole(table, width, terminal):
     words = set(printed.split())
     cells = {cell for line in [table.header, *table.lines] for cell in line}
     assert [word for cell in cells for word in cell.split() if word not in words] == []
-    flat = [" ".join(line.split()) for line in printed.splitlines()]
-    pairs = {pair for cell in cells for pair in re.findall(r"\S+ ± [^\s,;]+", cell)}
-    assert [pair for pair in pairs if not any(pair in line for line in flat)] == []
 
 
 def test_a_table_that_is_too_wide_comes_in_parts_that_each_have_the_labels():
-    table = Table("t", ("model", "N", *"abcdef"), [("hybrid", "100", *["0.067 ± 0.009"] * 6)], labels=2)
-    assert columns_of_parts(table, 80) == [[0, 1, 2, 3, 4, 5], [0, 1, 6, 7]]
-    assert columns_of_parts(table, 200) == [[*range(8)]]
+    assert columns_of_parts([9, 6, *[16] * 6], 2, 79) == [[0, 1, 2, 3, 4, 5], [0, 1, 6, 7]]
+    assert columns_of_parts([9, 6, *[16] * 6], 2, 199) == [[*range(8)]]
 
 
 def test_a_smoke_run_shows_no_verdict(tmp_path):

@@ -13,7 +13,7 @@ from test_ranking import compared_rows, spoilt
 
 from experiments.paper.figures import ranking, scores, theta
 from experiments.paper.flight_figures import example_flight, predictions, tilt
-from experiments.reporting.plots import COLOURS, LARGEST_RATIO, save_figure
+from experiments.reporting.plots import COLOURS, LARGEST_RATIO, save_figures
 
 
 def straight_flight(steps=10):
@@ -37,16 +37,13 @@ FIGURES = {
 
 @pytest.mark.parametrize("make", FIGURES.values(), ids=FIGURES)
 def test_figures_are_reproducible(tmp_path, make):
-    first, again = (save_figure(make(), tmp_path / name / "figure") for name in ("one", "two"))
-    assert [path.name for path in first] == ["figure.png"]
-    for one, two in zip(first, again, strict=True):
-        assert one.read_bytes() == two.read_bytes()
-    assert first[0].read_bytes().startswith(b"\x89PNG")
-
-
-def test_drawing_keeps_matplotlibs_settings(tmp_path):
     before = dict(mpl.rcParams)
-    save_figure(FIGURES["scores"](), tmp_path / "figure")
+    assert save_figures(tmp_path, {name: (make(), "A figure") for name in ("one", "two")}) == {
+        "one.png": "A figure",
+        "two.png": "A figure",
+    }
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
     assert dict(mpl.rcParams) == before
 
 

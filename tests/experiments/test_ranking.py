@@ -144,6 +144,6 @@ def test_page_of_a_comparison(tmp_path):
     assert "<summary>Claims of the paper" in shown
     assert page.count("| C9 |") == 1
     assert "N, target trajectories" not in page
-    assert all(page.count(f"- **{name}**") == 1 for name in ("Expert Augmentation", "θ_p only", "last layer (ridge)"))
+    assert all(page.count(f"| {name}: ") == 1 for name in ("Expert Augmentation", "θ_p only", "last layer (ridge)"))
     assert "95 % ± 0.5" in page
     assert "✓ holds" in text.getvalue()
