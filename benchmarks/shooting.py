@@ -14,7 +14,7 @@ from hybrid_jax.control import Controller, Weights
 from hybrid_jax.control.controller import VARIABLE_BOUND
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.export import casadi_step
+from hybrid_jax.export import casadi_function
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 
 TOLERANCE = 1e-6
@@ -107,7 +107,7 @@ def _step(model: AbstractVectorField, dt: float, half: float) -> ca.Function:
         return disturbed(model, both[INPUT_SIZE:])(x, both[:INPUT_SIZE])
 
     x, share, wind = ca.SX.sym("x", STATE_SIZE), ca.SX.sym("s", INPUT_SIZE), ca.SX.sym("w", 6)
-    step = casadi_step(windy, dt, state_size=STATE_SIZE, input_size=INPUT_SIZE + 6)  # pyright: ignore
+    step = casadi_function(windy, dt, state_size=STATE_SIZE, input_size=INPUT_SIZE + 6)  # pyright: ignore
     end = step(x, ca.vertcat(half * (1 + share), wind))
     end[QUATERNION] = end[QUATERNION] / ca.norm_2(end[QUATERNION])
     return ca.Function("step", [x, share, wind], [end])

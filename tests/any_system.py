@@ -16,7 +16,7 @@ from smoke import script
 from systems import SYSTEMS
 
 import hybrid_jax as hj
-from hybrid_jax.export import casadi_step, export_program, load_program
+from hybrid_jax.export import casadi_function, export_program, load_program
 from hybrid_jax.metrics import rollout_mse
 
 # Few epochs: what is checked is that every method goes through, not how well it does.
@@ -104,7 +104,7 @@ def test_an_exported_step_is_the_model_s(adapted, method, tmp_path):
     scale = float(np.abs(expected).max())
     export_program(tmp_path / "step.npz", field, test.dt, **sizes)
     np.testing.assert_allclose(load_program(tmp_path / "step.npz")(x, u), expected, atol=1e-6 * scale)
-    step = attempt(casadi_step, field, test.dt, **sizes)
+    step = attempt(casadi_function, field, test.dt, **sizes)
     if isinstance(step, casadi.Function):
         np.testing.assert_allclose(np.ravel(step(x, u)), expected, atol=1e-5 * scale)
     else:

@@ -21,7 +21,7 @@ from hybrid_jax.adaptation import ridge
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.least_squares import fit_least_squares
-from hybrid_jax.export import casadi_function, casadi_step, export_program, load_program
+from hybrid_jax.export import casadi_function, export_program, load_program
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import SplitSpec, random_flights
@@ -283,5 +283,5 @@ def test_a_program_is_written_whole_or_refused(folder, options, dt, field):
     st.fixed_dictionaries(SIZES, optional={"name": odd("f")}), odd(0.05), st.sampled_from([SWING, BODY, None, "field"])
 )
 def test_a_casadi_function_is_made_or_refused(options, dt, field):
-    for made in (outcome(casadi_function, field, **options), outcome(casadi_step, field, dt, **options)):
+    for made in (outcome(casadi_function, field, **options), outcome(casadi_function, field, dt, **options)):
         assert made is None or is_finite(np.asarray(made(np.ones(2), np.ones(1))))

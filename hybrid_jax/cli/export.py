@@ -19,7 +19,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
-from hybrid_jax.export import casadi_function, casadi_step, export_adaptation_c, export_c, export_program
+from hybrid_jax.export import casadi_function, export_adaptation_c, export_c, export_program
 from hybrid_jax.export.program import sizes_of, vehicle_in
 from hybrid_jax.io.models import load
 from hybrid_jax.networks import smoothed
@@ -120,7 +120,8 @@ def run(options: Options) -> int:
             export_program(options.output / f"{kind}.npz", field, length, **own, **more)
             written.append(options.output / f"{kind}.npz")
         if "casadi" in options.to:
-            for kind, function in (("field", casadi_function(field, **own)), ("step", casadi_step(field, dt, **own))):
+            for kind, length, letter in (("field", None, "f"), ("step", dt, "F")):
+                function = casadi_function(field, length, name=letter, **own)
                 function.save(str(options.output / f"{kind}.casadi"))
                 written.append(options.output / f"{kind}.casadi")
     if options.smooth is not None:

@@ -1,7 +1,7 @@
 """Export ẋ = f(x, u), or a step x⁺ = F(x, u), for programs that do not use this library.
 
 - `export_program`, `load_program`: StableHLO in a file, through `jax.export` (extra `export`).
-- `casadi_function`, `casadi_step`, `acados_model`: CasADi functions, for optimal control (extra `casadi`).
+- `casadi_function`: a CasADi function, for optimal control (extra `casadi`).
 - `export_c`, `export_adaptation_c`: C99 for a flight controller.
 
 See docs/howto/export.md for an example.
@@ -9,9 +9,7 @@ See docs/howto/export.md for an example.
 
 from hybrid_jax.export.c.adaptation import export_adaptation_c
 from hybrid_jax.export.c.fields import export_c
-from hybrid_jax.export.casadi_functions import acados_model, casadi_function, casadi_step
+from hybrid_jax.export.casadi_functions import casadi_function
 from hybrid_jax.export.stablehlo import Program, export_program, load_program
 
-__all__ = ["Program", "acados_model", "casadi_function", "casadi_step"]
-__all__ += ["export_adaptation_c", "export_c"]
-__all__ += ["export_program", "load_program"]
+__all__ = ["Program", "casadi_function", "export_adaptation_c", "export_c", "export_program", "load_program"]

@@ -1,6 +1,6 @@
 """Fields and steps as CasADi functions, for optimal control, estimation and generated C code (extra `casadi`)."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 
@@ -18,18 +18,21 @@ MOST_STATES = 512  # a field on a grid of thousands would be a graph of millions
 @entry
 def casadi_function(
     field: AbstractVectorField,
+    dt: float | None = None,
     *,
     state_size: Size = None,
     input_size: Size = None,
     name: str = "f",
     smooth: float | None = None,
 ) -> "casadi.Function":
-    """ẋ = f(x, u) of a field in inference mode, from x (d × 1) and u (m × 1) to xdot (d × 1), in double precision.
+    """ẋ = f(x, u) of a field in inference mode, or a step of it, from x (d × 1) and u (m × 1), in double precision.
 
-    CasADi differentiates it, saves it (`.save`) and translates it to C (`.generate`).
+    Its output is xdot, or xnext of a step. CasADi differentiates it, saves it (`.save`) and translates it to C
+    (`.generate`).
 
     Args:
         field: ẋ = f(x, u), of one state x (d,) and one input u (m,).
+        dt: length of a step of RK4 with the input held [s], x⁺ = F(x, u); without it the function is ẋ.
         state_size: d; by default that of the field's vehicle or, failing that, its attribute of this name.
         input_size: m; likewise.
         name: of the function, as CasADi accepts it.
@@ -41,73 +44,14 @@ def casadi_function(
             that CasADi does not have, by its name.
         ImportError: casadi is not installed.
     """
-    return _function(field, None, state_size, input_size, name, smooth, "xdot")
-
-
-@entry
-def casadi_step(
-    field: AbstractVectorField,
-    dt: float,
-    *,
-    state_size: Size = None,
-    input_size: Size = None,
-    name: str = "F",
-    smooth: float | None = None,
-) -> "casadi.Function":
-    """x⁺ = F(x, u), one step of RK4 with u held; its output is xnext. Otherwise as `casadi_function`.
-
-    Args:
-        field: as of `casadi_function`, like `state_size`, `input_size` and `smooth`.
-        dt: length of the step [s].
-        state_size: d.
-        input_size: m.
-        name: of the function.
-        smooth: β of a smooth ReLU.
-    """
-    checks.positive("dt", dt, "a positive number of seconds")
-    return _function(field, float(dt), state_size, input_size, name, smooth, "xnext")
-
-
-@entry
-def acados_model(
-    field: AbstractVectorField,
-    *,
-    state_size: Size = None,
-    input_size: Size = None,
-    name: str = "model",
-    smooth: float | None = None,
-) -> dict[str, Any]:
-    """The attributes of an `AcadosModel` of acados: name, x, u, xdot, p, f_expl_expr and f_impl_expr = xdot − f(x, u).
-
-    Set them one by one: `model = AcadosModel(); [setattr(model, *one) for one in acados_model(field).items()]`. acados
-    integrates by itself, so there is no step; p is empty, as the parameters are numbers. Errors as of
-    `casadi_function`.
-
-    Args:
-        field: as of `casadi_function`, like `state_size`, `input_size` and `smooth`.
-        state_size: d.
-        input_size: m.
-        name: of the model.
-        smooth: β of a smooth ReLU.
-    """
-    function = casadi_function(field, state_size=state_size, input_size=input_size, name=name, smooth=smooth)
-    import casadi as ca
-
-    x, u = ca.SX.sym("x", function.numel_in(0)), ca.SX.sym("u", function.numel_in(1))
-    xdot, slope = ca.SX.sym("xdot", function.numel_out(0)), function(x, u)
-    expressions = {"f_expl_expr": slope, "f_impl_expr": xdot - slope}
-    return {"name": name, "x": x, "u": u, "xdot": xdot, "p": ca.SX.sym("p", 0), **expressions}
-
-
-def _function(
-    field, dt: float | None, state_size: Size, input_size: Size, name: str, smooth: float | None, output: str
-) -> "casadi.Function":
     try:
         import casadi as ca
 
         from hybrid_jax.export.casadi_operations import evaluate
     except ImportError as error:
         raise ImportError("CasADi functions need casadi: pip install 'hybrid_jax[casadi]'") from error
+    if dt is not None:
+        checks.positive("dt", dt, "a positive number of seconds")
     sizes = sizes_of(field, state_size, input_size)
     if sizes[0] > MOST_STATES:
         raise ValueError(
@@ -121,4 +65,4 @@ def _function(
     with jax.enable_x64(True):
         likes = [jax.ShapeDtypeStruct((size,), float) for size in sizes]
         result = evaluate(jax.make_jaxpr(program_of(field, likes, dt, smooth))(*likes), symbols)
-    return ca.Function(name, symbols, [result], ["x", "u"], [output])
+    return ca.Function(name, symbols, [result], ["x", "u"], ["xdot" if dt is None else "xnext"])

@@ -8,7 +8,7 @@ from choices import FEW
 from fields import FIELDS, KEY, SIZES, body, double, field_of, samples
 
 from hybrid_jax import Hybrid, residual_network
-from hybrid_jax.export import acados_model, casadi_function, casadi_step
+from hybrid_jax.export import casadi_function
 from hybrid_jax.integrate import rollout
 from hybrid_jax.networks import smoothed
 
@@ -46,7 +46,7 @@ def test_it_has_the_values_and_the_derivatives_of_the_field(name):
 
 @pytest.mark.parametrize("name", ["hybrid, norm batch", "one's own"])
 def test_a_step_is_an_interval_of_a_rollout(name):
-    function = casadi_step(field_of(name), 0.02)
+    function = casadi_function(field_of(name), 0.02)
     with jax.enable_x64(True):
         field = double(field_of(name))
         for x, u in zip(*samples(2), strict=True):
@@ -56,7 +56,7 @@ def test_a_step_is_an_interval_of_a_rollout(name):
 def test_inputs_and_outputs_have_names_and_sizes_of_another_system_too():
     function = casadi_function(residual_network(2, 1, KEY, hidden=4), state_size=2, input_size=1, name="pendulum")
     assert str(function) == "pendulum:(x[2],u)->(xdot[2]) SXFunction"
-    assert casadi_step(body(), 0.01).name_out() == ["xnext"]
+    assert casadi_function(body(), 0.01).name_out() == ["xnext"]
     assert function(x=[0.1, 0.2], u=0.3)["xdot"].shape == (2, 1)
 
 
@@ -66,32 +66,8 @@ def test_smooth_takes_the_place_of_relu_alone():
     with jax.enable_x64(True):
         for field, smooth in ((relu, smoothed(relu, 30.0)), (tanh, tanh)):
             close(casadi_function(field, smooth=30.0)(x, u), double(smooth)(x, u))
-            close(casadi_step(field, 0.02, smooth=30.0)(x, u), rollout(double(smooth), x, u[None], 0.02)[0])
+            close(casadi_function(field, 0.02, smooth=30.0)(x, u), rollout(double(smooth), x, u[None], 0.02)[0])
     assert abs(casadi_function(relu)(x, u) - casadi_function(relu, smooth=30.0)(x, u)).full().max() > 1e-6
-
-
-def test_a_model_of_acados_has_the_field_explicitly_and_implicitly():
-    """As far as CasADi goes: acados itself is on no package index."""
-    model, (x, u) = acados_model(field_of("hybrid, norm none"), name="iris"), (part[0] for part in samples())
-    assert (model["name"], model["x"].shape, model["u"].shape) == ("iris", (13, 1), (4, 1))
-    expected = casadi_function(field_of("hybrid, norm none"))(x, u)
-    x_, u_, xdot, p, slope = (model[key] for key in ("x", "u", "xdot", "p", "f_expl_expr"))
-    assert p.is_empty()
-    assert all(one.is_valid_input() for one in (x_, u_, xdot))
-    explicit = ca.Function("e", [x_, u_, p], [slope])
-    implicit = ca.Function("i", [x_, xdot, u_, p], [model["f_impl_expr"]])
-    close(explicit(x, u, []), expected)
-    assert abs(implicit(x, expected, u, [])).full().max() == 0
-    assert abs(implicit(x, expected + 1, u, []) - 1).full().max() < 1e-9
-    # Its explicit integrators ask for directions Sx and Su, its implicit ones for Jacobians.
-    seeds = np.random.default_rng(0).normal(size=(13, 17))
-    forward = ca.Function("v", [x_, u_, p], [ca.jtimes(slope, x_, ca.DM(seeds)) + ca.jacobian(slope, u_) @ seeds[:4]])
-    whole = ca.Function("j", [x_, xdot, u_, p], [ca.jacobian(model["f_impl_expr"], one) for one in (x_, xdot, u_)])
-    by_x, by_xdot, by_u = (part.full() for part in whole(x, expected, u, []))
-    np.testing.assert_allclose(forward(x, u, []), -by_x @ seeds - by_u @ seeds[:4], rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(by_xdot, np.eye(13))
-    with jax.enable_x64(True):
-        close(-by_x, jax.jacfwd(double(field_of("hybrid, norm none")))(jnp.asarray(x), jnp.asarray(u)))
 
 
 def test_it_is_the_same_after_a_file(tmp_path):
@@ -154,7 +130,7 @@ def test_an_operation_that_casadi_has_not_is_named(field, said):
 def test_what_makes_no_sense_is_refused():
     for dt in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="dt must be a positive"):
-            casadi_step(body(), dt)
+            casadi_function(body(), dt)
     with pytest.raises(ValueError, match="name must be one"):
         casadi_function(body(), name="1 f")
     with pytest.raises(ValueError, match="field: ResidualNetwork does not take"):
