@@ -6,7 +6,6 @@ what a multirotor's network reads and returns, and `factory` builds these by nam
 point of a grid.
 """
 
-from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.grids import GridNetwork, grid_network
 from hybrid_jax.networks.mlp import (
     InputScaling,
@@ -18,7 +17,7 @@ from hybrid_jax.networks.mlp import (
     zero_output,
 )
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
-from hybrid_jax.networks.views import RotorThrust
+from hybrid_jax.networks.views import RotorThrust, make_residual
 
 __all__ = ["BatchNorm", "Bias", "InputScaling", "LayerNorm", "LinearResidual", "LinearSkip", "ResidualNetwork"]
 __all__ += [
