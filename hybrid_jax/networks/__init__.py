@@ -1,10 +1,4 @@
-"""Residual networks f_d.
-
-`mlp` defines the network of the paper and linear maps, `activations` what its hidden units are, `normalisation` its
-scaling and what its hidden layer may be normalised by, `standardise` sets the scaling from windows, `views` restrict
-what a multirotor's network reads and returns, and `factory` builds these by name. `grids` has the same network at every
-point of a grid.
-"""
+"""Residual networks f_d: that of the paper (`mlp`), parts of a multirotor's state (`views`), and grids (`grids`)."""
 
 from hybrid_jax.networks.grids import GridNetwork, grid_network
 from hybrid_jax.networks.mlp import (
