@@ -21,8 +21,9 @@ from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_
 from hybrid_jax.flights.checks.cleaning import in_flight
 from hybrid_jax.flights.checks.consistency import FAILS, UNKNOWN, WARNS, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording
-from hybrid_jax.flights.formats.raw import WXYZ, XYZ, Samples, record
-from hybrid_jax.flights.load import find_logs, read_log
+from hybrid_jax.flights.conversion import flight_at
+from hybrid_jax.flights.formats.raw import Samples, record
+from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
@@ -165,9 +166,8 @@ def sound_logs(domain: Domain, seed: int) -> list[FlightLog]:
 
 def recording_of(log: Parts) -> Recording:
     """What a reader of CSV makes of such columns."""
-    names = {"p": ("position", XYZ), "q": ("attitude", WXYZ), "v": ("velocity", XYZ), "w": ("rates", XYZ)}
-    names["u"] = "rotor_speed", tuple(map(str, range(log["u"].shape[1])))
-    samples = {name: Samples(log["t"], log[key], axes, f"columns of {name}") for key, (name, axes) in names.items()}
+    names = {"p": "position", "q": "attitude", "v": "velocity", "w": "rates", "u": "rotor_speed"}
+    samples = {name: Samples(log["t"], log[key], f"columns of {name}") for key, name in names.items()}
     return record("flight", samples, facts={"format": "CSV"})
 
 
@@ -194,13 +194,13 @@ def checks_of(path: Path, top: Path) -> tuple[list[Check], str]:
     )
     vehicle = None if vehicle is None else load_vehicle(vehicle)
     try:
-        raw = read_log(path, columns=columns)
+        raw = read_recording(path, columns=columns)
     except ValueError as error:
         return [], str(error)
-    slowest = max((each.interval for name, each in raw.recording.signals.items() if name != "voltage"), default=1.0)
-    found = raw.checks(vehicle, slowest)
+    slowest = max((each.interval for name, each in raw.signals.items() if name != "voltage"), default=1.0)
+    found = check_recording(raw, vehicle, slowest)
     try:
-        log, _ = in_flight(raw.flight(slowest, (0.0, 1.0)))
+        log, _ = in_flight(flight_at(raw, slowest, (0.0, 1.0)))
         return [*found, *check_log(log, vehicle)], ""
     except ValueError as error:
         return found, str(error)

@@ -11,7 +11,8 @@ from hybrid_jax.cli.command import ChecksFailed
 from hybrid_jax.cli.flags import in_flags
 from hybrid_jax.flights.checks.cleaning import clean, lag_motors
 from hybrid_jax.flights.checks.consistency import FAILS, Check, check_log
-from hybrid_jax.flights.checks.suitability import failures
+from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.flights.conversion import flight_at, own_interval
 from hybrid_jax.flights.load import read_folder
 from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
 from hybrid_jax.flights.windows import flight_of
@@ -50,13 +51,13 @@ def load_logs(option: str, folder: Path, vehicle: Vehicle, time_constant: float,
         about_folder = str(error).startswith(f"{folder}: ")
         raise ValueError(f"--{option} {error}" if about_folder else str(error)) from error
     # Before they become flights, which those that fail might not do.
-    found = [raw.checks(vehicle, dt) for raw in raws]
-    names = [f"{option}/{Path(raw.recording.name).name}" for raw in raws]
+    found = [check_recording(raw, vehicle, dt or own_interval(raw)) for raw in raws]
+    names = [f"{option}/{Path(raw.name).name}" for raw in raws]
     require_checks(list(zip(names, found, strict=True)), config)
-    flights = [raw.flight(dt, config.polynomial) for raw in raws]
+    flights = [flight_at(raw, dt, config.polynomial) for raw in raws]
     cleaned = [clean(flight, config.cleaning, vehicle) for flight in flights]
     records = [
-        _record(option, flight, log, done, [*checks, *check_log(log, vehicle)], raw.recording.notes)
+        _record(option, flight, log, done, [*checks, *check_log(log, vehicle)], raw.notes)
         for raw, flight, (log, done), checks in zip(raws, flights, cleaned, found, strict=True)
     ]
     logs = LogSet(option, [log for log, _ in cleaned], records, {path.name: why for path, why in left.items()})

@@ -14,8 +14,8 @@ from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body, with_vehicle
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.io.archive import named_leaves
+from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.networks.views import make_residual
 from hybrid_jax.training.channels import ChannelLoss, channels_from
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle

@@ -16,9 +16,8 @@ from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import DT, STATES, to_flight
-from hybrid_jax.flights.formats.raw import WXYZ, XYZ
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.recording import Recording, Signal
+from hybrid_jax.flights.recording import AXES, Recording, Signal
 from hybrid_jax.identification.slow_commands import SLOW
 from hybrid_jax.vehicle import Vehicle
 
@@ -120,8 +119,8 @@ def _filled(recording: Recording, signals: dict[str, Signal], dt: float) -> Reco
             in_body = signals[name] is recording.signals.get("body_velocity")
             kept["body_velocity" if in_body else name] = signals[name]
         else:
-            axes, rest = (WXYZ, [1.0, 0, 0, 0]) if name == "attitude" else (XYZ, [0.0] * 3)
-            kept[name] = Signal(motors.t[[0, -1]], np.tile(rest, (2, 1)), axes, "nothing")
+            rest = [1.0, 0, 0, 0] if name == "attitude" else [0.0] * 3
+            kept[name] = Signal(motors.t[[0, -1]], np.tile(rest, (2, 1)), AXES[name][0], "nothing")
     return replace(recording, signals=kept)
 
 

@@ -28,8 +28,8 @@ from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
+from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.networks.views import make_residual
 from hybrid_jax.training import Settings, fit, rates_by_group
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.trajectories import Trajectories

@@ -21,7 +21,7 @@ from hybrid_jax.cli.logs import LISTS, look, raw_logs
 from hybrid_jax.cli.vehicle_text import vehicle_text
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
-from hybrid_jax.flights.load import read_log
+from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording, Signal
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.vehicle import Vehicle
@@ -126,15 +126,13 @@ def inspected(path: Path, vehicle: Vehicle | None, options: Any) -> Inspected:
     """Read and check one log, by the options of this verb or of `fit`; what refuses it is part of the result."""
     name = printable(path.name)
     try:
-        raw = read_log(path, **options.reading)
+        raw = read_recording(path, **options.reading)
     except ValueError as error:
         why = str(error).removeprefix(f"{path}: ")
         return Inspected(name, None, refusal=printable(in_flags("inspect", why)))
     found = look(path, raw, vehicle, options.dt, options.polynomial)
     told = [replace(each, suggestion=in_flags("inspect", each.suggestion)) for each in found.checks]
-    return Inspected(
-        name, raw.recording, told, in_flags("inspect", found.refusal), (*raw.recording.notes, *found.notes)
-    )
+    return Inspected(name, raw, told, in_flags("inspect", found.refusal), (*raw.notes, *found.notes))
 
 
 def write_vehicle(

@@ -13,8 +13,9 @@ from hybrid_jax.cli.command import ChecksFailed, step
 from hybrid_jax.cli.log_options import SpeedOptions, require_distinct
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.checks.consistency import RATIO, Check, check_log
-from hybrid_jax.flights.checks.suitability import failures
-from hybrid_jax.flights.load import RawLog, find_logs, read_log
+from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.flights.conversion import flight_at
+from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import FlightLog, unevenness
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.windows import LogWindows, cut_windows, require_length
@@ -103,14 +104,14 @@ def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptio
         ValueError: a log cannot be read, or is there twice.
     """
     with step(f"reading {folder}") as told:
-        raws, said = raw_logs(folder, lambda path: read_log(path, **options.reading))
-        contents = {path.name: content_of(raw.recording) for path, raw in raws}
+        raws, said = raw_logs(folder, lambda path: read_recording(path, **options.reading))
+        contents = {path.name: content_of(raw) for path, raw in raws}
         require_distinct(list(contents.items()))
         logs, failed = [], []
         for path, raw in raws:
             one = look(path, raw, vehicle, dt, options.polynomial, changed)
             lines = failures(one.checks, path.name) or [f"{path.name}: no flight: {one.refusal}"] * bool(one.refusal)
-            said += [f"{path.name}: {note}" for note in (*raw.recording.notes, *one.notes)]
+            said += [f"{path.name}: {note}" for note in (*raw.notes, *one.notes)]
             failed += lines
             if one.log is not None and (options.anyway or not lines):
                 logs.append(one.log)
@@ -126,20 +127,20 @@ def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptio
 
 
 def look(
-    path: Path, raw: RawLog, vehicle: Vehicle | None, dt: float, polynomial: Sequence[float], changed: bool = False
+    path: Path, raw: Recording, vehicle: Vehicle | None, dt: float, polynomial: Sequence[float], changed: bool = False
 ) -> Looked:
     """Check a log and cut it to its flight; what cannot be compared with the vehicle is compared with itself."""
-    checks, notes = raw.checks(vehicle, dt), []
-    scaled = "rotor_speed" in raw.recording.signals or bool(polynomial)
+    checks, notes = check_recording(raw, vehicle, dt), []
+    scaled = "rotor_speed" in raw.signals or bool(polynomial)
     try:
-        log = raw.flight(dt, polynomial if scaled else ONE_TO_ONE)
+        log = flight_at(raw, dt, polynomial if scaled else ONE_TO_ONE)
         fits = log.dt == dt and not unevenness(log).any()
         log, notes = clean(log, Cleaning(in_flight=True, resample=None if fits else dt), vehicle)
         other = vehicle is not None and log.u.shape[1] != vehicle.rotors  # a check that failed says so
         checks += check_log(log, None if other or not scaled else vehicle)
         require_length([log], STEPS)
         if not scaled:
-            raw.flight(dt)  # says what is missing
+            flight_at(raw, dt)  # says what is missing
         refusal = ""
     except ValueError as error:
         log, refusal = None, str(error).removeprefix(f"{path}: ")

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,6 +16,7 @@ from hybrid_jax.vehicle import MOST_ROTORS
 
 DT = 0.01  # s, of logs whose signals have times of their own
 STATES = ("position", "velocity", "attitude", "rates")
+WHOLE = 0.9  # share of the rows of a CSV file that must hold all of a flight, for one at their times
 # What to log, by format, ready to paste.
 CRAZYFLIE = (
     *(f"stateEstimate.{each}" for each in ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz")),
@@ -93,6 +95,33 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
     known = np.logical_and.reduce([_is_known(t, signal.t, dt) for signal in used])
     x = np.concatenate([p, q, v, omega], axis=1)
     return FlightLog(t[known] - first, x[known], u[known], recording.name)
+
+
+def flight_at(recording: Recording, dt: float | None = None, polynomial: Sequence[float] = ()) -> FlightLog:
+    """The flight at its rows' own times, or at intervals of dt [s], by default 0.01: see `to_flight`."""
+    rows = own_rows(recording)
+    return to_flight(recording, dt or DT, polynomial) if rows is None else rows
+
+
+def own_interval(recording: Recording) -> float:
+    """Between the samples of `flight_at` [s]."""
+    rows = own_rows(recording)
+    return DT if rows is None else rows.dt
+
+
+def own_rows(recording: Recording) -> FlightLog | None:
+    """The flight at the times of the rows of a CSV file, if most of them hold all that a flight needs; else None."""
+    names = {"velocity" if "velocity" in recording.signals else "body_velocity", "rotor_speed"}
+    names |= {"position", "attitude", "rates"}
+    found = {name.removeprefix("body_"): each for name, each in recording.signals.items() if name in names}
+    if recording.facts.get("format") != "CSV" or len(found) < len(names):
+        return None
+    t = reduce(np.intersect1d, (each.t for each in found.values()))
+    if len(t) < max(2, WHOLE * max(map(len, found.values()))):
+        return None
+    p, v, q, omega, u = (found[name].values[np.isin(found[name].t, t)] for name in (*STATES, "rotor_speed"))
+    v = rotation_of(q).apply(v) if "body_velocity" in names else v
+    return FlightLog(t, np.concatenate([p, q, v, omega], axis=1), u, recording.name)
 
 
 def missing_states(recording: Recording) -> list[str]:

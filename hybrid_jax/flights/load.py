@@ -3,25 +3,23 @@
 The format is told by a file's first bytes, and by its suffix.
 """
 
+import contextlib
 import warnings
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
-from hybrid_jax.flights.attitude import rotation_of
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.checks.consistency import FAILS, WARNS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
-from hybrid_jax.flights.conversion import DT, to_flight
+from hybrid_jax.flights.conversion import flight_at, own_interval
 from hybrid_jax.flights.formats.blackbox import read_blackbox
 from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map, read_mapped
 from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
-from hybrid_jax.flights.formats.raw import is_packed, opened
+from hybrid_jax.flights.formats.raw import GZIP, readable
 from hybrid_jax.flights.formats.rosbag import read_rosbag
 from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.log import FlightLog, unevenness
@@ -45,29 +43,7 @@ UNREAD |= {b"PK\x03\x04": "a zip archive: unpack it and give its logs"}
 UNREAD |= {".tlog": "MAVLink telemetry, not read: it is too slow; give the log of the vehicle's own card"}
 OTHER = "no format that is read"
 BAG = "metadata.yaml"  # makes a folder one recording of ROS 2
-PARTS = ("position", "attitude", "velocity", "rates", "rotor_speed")
-WHOLE = 0.9  # share of the rows of a CSV file that must hold all of them, for a flight at their times
 Failed = Literal["refuse", "warn"]
-
-
-class RawLog(NamedTuple):
-    """A log as it was read.
-
-    Attributes:
-        recording: its signals at their own rates.
-        log: its samples, if they stand on common times already, as those of a CSV file.
-    """
-
-    recording: Recording
-    log: FlightLog | None = None
-
-    def flight(self, dt: float | None = None, polynomial: Sequence[float] = ()) -> FlightLog:
-        """The flight at its own times, or at intervals of dt [s]: see `to_flight`."""
-        return to_flight(self.recording, dt or DT, polynomial) if self.log is None else self.log
-
-    def checks(self, vehicle: Vehicle | None = None, dt: float | None = None) -> list[Check]:
-        """`check_recording`, for intervals of dt [s], by default those of samples on common times."""
-        return check_recording(self.recording, vehicle, dt or (DT if self.log is None else self.log.dt))
 
 
 def load_log(
@@ -92,7 +68,7 @@ def load_log(
     Raises:
         ValueError: the file, row, field and what to do, in one line.
     """
-    return read_log(path, columns=columns, topics=topics, motor_order=motor_order).flight(dt, polynomial)
+    return flight_at(read_recording(path, columns, topics, motor_order), dt, polynomial)
 
 
 def load_logs(
@@ -128,13 +104,13 @@ def load_logs(
     cleaning = cleaning or Cleaning()
     dt = cleaning.resample if dt is None else dt
     raws = read_folder(folder, columns=columns, topics=topics, motor_order=motor_order)[0]
-    report([(raw.recording.name, check) for raw in raws for check in raw.checks(vehicle, dt)], failed)
+    report([(raw.name, c) for raw in raws for c in check_recording(raw, vehicle, dt or own_interval(raw))], failed)
 
     def cleaned(log: FlightLog) -> FlightLog:
         fits = dt is None or (log.dt == dt and not unevenness(log).any())
         return clean(log, replace(cleaning, resample=None if fits else dt), vehicle)[0]
 
-    return [cleaned(raw.flight(dt, polynomial)) for raw in raws]
+    return [cleaned(flight_at(raw, dt, polynomial)) for raw in raws]
 
 
 def report(found: Sequence[tuple[str, Check]], failed: Failed) -> None:
@@ -155,7 +131,7 @@ def read_folder(
     columns: ColumnMap | str | Path | None = None,
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
-) -> tuple[list[RawLog], dict[Path, str]]:
+) -> tuple[list[Recording], dict[Path, str]]:
     """Read all logs of a folder, in the order of their names; also its other files, each with why it is left.
 
     Raises:
@@ -167,34 +143,7 @@ def read_folder(
         found = f"; it holds {others}" if left else ""
         raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
     columns = _column_map(columns)
-    return [read_log(path, columns=columns, topics=topics, motor_order=motor_order) for path in paths], left
-
-
-def read_log(
-    path: str | Path,
-    *,
-    columns: ColumnMap | str | Path | None = None,
-    topics: Mapping[str, str] | None = None,
-    motor_order: Sequence[int] = (),
-) -> RawLog:
-    """Read one log of any format of `read_recording`; arguments and errors as of it."""
-    recording = read_recording(path, columns, topics, motor_order)
-    return RawLog(recording, _of_rows(recording) if recording.facts.get("format") == CSV else None)
-
-
-def _of_rows(recording: Recording) -> FlightLog | None:
-    """The flight at the times of the rows of a file, if most of them hold all that a flight needs; else None."""
-    names = {"velocity" if "velocity" in recording.signals else "body_velocity", "rotor_speed"}
-    names |= {"position", "attitude", "rates"}
-    found = {name.removeprefix("body_"): each for name, each in recording.signals.items() if name in names}
-    if len(found) < len(names):
-        return None
-    t = reduce(np.intersect1d, (each.t for each in found.values()))
-    if len(t) < max(2, WHOLE * max(map(len, found.values()))):
-        return None
-    p, q, v, omega, u = (found[name].values[np.isin(found[name].t, t)] for name in PARTS)
-    v = rotation_of(q).apply(v) if "body_velocity" in names else v
-    return FlightLog(t, np.concatenate([p, q, v, omega], axis=1), u, recording.name)
+    return [read_recording(path, columns, topics, motor_order) for path in paths], left
 
 
 def _column_map(columns: ColumnMap | str | Path | None) -> ColumnMap | None:
@@ -217,13 +166,11 @@ def format_of(path: str | Path) -> tuple[str, str]:
     return "", OTHER if head or path.stat().st_size else "empty"
 
 
-def _head(path: Path) -> bytes:
-    """The first bytes of a file, unpacked; empty where they cannot be read: the reader then says why."""
-    try:
-        with opened(path) as file:
-            return file.read(32)
-    except (OSError, EOFError, zlib.error):
-        return b""
+def _head(path: str | Path, unpack: bool = True) -> bytes:
+    """The first bytes of a file; empty where they cannot be read: the reader then says why."""
+    with contextlib.suppress(ValueError), readable(path, unpack) as file:
+        return file.read(32)
+    return b""
 
 
 def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
@@ -271,7 +218,7 @@ def read_recording(
         raise ValueError(f"{path}: no such file")
     if kind == CSV:
         found = read_mapped(path, _column_map(columns))
-    elif kind == ROSBAG and Path(path).is_file() and is_packed(path):
+    elif kind == ROSBAG and Path(path).is_file() and _head(path, unpack=False).startswith(GZIP):
         raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
     elif kind == ROSBAG:
         found = read_rosbag(path, topics or {})

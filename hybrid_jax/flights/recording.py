@@ -24,6 +24,11 @@ ROTOR_UNITS = {"rotor_speed": "rad/s", "command": "1"}  # one axis for each roto
 QUANTITIES = (*AXES, *ROTOR_UNITS)
 
 
+def axes_of(quantity: str, count: int) -> tuple[str, ...]:
+    """The names of so many columns of a quantity; of three axes one alone is the last."""
+    return AXES[quantity][0][-count:] if quantity in AXES else tuple(map(str, range(count)))
+
+
 @dataclass(frozen=True)
 class Recording(Record):
     """The signals of one log, by names of `QUANTITIES`; for its attributes see `hybrid_jax.records.Record`.

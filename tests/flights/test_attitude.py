@@ -13,11 +13,12 @@ NONE, DEG = np.zeros((1, 3)), np.pi / 180
 
 
 def to_library(p, q, v, omega, frames):
-    turned = raw.attitude(q, frames.world, frames.body)
-    moving = (
-        rotation_of(turned).apply(raw.body(v, frames.body)) if frames.velocity == "body" else raw.world(v, frames.world)
-    )
-    return np.concatenate([raw.world(p, frames.world), turned, moving, raw.body(omega, frames.body)], axis=1)
+    """By the conversion of readers, whose recordings become flights."""
+    velocity = "body_velocity" if frames.velocity == "body" else "velocity"
+    parts = {"position": p, "attitude": q, velocity: v, "rates": omega}
+    parts = {name: raw.Samples(np.zeros(len(q)), values, name) for name, values in parts.items()}
+    p, q, v, omega = (part.values for part in raw.turned(parts, frames.world, frames.body).values())
+    return np.concatenate([p, q, rotation_of(q).apply(v) if frames.velocity == "body" else v, omega], axis=1)
 
 
 def row(*numbers):

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from surface import refusal
 
+from hybrid_jax.flights.checks.suitability import check_recording
+from hybrid_jax.flights.conversion import flight_at
 from hybrid_jax.flights.formats.csv import read_table
-from hybrid_jax.flights.load import load_log, read_log, read_recording
+from hybrid_jax.flights.load import load_log, read_recording
 from hybrid_jax.flights.log import COLUMNS
 
 HEADER = ",".join(COLUMNS)
@@ -50,8 +52,7 @@ def test_a_file_that_ends_within_a_row_has_a_note(flight, written, packed):
     whole = "\r\n".join([HEADER, *rows_of(flight[:20])]) + "\r\n"
     for cut, notes in ((0, 0), (4, 1)):
         path = written(whole[: len(whole) - cut], packed=packed)
-        for recording in (read_log(path).recording, read_recording(path)):
-            assert sum("its last number may be cut off" in note for note in recording.notes) == notes
+        assert sum("its last number may be cut off" in note for note in read_recording(path).notes) == notes
 
 
 def test_columns_may_have_any_order(flight, written):
@@ -102,12 +103,12 @@ def test_rows_that_tell_nothing_are_gaps(flight, written, cell):
     for row in rows[500:505]:
         row[COLUMNS.index("px") : COLUMNS.index("vx")] = ["0.0"] * 7
     rows[40][0] = "0.0"  # one time stamp
-    raw = read_log(written("\n".join([HEADER, *map(",".join, rows)]) + "\n"))
-    log = raw.flight()
+    raw = read_recording(written("\n".join([HEADER, *map(",".join, rows)]) + "\n"))
+    log = flight_at(raw)
     kept = np.delete(np.arange(len(flight)), [*range(300, 310), *range(500, 505), 40])
     np.testing.assert_allclose(log.x, flight.x[kept], atol=1e-12)
-    assert len(raw.recording.signals["rates"]) >= len(flight) - 6
-    assert any("velocity stands in 1190 of 1200 rows" in note for note in raw.recording.notes)
+    assert len(raw.signals["rates"]) >= len(flight) - 6
+    assert any("velocity stands in 1190 of 1200 rows" in note for note in raw.notes)
 
 
 def test_joined_tables_of_several_rates_have_the_times_of_each(flight, written):
@@ -118,16 +119,16 @@ def test_joined_tables_of_several_rates_have_the_times_of_each(flight, written):
             if not kept:
                 begin, end = COLUMNS.index(first), COLUMNS.index(last) + (last == "u3")
                 row[begin:end] = [""] * (end - begin)
-    raw = read_log(written("\n".join([HEADER, *map(",".join, rows)]) + "\n"))
-    assert {name: len(each) for name, each in raw.recording.signals.items()} == {
+    raw = read_recording(written("\n".join([HEADER, *map(",".join, rows)]) + "\n"))
+    assert {name: len(each) for name, each in raw.signals.items()} == {
         "position": 1200, "attitude": 300, "velocity": 1200, "rates": 1200, "rotor_speed": 600,
     }  # fmt: skip
-    (line,) = [c.suggestion for c in raw.checks(None, 0.01) if c.name == "slowest signal"]
+    (line,) = [c.suggestion for c in check_recording(raw, None, 0.01) if c.name == "slowest signal"]
     assert "attitude 25 Hz, motors 50 Hz" in line
-    log = raw.flight(0.02)
+    log = flight_at(raw, 0.02)
     apart = [[*row[:14], *[""] * 4] for row in rows] + [[row[0], *[""] * 13, *row[14:]] for row in rows]
     apart = [",".join(row) for row in sorted(apart, key=lambda row: float(row[0]))]  # two rows at each time
-    again = read_log(written("\n".join([HEADER, *apart]))).flight(0.02)
+    again = flight_at(read_recording(written("\n".join([HEADER, *apart]))), 0.02)
     np.testing.assert_array_equal(again.x, log.x)
     np.testing.assert_allclose(log.x[:, 7:10], flight.x[1 : 2 * len(log) : 2, 7:10], atol=1e-9)
 
@@ -149,7 +150,7 @@ def test_damaged_files_are_refused(flight, written, tmp_path):
 
 def test_too_many_rows_are_refused(flight, written):
     path = written("\n".join([HEADER, *rows_of(flight)]))
-    assert len(read_table(path, COLUMNS, max_rows=len(flight))) == len(flight)
+    assert len(read_table(path, COLUMNS, max_rows=len(flight))[0]) == len(flight)
     refusal(
         lambda: read_table(path, COLUMNS, max_rows=len(flight) - 1), path, f"row {len(flight) + 1}", "split the file"
     )
@@ -162,7 +163,7 @@ def test_memory_is_bounded_by_the_numbers_kept(flight, written):
     def peak(count):
         path = written("\n".join([HEADER, *(f"{i / 100:.2f},{row}" for i, row in enumerate(rows[:count]))]))
         tracemalloc.start()
-        assert len(read_table(path, COLUMNS)) == count
+        assert len(read_table(path, COLUMNS)[0]) == count
         found = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return found

@@ -13,7 +13,7 @@ from hybrid_jax.flights import load_logs
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.formats.column_map import SCALES, of_unit
-from hybrid_jax.flights.formats.raw import XYZ, Samples, record
+from hybrid_jax.flights.formats.raw import Samples, record
 from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import COLUMNS, FlightLog
 from hybrid_jax.vehicle import IRIS
@@ -270,7 +270,7 @@ def test_events_of_a_crazyflie_have_their_own_times(flight, written):
 def test_two_clocks_are_named(flight):
     """Stamps since boot beside those since 1970, as of mavros without a time sync."""
     parts = {"rates": (flight.t, flight.x[:, 10:], "/imu"), "position": (flight.t + 1.7e9, flight.x[:, :3], "/odom")}
-    samples = {name: Samples(t, values, XYZ, source) for name, (t, values, source) in parts.items()}
+    samples = {name: Samples(t, values, source) for name, (t, values, source) in parts.items()}
     (line,) = [line for line in failures(check_recording(record("bag", samples)), "log") if "no time in common" in line]
     assert "/odom from 1700000000 to 1700000012 s" in line
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_jax.flights.formats import raw
-from hybrid_jax.flights.formats.raw import BATTERY, XYZ, Samples
+from hybrid_jax.flights.formats.raw import Samples
 from hybrid_jax.flights.recording import Recording
 
 GRAVITY, MOST, POLES, DSHOT = 9.81, 12, 14, 2047
@@ -98,19 +98,18 @@ def _parser() -> Any:
 def _frames(content: bytes) -> tuple[Any, np.ndarray, str]:
     """The parser, its frames as rows of the fields of main frames, and how the log is damaged; empty if it is not."""
     from orangebox.reader import Reader
+    from orangebox.types import FrameType
 
     with tempfile.NamedTemporaryFile() as file:  # orangebox reads files alone
         file.write(content)
         file.flush()
         parser = _parser()(Reader(file.name, 1))
-    width, rows, ended, junk = len(parser.reader.field_defs[_intra()]), [], True, 0
+    width, rows, ended, junk = len(parser.reader.field_defs[FrameType.INTRA]), [], True, 0
     try:
         for frame in parser.frames():
-            if not rows and frame.type != _intra():  # nothing is known of what came before the first whole frame
-                junk = parser._ctx.invalid_frame_count
-                continue
             junk = junk if rows else parser._ctx.invalid_frame_count
-            rows.append(frame.data[:width])
+            if rows or frame.type == FrameType.INTRA:  # nothing is known of what came before the first whole frame
+                rows.append(frame.data[:width])
     except Exception:  # at the end of a file that was cut off; orangebox does not look for it
         ended = False
     sound = [row for row in rows if all(isinstance(value, int | float) for value in row)]
@@ -119,41 +118,28 @@ def _frames(content: bytes) -> tuple[Any, np.ndarray, str]:
     return parser, np.array(sound, float).reshape(len(sound), width), damage
 
 
-def _intra():
-    from orangebox.types import FrameType
-
-    return FrameType.INTRA
-
-
 def _parts(path, columns, headers) -> Iterator[tuple[str, Samples]]:
-    ticks = columns["time"]
-
-    def part(names: list[str], factor: float, rest: float = 0.0, axes: tuple[str, ...] = XYZ) -> Samples:
+    def part(names: list[str], factor: float, rest: float = 0.0) -> Samples:
         values = (np.stack([columns[name] for name in names], axis=1) - rest) * factor
-        return Samples(ticks, values, axes, " ".join(names))
+        return Samples(columns["time"], values, " ".join(names))
 
-    gyro, acc = ([f"{field}[{i}]" for i in range(3)] for field in ("gyroADC", "accSmooth"))
-    if {*gyro} <= {*columns}:
+    def of(field: str, most: int) -> list[str]:
+        return [name for name in (f"{field}[{i}]" for i in range(most)) if name in columns]
+
+    if len(gyro := of("gyroADC", 3)) == 3:
         fine = 0.1 if headers.get("blackbox_high_resolution") == 1 else 1.0
         yield "rates", part(gyro, _scale(path, headers) * fine * np.pi / 180)
-    if {*acc} <= {*columns}:
-        unit = _number(path, headers, "acc_1G")
-        yield "specific_force", part(acc, GRAVITY / unit)
+    if len(acc := of("accSmooth", 3)) == 3:
+        yield "specific_force", part(acc, GRAVITY / _number(path, headers, "acc_1G"))
     if "vbatLatest" in columns:
         # Cells in 0.1 V until Betaflight 3, in 0.01 V from 4 on.
-        fine = _most(headers.get("vbatcellvoltage")) > 100
-        yield "voltage", part(["vbatLatest"], 0.01 if fine else 0.1, axes=BATTERY)
-    for quantity, field in (("command", "motor"), ("rotor_speed", "eRPM")):
-        names = [f"{field}[{i}]" for i in range(MOST) if f"{field}[{i}]" in columns]
-        axes = tuple(map(str, range(len(names))))
-        if names and quantity == "command":
-            digital = _most(headers.get("motorOutput")) == DSHOT
-            low, high = FULL[digital]
-            found = part(names, 1 / (high - low), low, axes)
-            yield quantity, found._replace(values=np.maximum(found.values, 0.0))
-        elif names and columns[names[0]].any():
-            poles = _number(path, headers, "motor_poles", POLES)
-            yield quantity, part(names, 100 * 2 / poles * np.pi / 30, axes=axes)
+        yield "voltage", part(["vbatLatest"], 0.01 if _most(headers.get("vbatcellvoltage")) > 100 else 0.1)
+    if names := of("motor", MOST):
+        low, high = FULL[_most(headers.get("motorOutput")) == DSHOT]
+        found = part(names, 1 / (high - low), low)
+        yield "command", found._replace(values=np.maximum(found.values, 0.0))
+    if (names := of("eRPM", MOST)) and columns[names[0]].any():
+        yield "rotor_speed", part(names, 100 * 2 / _number(path, headers, "motor_poles", POLES) * np.pi / 30)
 
 
 def _scale(path, headers) -> float:
@@ -168,9 +154,8 @@ def _scale(path, headers) -> float:
 
 def _most(given) -> float:
     """The largest of the numbers of a header; 0 without any."""
-    return max(
-        (each for each in (given if isinstance(given, list) else [given]) if isinstance(each, int | float)), default=0
-    )
+    each = given if isinstance(given, list) else [given]
+    return max((number for number in each if isinstance(number, int | float)), default=0)
 
 
 def _number(path, headers, name: str, usual: float | None = None) -> float:

@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import Frames, from_euler
 from hybrid_jax.flights.formats import raw
-from hybrid_jax.flights.formats.csv import header_of, notes_on_end, read_table
+from hybrid_jax.flights.formats.csv import header_of, read_table
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_NAMES, VELOCITY, input_names
 from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS, from_table, read_tables, require_known
@@ -178,42 +178,26 @@ def read_mapped(path: str | Path, column_map: ColumnMap | None = None) -> Record
         ValueError: file, row, field and what to do, in one line.
     """
     column_map = library_map(path) if column_map is None else column_map
-    parts, stated, frames = _parts(path, column_map), column_map.quantities, column_map.frames
-    t, found, notes = parts.pop("time")[:, 0], {}, list(notes_on_end(path))
-    for name, values in parts.items():
-        quantity, axes = {"body_rates": "rates", "motors": "rotor_speed"}.get(name, name), raw.XYZ
-        source = f"columns {' '.join(stated[name].columns)}"
-        told = np.isfinite(t) & np.isfinite(values).all(axis=1)
-        notes += [f"{source}: {name} stands in {told.sum()} of {len(t)} rows"] * (not told.all())
-        values = values[told]
-        if name == "attitude":
-            values = raw.attitude(_attitude(values, stated[name], path), frames.world, frames.body)
-            axes = raw.WXYZ
-        elif name == "motors":
-            commands = stated[name].unit in SHARES and not stated[name].polynomial
-            quantity, values = ("command", values) if commands else (quantity, _speeds(values, stated[name]))
-            axes = tuple(map(str, range(values.shape[1])))
-        elif name == "voltage":
-            axes = raw.BATTERY
-        elif name == "position" or (name == "velocity" and frames.velocity == "world"):
-            values = raw.world(values, frames.world)
-        else:
-            values = raw.body(values, frames.body)
-            quantity = "body_velocity" if name == "velocity" else quantity
-        found[quantity] = raw.Samples(t[told], values, axes, source)
-    return raw.record(path, found, notes=notes, facts={"format": "CSV"})
-
-
-def _parts(path, column_map: ColumnMap) -> dict[str, Float[np.ndarray, "n k"]]:
-    """The columns of each quantity, scaled to SI units and shares."""
-    form, stated = column_map.format, column_map.quantities
-    table = read_table(path, column_map.names, delimiter=form.delimiter, decimal=form.decimal)
-    parts, begin = {}, 0
+    form, stated, frames = column_map.format, column_map.quantities, column_map.frames
+    table, notes = read_table(path, column_map.names, delimiter=form.delimiter, decimal=form.decimal)
+    columns = dict(zip(column_map.names, table.T, strict=True))
+    clock, found = stated.pop("time"), {}
+    t = columns[clock.columns[0]] * SCALES["time"][clock.unit]
     for name, each in stated.items():
-        end = begin + len(each.columns)
-        values, begin = table[:, begin:end], end
-        parts[name] = of_unit(values, each.unit) if name == "motors" else values * SCALES[name][each.unit]
-    return parts
+        values, source = np.stack([columns[column] for column in each.columns], axis=1), " ".join(each.columns)
+        told = np.isfinite(t) & np.isfinite(values).all(axis=1)
+        partly = f"columns {source}: {name} stands in {told.sum()} of {len(t)} rows"
+        notes += () if told.all() else (partly,)
+        values = of_unit(values[told], each.unit) if name == "motors" else values[told] * SCALES[name][each.unit]
+        if each.polynomial:
+            values = np.polynomial.polynomial.polyval(values, each.polynomial)
+        if name == "attitude":
+            values = _attitude(values, each, path)
+        commands = each.unit in SHARES and not each.polynomial
+        quantity = {"body_rates": "rates", "motors": "command" if commands else "rotor_speed"}.get(name, name)
+        quantity = "body_velocity" if name == "velocity" and frames.velocity == "body" else quantity
+        found[quantity] = raw.Samples(t[told], values, f"columns {source}")
+    return raw.record(path, raw.turned(found, frames.world, frames.body), notes=notes, facts={"format": "CSV"})
 
 
 def of_unit(motors: Float[np.ndarray, "n m"], unit: str) -> Float[np.ndarray, "n m"]:
@@ -221,10 +205,6 @@ def of_unit(motors: Float[np.ndarray, "n m"], unit: str) -> Float[np.ndarray, "n
     rest = REST.get(unit, 0.0)
     disarmed = (motors == 0) | ((motors >= DISARMED * rest) & (motors < rest))
     return np.where(disarmed, 0.0, motors - rest) * SCALES["motors"][unit]
-
-
-def _speeds(motors: Float[np.ndarray, "n m"], stated: Columns) -> Float[np.ndarray, "n m"]:
-    return np.polynomial.polynomial.polyval(motors, stated.polynomial) if stated.polynomial else motors
 
 
 def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str | Path) -> Float[np.ndarray, "n 4"]:

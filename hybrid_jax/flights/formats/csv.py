@@ -4,14 +4,14 @@ import contextlib
 import io
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 from jaxtyping import Float
 
-from hybrid_jax.flights.formats.raw import opened, readable
+from hybrid_jax.flights.formats.raw import readable
 
 BLOCK = 1 << 22  # characters read at once
 LISTS = "a list in a cell: write each of its numbers in a column of its own"
@@ -19,6 +19,7 @@ MAX_ROW_LENGTH = 1 << 16
 COMMENT = re.compile("[#%]+ *")
 NOTHING = ("", "null", "none", "na", "n/a", "-")  # cells without a number, beside nan
 MAX_ROWS = 4_000_000  # 0.6 GB of numbers; eleven hours at 100 Hz
+CUT = "no line break ends the last row, so its last number may be cut off: cut the row out, or end it with one"
 
 
 def read_table(
@@ -28,30 +29,41 @@ def read_table(
     delimiter: str = ",",
     decimal: str = ".",
     max_rows: int = MAX_ROWS,
-) -> Float[np.ndarray, "n c"]:
-    """Read the named columns of a CSV file with a header, in the given order; a cell without a number is NaN.
+) -> tuple[Float[np.ndarray, "n c"], tuple[str, ...]]:
+    """Read the named columns of a CSV file with a header, in the given order, and a note if it was cut off.
 
-    Lines before the header that begin with # or % or say `sep=;` are passed over; the header may begin with them, too.
+    A cell without a number is NaN. Lines before the header that begin with # or % or say `sep=;` are passed over; the
+    header may begin with them, too.
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
     """
+    parts, block = [], ""
     try:
         with readable(path) as file:
             text = io.TextIOWrapper(file, encoding="utf-8-sig")
-            parts = list(_parts(path, text, columns, delimiter, decimal, max_rows))
+            names, header, above = _header(text, delimiter)
+            for name in columns:
+                if names.count(name) != 1:
+                    raise ValueError(_header_complaint(path, name, names, header, delimiter))
+            picked, row = [names.index(name) for name in columns], above + 1
+            while more := text.read(BLOCK):
+                block = more + text.readline(MAX_ROW_LENGTH)
+                lines = block.replace('"', "").replace(decimal, ".").split("\n")
+                if not lines[-1]:
+                    lines.pop()
+                elif len(lines[-1]) >= MAX_ROW_LENGTH:
+                    last = row + len(lines) - 1
+                    raise ValueError(f"{path}: row {last}: is too long for a row of numbers; is this a CSV file?")
+                if row - above - 1 + len(lines) > max_rows:
+                    raise ValueError(f"{path}: row {max_rows + 2}: more than {max_rows} rows; split the file by flight")
+                parts.append(_numbers(path, lines, row, names, picked, delimiter))
+                row += len(lines)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is not text; export the log as CSV in UTF-8") from error
-    return np.concatenate(parts)
-
-
-def notes_on_end(path: str | Path) -> tuple[str, ...]:
-    """A note if no line break ends the last row of a file that was read: a program that writes rows ends each."""
-    with opened(path) as file:
-        file.seek(-1, io.SEEK_END)
-        ended = file.read(1) in b"\r\n"
-    note = "no line break ends the last row, so its last number may be cut off: cut the row out, or end it with one"
-    return () if ended else (note,)
+    if not parts:
+        raise ValueError(f"{path}: row {row}: there are no samples below the header; record or export the flight again")
+    return np.concatenate(parts), () if block.endswith("\n") else (CUT,)
 
 
 def header_of(path: str | Path, delimiter: str = ",") -> list[str]:
@@ -70,31 +82,6 @@ def _header(text: IO[str], delimiter: str) -> tuple[list[str], str, int]:
     return [name.strip() for name in line.split(delimiter)], line, row
 
 
-def _parts(
-    path, text: IO[str], columns: Sequence[str], delimiter: str, decimal: str, max_rows: int
-) -> Iterator[Float[np.ndarray, "n c"]]:
-    names, header, above = _header(text, delimiter)
-    for name in columns:
-        if names.count(name) != 1:
-            raise ValueError(_header_complaint(path, name, names, header, delimiter))
-    picked, row = [names.index(name) for name in columns], above + 1
-    while block := text.read(BLOCK):
-        block += text.readline(MAX_ROW_LENGTH)
-        block = block.replace('"', "")
-        lines = (block.replace(decimal, ".") if decimal != "." else block).split("\n")
-        if not lines[-1]:
-            lines.pop()
-        elif len(lines[-1]) >= MAX_ROW_LENGTH:
-            last = row + len(lines) - 1
-            raise ValueError(f"{path}: row {last}: is too long for a row of numbers; is this a CSV file?")
-        if row - above - 1 + len(lines) > max_rows:
-            raise ValueError(f"{path}: row {max_rows + 2}: more than {max_rows} rows; split the file by flight")
-        yield _numbers(path, lines, row, names, picked, delimiter)
-        row += len(lines)
-    if row == above + 1:
-        raise ValueError(f"{path}: row {row}: there are no samples below the header; record or export the flight again")
-
-
 def _header_complaint(path, name: str, names: list[str], header: str, delimiter: str) -> str:
     if not header.strip():
         return f"{path}: row 1: the file is empty or has no header; export the log again"
@@ -111,42 +98,38 @@ def _header_complaint(path, name: str, names: list[str], header: str, delimiter:
 
 def _numbers(path, lines: list[str], row: int, names, picked, delimiter: str) -> Float[np.ndarray, "n c"]:
     """Parse the picked cells of some lines, the first of which is the given row."""
-    commas = len(names) - 1
     for at, line in enumerate(lines):
-        if line.count(delimiter) != commas:
-            found = f"{line.count(delimiter) + 1} fields" if line.strip() else "a blank line"
+        if (count := line.count(delimiter) + 1) != len(names):
+            found = f"{count} fields" if line.strip() else "a blank line"
             mend = LISTS if "[" in line else "repair or cut the row out"
-            raise ValueError(f"{path}: row {row + at}: {found}, the header has {commas + 1}; {mend}")
-    for told in (lambda line: line, lambda line: _told(line, picked, delimiter)):
+            raise ValueError(f"{path}: row {row + at}: {found}, the header has {len(names)}; {mend}")
+    for told in (str, lambda line: delimiter.join(map(_told, line.split(delimiter)))):
         with contextlib.suppress(ValueError):
             table = np.loadtxt(list(map(told, lines)), delimiter=delimiter, usecols=picked, comments=None, ndmin=2)
             if table.shape == (len(lines), len(picked)):
                 return table
-    raise ValueError(f"{path}: {_bad_cell(lines, row, names, picked, delimiter)}")
-
-
-def _told(line: str, picked, delimiter: str) -> str:
-    """A row in which picked cells that hold nothing are NaN."""
-    cells = line.split(delimiter)
-    for column in picked:
-        cells[column] = "nan" if cells[column].strip().lower() in NOTHING else cells[column]
-    return delimiter.join(cells)
-
-
-def _bad_cell(lines, row, names, picked, delimiter) -> str:
     for at, line in enumerate(lines):
         cells = line.split(delimiter)
         for column in picked:
-            cell = cells[column].strip()
-            with contextlib.suppress(ValueError):
-                np.loadtxt(["nan" if cell.lower() in NOTHING else cell], delimiter=delimiter, comments=None)
-                continue
-            if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell):
-                advice = 'set format = {delimiter = ";", decimal = ","} in a column map, columns=…'
-                return f"row {row + at}, field {names[column]}: {cell[:40]!r} has a decimal comma; {advice}"
-            if re.match(r"\d{4}-\d\d-\d\d", cell) or cell.startswith("["):
-                kind = LISTS if cell.startswith("[") else "a date: write the time in seconds"
-                return f"row {row + at}, field {names[column]}: {cell[:40]!r} is {kind}"
-            found = f"{cell[:40]!r} is not a number; empty the cell (it becomes a gap) or repair it"
-            return f"row {row + at}, field {names[column]}: {found}"
-    return f"rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again"
+            if said := _bad_cell(cells[column].strip(), delimiter):
+                raise ValueError(f"{path}: row {row + at}, field {names[column]}: {said}")
+    raise ValueError(f"{path}: rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again")
+
+
+def _told(cell: str) -> str:
+    return "nan" if cell.strip().lower() in NOTHING else cell
+
+
+def _bad_cell(cell: str, delimiter: str) -> str:
+    """Why a cell is no number, and what to do; empty if it is one."""
+    with contextlib.suppress(ValueError):
+        np.loadtxt([_told(cell)], delimiter=delimiter, comments=None)
+        return ""
+    if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell):
+        advice = 'set format = {delimiter = ";", decimal = ","} in a column map, columns=…'
+        return f"{cell[:40]!r} has a decimal comma; {advice}"
+    if cell.startswith("["):
+        return f"{cell[:40]!r} is {LISTS}"
+    if re.match(r"\d{4}-\d\d-\d\d", cell):
+        return f"{cell[:40]!r} is a date: write the time in seconds"
+    return f"{cell[:40]!r} is not a number; empty the cell (it becomes a gap) or repair it"

@@ -3,6 +3,7 @@
 import bisect
 import contextlib
 import gzip
+import io
 import math
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,10 +15,9 @@ from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rotation_of
 from hybrid_jax.flights.log import LARGEST, unlike_one
-from hybrid_jax.flights.recording import GAP, Recording, Signal
+from hybrid_jax.flights.recording import GAP, Recording, Signal, axes_of
 
 GZIP = b"\x1f\x8b"
-XYZ, WXYZ, BATTERY = ("x", "y", "z"), ("w", "x", "y", "z"), ("battery",)
 LATE = 0.1  # s; a time that is further behind is a restarted clock, not a sample that came late
 SHARED = 0.1  # share of samples with the time of the one before, from which on that is no double
 FEW_DIGITS = "it has too few digits, as of %g: write it with nine after the point, or as whole µs"
@@ -38,52 +38,49 @@ RATIO, MOST, SMALL = 100, 2**31, 2**24  # bytes that a gzip file may hold: for e
 
 
 class Samples(NamedTuple):
-    """n samples of one quantity at integer or real ticks, with its axes and where it came from, for messages."""
+    """n samples of one quantity at integer or real ticks, and where they came from, for messages."""
 
     ticks: np.ndarray
     values: Float[np.ndarray, "n k"]
-    axes: tuple[str, ...]
     source: str
 
 
-def is_packed(path: str | Path) -> bool:
-    """Whether a file is gzip, by its first bytes."""
-    with opened(path, packed=False) as file:
-        return file.read(2) == GZIP
+class _Unpacked(io.RawIOBase):
+    """The bytes in a gzip file, as many as a log may hold."""
 
+    def __init__(self, path: Path, packed: IO[bytes]):
+        self.path, self.file = path, gzip.GzipFile(fileobj=packed)
+        self.most = self.left = min(max(RATIO * path.stat().st_size, SMALL), MOST)
 
-def opened(path: str | Path, packed: bool | None = None) -> IO[bytes]:
-    """A file, plain or gzip, to read its bytes; OSError for a pipe or device, which may never end."""
-    if Path(path).exists() and not Path(path).is_file():
-        raise OSError(0, "is no regular file")
-    packed = is_packed(path) if packed is None else packed
-    return gzip.open(path) if packed else Path(path).open("rb")  # pyright: ignore[reportReturnType]
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer) -> int:
+        count = self.file.readinto1(buffer)
+        self.left -= count
+        if self.left < 0:
+            most = f"{self.most / 2**20:.0f} MiB"
+            raise ValueError(f"{self.path}: unpacks to over {most}, as no log does; unpack it first")
+        return count
 
 
 @contextlib.contextmanager
-def readable(path: str | Path) -> Iterator[IO[bytes]]:
+def readable(path: str | Path, unpack: bool = True) -> Iterator[IO[bytes]]:
     """A file, plain or gzip, to read; ValueError, with the file and what to do, if that cannot be done."""
+    path = Path(path)
     try:
-        if is_packed(path):
-            _refuse_bomb(path)
-        with opened(path) as file:
-            yield file
+        if path.exists() and not path.is_file():
+            raise OSError(0, "is no regular file")  # a pipe or a device may never end
+        with path.open("rb") as plain:
+            packed = unpack and plain.read(2) == GZIP
+            plain.seek(0)
+            yield io.BufferedReader(_Unpacked(path, plain)) if packed else plain
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
     except (EOFError, zlib.error) as error:
         raise ValueError(f"{path}: the gzip data are truncated or damaged; copy the file again") from error
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
-def _refuse_bomb(path: str | Path) -> None:
-    """Refuse gzip data that would fill the memory."""
-    size, most = 0, min(max(RATIO * Path(path).stat().st_size, SMALL), MOST)
-    with opened(path) as file:
-        while part := file.read(1 << 20):
-            size += len(part)
-            if size > most:
-                raise ValueError(f"{path}: unpacks to over {most / 2**20:.0f} MiB, as no log does; unpack it first")
 
 
 def unpacked(path: str | Path) -> bytes:
@@ -131,15 +128,15 @@ def record(
             why = f"{name} is no {'rotation' if name == 'attitude' else 'number'} in {gone.sum()} samples"
             said.append(f"{part.source}: {why}, the first at {t[gone][0]:.4g} s: left out")
             t, part = t[~gone], part._replace(values=part.values[~gone])
-        for row in np.flatnonzero(gone)[:1] if len(t) == len(gone) else ():
-            raise ValueError(f"{path}: {part.source}: {_wrong(name, part, row, t[row])}")
+        elif gone.any():
+            raise ValueError(f"{path}: {part.source}: {_wrong(name, part, int(gone.argmax()), t)}")
         own, values = own_samples(t, part.values, name not in AS_TOLD)
         if len(own) < len(t):
             apart = float(np.median(np.diff(own)))
             drawn = f"values repeated, or lines between samples {apart:.3g} s apart"
             said.append(f"{part.source}: {drawn}: read as these samples")
         try:
-            found = Signal(own, values, part.axes, part.source)
+            found = Signal(own, values, axes_of(name, values.shape[1]), part.source)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
         signals |= {name: found} if len(t) else {}
@@ -148,16 +145,17 @@ def record(
 
 def _lost(name: str, part: Samples) -> np.ndarray:
     """Which samples are no numbers, far beyond any measurement, or no rotations."""
-    lost = ~(np.abs(np.asarray(part.values)) < LARGEST).all(axis=1)
-    return lost | np.asarray(unlike_one(part.values)) if name == "attitude" else np.asarray(lost)
+    lost = np.asarray(~(np.abs(np.asarray(part.values)) < LARGEST).all(axis=1))
+    return lost | np.asarray(unlike_one(part.values)) if name == "attitude" else lost
 
 
-def _wrong(name: str, part: Samples, row: int, t: float) -> str:
+def _wrong(name: str, part: Samples, row: int, t: np.ndarray) -> str:
+    values, at = part.values[row], f"at {t[row]:.6g} s"
     if name == "attitude":
         with np.errstate(over="ignore"):
-            return f"the quaternion at {t:.6g} s has norm {np.linalg.norm(part.values[row]):.4g}, must be 1"
-    column = int((~(np.abs(part.values[row]) < LARGEST)).argmax())
-    return f"{part.axes[column]} is {part.values[row, column]:.6g} at {t:.6g} s, must be a number below {LARGEST:g}"
+            return f"the quaternion {at} has norm {np.linalg.norm(values):.4g}, must be 1"
+    column = int((~(np.abs(values) < LARGEST)).argmax())
+    return f"{axes_of(name, len(values))[column]} is {values[column]:.6g} {at}, must be a number below {LARGEST:g}"
 
 
 def _of_one_message(a: Samples, b: Samples) -> bool:
@@ -281,14 +279,15 @@ def _meetings(t, values, slope, bend):
         k += 2 if late else 1
 
 
-def world(values: Float[np.ndarray, "n 3"], frame: str) -> Float[np.ndarray, "n 3"]:
-    """Vectors of a world of `WORLDS` in the library's, z up."""
-    return values @ WORLDS[frame].T
-
-
-def body(values: Float[np.ndarray, "n 3"], frame: str) -> Float[np.ndarray, "n 3"]:
-    """Vectors of a body of `BODIES` in the library's, forward-left-up."""
-    return values @ BODIES[frame].T
+def turned(parts: Mapping[str, Samples], world: str, body: str) -> dict[str, Samples]:
+    """Quantities that stand in frames of `WORLDS` and `BODIES`, in the library's: world z up, body forward-left-up."""
+    turns = dict.fromkeys(("position", "velocity"), WORLDS[world].T)
+    turns |= dict.fromkeys(("body_velocity", "rates", "specific_force"), BODIES[body].T)
+    found = {name: part._replace(values=part.values @ turns[name]) for name, part in parts.items() if name in turns}
+    if "attitude" in parts:
+        part = parts["attitude"]
+        found["attitude"] = part._replace(values=attitude(part.values, world, body))
+    return {**parts, **found}
 
 
 def attitude(q: Float[np.ndarray, "n 4"], world: str, body: str) -> Float[np.ndarray, "n 4"]:

@@ -8,7 +8,8 @@ Frames are those of REP 103 and 105: world z up, body forward-left-up, an odomet
 """
 
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -17,67 +18,40 @@ import numpy as np
 from hybrid_jax.flights.attitude import rotation_of
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.column_map import SCALES, SHARES, of_unit
-from hybrid_jax.flights.formats.raw import BATTERY, WXYZ, XYZ, Samples
+from hybrid_jax.flights.formats.raw import Samples
 from hybrid_jax.flights.formats.ulog import TOPICS, motors, states
 from hybrid_jax.flights.log import unlike_one
-from hybrid_jax.flights.recording import Recording
+from hybrid_jax.flights.recording import AXES, Recording
 from hybrid_jax.vehicle import FEWEST_ROTORS
 
 PX4 = "px4_msgs/"
-
 FIELDS = ("angular_velocities", "velocity")  # of motors, in rad/s by the definition of their messages
-_Reader = Callable[[Any], list[float]]
 
 
-def _xyz(vector) -> list[float]:
-    return [vector.x, vector.y, vector.z]
+def _pose(prefix: str) -> dict[str, str]:
+    return {"position": f"{prefix}position", "attitude": f"{prefix}orientation"}
 
 
-def _wxyz(q) -> list[float]:
-    return [q.w, q.x, q.y, q.z]
-
-
-def _pose(at: Callable[[Any], Any]) -> dict[str, tuple[tuple[str, ...], _Reader]]:
-    return {
-        "position": (XYZ, lambda message: _xyz(at(message).position)),
-        "attitude": (WXYZ, lambda message: _wxyz(at(message).orientation)),
-    }
-
-
-_TRANSFORM: dict[str, tuple[tuple[str, ...], _Reader]] = {
-    "position": (XYZ, lambda message: _xyz(message.transform.translation)),
-    "attitude": (WXYZ, lambda message: _wxyz(message.transform.rotation)),
-}
-# Role → message type, without package → quantity → its axes and how it is read. Roles, and "motors", are the keys of
-# `topics`; those that come later count where two tell of one quantity.
-READERS: dict[str, dict[str, dict[str, tuple[tuple[str, ...], _Reader]]]] = {
+VELOCITY = "twist.twist.linear"
+# Role → message type, without package → quantity → its field. Roles, and "motors", are the keys of `topics`; those that
+# come later count where two tell of one quantity.
+READERS: dict[str, dict[str, dict[str, str]]] = {
     "pose": {
-        "PoseStamped": _pose(lambda message: message.pose),
-        "PoseWithCovarianceStamped": _pose(lambda message: message.pose.pose),
-        "Pose": _pose(lambda message: message),
-        "TransformStamped": _TRANSFORM,
-        "PointStamped": {"position": (XYZ, lambda message: _xyz(message.point))},
+        "PoseStamped": _pose("pose."),
+        "PoseWithCovarianceStamped": _pose("pose.pose."),
+        "Pose": _pose(""),
+        "TransformStamped": {"position": "transform.translation", "attitude": "transform.rotation"},
+        "PointStamped": {"position": "point"},
     },
-    "odometry": {
-        "Odometry": _pose(lambda message: message.pose.pose)
-        | {
-            "body_velocity": (XYZ, lambda message: _xyz(message.twist.twist.linear)),
-            "rates": (XYZ, lambda message: _xyz(message.twist.twist.angular)),
-        }
-    },
+    "odometry": {"Odometry": _pose("pose.pose.") | {"body_velocity": VELOCITY, "rates": "twist.twist.angular"}},
     "velocity": {
-        "TwistStamped": {"velocity": (XYZ, lambda message: _xyz(message.twist.linear))},
-        "TwistWithCovarianceStamped": {"velocity": (XYZ, lambda message: _xyz(message.twist.twist.linear))},
-        "Vector3Stamped": {"velocity": (XYZ, lambda message: _xyz(message.vector))},
-        "Odometry": {"velocity": (XYZ, lambda message: _xyz(message.twist.twist.linear))},
+        "TwistStamped": {"velocity": "twist.linear"},
+        "TwistWithCovarianceStamped": {"velocity": VELOCITY},
+        "Vector3Stamped": {"velocity": "vector"},
+        "Odometry": {"velocity": VELOCITY},
     },
-    "imu": {
-        "Imu": {
-            "rates": (XYZ, lambda message: _xyz(message.angular_velocity)),
-            "specific_force": (XYZ, lambda message: _xyz(message.linear_acceleration)),
-        }
-    },
-    "voltage": {"BatteryState": {"voltage": (BATTERY, lambda message: [message.voltage])}},
+    "imu": {"Imu": {"rates": "angular_velocity", "specific_force": "linear_acceleration"}},
+    "voltage": {"BatteryState": {"voltage": "voltage"}},
 }
 # Read in a role only if `topics` says so.
 ASKED_FOR = {("velocity", "Odometry"), ("velocity", "Vector3Stamped"), ("pose", "PointStamped")}
@@ -126,7 +100,7 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
     if "velocity" in chosen:
         _twist_in_world(parts, chosen["velocity"][0])
     tables = {_px4(each): _px4_table(messages[each.topic]) for each in wanted if each.msgtype.startswith(PX4)}
-    own = dict(states(tables, notes)) | motors(tables, {}, 0, notes)
+    own = states(tables, notes) | motors(tables, {}, 0, notes)
     parts = {name: part._replace(ticks=1000 * part.ticks) for name, part in own.items()} | parts  # µs, the bag ns
     notes += [f"topics that are not used: {', '.join(sorted(types.keys() - used))}"] if types.keys() - used else []
     return raw.record(path, parts, 1e-9, notes, {"format": "ROS bag"})
@@ -214,8 +188,10 @@ def _stamps(messages) -> np.ndarray:
 
 def _states(role: str, kind: str, topic: str, messages) -> Iterator[tuple[str, Samples]]:
     ticks = _stamps(messages)
-    for quantity, (axes, read) in READERS[role][kind].items():
-        yield quantity, Samples(ticks, np.array([read(message) for _, message in messages], float), axes, topic)
+    for quantity, field in READERS[role][kind].items():
+        found = [attrgetter(field)(message) for _, message in messages]
+        values = [[getattr(each, axis, each) for axis in AXES[quantity][0]] for each in found]  # a voltage has no axes
+        yield quantity, Samples(ticks, np.array(values, float), topic)
 
 
 def _numbers(message, field: str):
@@ -239,4 +215,4 @@ def _motors(path, topic: str, field: str, unit: str, messages) -> Iterator[tuple
         raise ValueError(f"{path}: {topic}: field {name} holds {found}")
     values = of_unit(np.stack(rows), unit)
     quantity = "command" if unit in SHARES else "rotor_speed"
-    yield quantity, Samples(_stamps(messages), values, tuple(map(str, range(values.shape[1]))), f"{topic} {name}")
+    yield quantity, Samples(_stamps(messages), values, f"{topic} {name}")

@@ -8,14 +8,13 @@ import contextlib
 import io
 import struct
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hybrid_jax.flights.formats import raw
-from hybrid_jax.flights.formats.raw import BATTERY, WXYZ, XYZ, Samples
+from hybrid_jax.flights.formats.raw import Samples, turned
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.vehicle import FEWEST_ROTORS
 
@@ -69,7 +68,7 @@ def read_ulog(path: str | Path) -> Recording:
         longest = max(each.duration for each in log.dropouts)
         notes.append(f"{len(log.dropouts)} dropouts of the logger, the longest of {longest} ms")
     simulated = "SITL" in facts["program"]
-    parts = dict(states(tables, notes))
+    parts = states(tables, notes)
     parts |= motors(tables, log.initial_parameters, ROTORS.get(kind, 0), notes, simulated)
     return raw.record(path, parts, 1e-6, notes, facts)
 
@@ -161,22 +160,17 @@ def _table(tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple
         return ticks, np.stack([table[field] for field in fields], axis=1).astype(float)
 
 
-def states(tables, notes: list[str]) -> Iterator[tuple[str, Samples]]:
+def states(tables, notes: list[str]) -> dict[str, Samples]:
     """The quantities of `SOURCES` in tables of topics: field → array."""
+    found = {}
     for quantity, places in SOURCES.items():
         topic, fields = next((place for place in places if _has(tables, *place)), ("", ()))
-        if not topic:
-            continue
-        ticks, values = _table(tables, topic, fields)
-        if quantity in VALID:
-            ticks, values = _valid(tables[topic], quantity, ticks, values, notes)
-        if quantity == "attitude":
-            values = raw.attitude(values, "NED", "FRD")
-        elif quantity != "voltage":
-            of_world = quantity in VALID
-            values = raw.world(values, "NED") if of_world else raw.body(values, "FRD")
-        axes = {"attitude": WXYZ, "voltage": BATTERY}.get(quantity, XYZ)
-        yield quantity, Samples(ticks, values, axes, f"{topic} {' '.join(fields)}")
+        if topic:
+            ticks, values = _table(tables, topic, fields)
+            if quantity in VALID:
+                ticks, values = _valid(tables[topic], quantity, ticks, values, notes)
+            found[quantity] = Samples(ticks, values, f"{topic} {' '.join(fields)}")
+    return turned(found, "NED", "FRD")
 
 
 def _valid(table, quantity: str, ticks, values, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -219,7 +213,7 @@ def motors(tables, parameters, expected: int, notes: list[str], simulated: bool 
         elif topic == OUTPUTS:
             used, unit = _shares(used, parameters)
             notes.append(f"{OUTPUTS}: commands are shares {unit}")
-        found[quantity] = Samples(ticks, used, tuple(map(str, range(count))), topic)
+        found[quantity] = Samples(ticks, used, topic)
     return found
 
 
