@@ -164,8 +164,6 @@ def renamed(node: Any, others: Mapping[str, str]) -> Any:
         return node
     if isinstance(node, Reference):
         return replace(node, name=others.get(node.name, node.name))
-    if not isinstance(node, Node):
-        return node
     return replace(node, **{key: renamed(one, others) for key, one in vars(node).items()})
 
 

@@ -107,8 +107,8 @@ class CTranslation(Translation[np.ndarray]):
         passed = [self._passed(value, value.shape, 0) for value in inputs[:shared]]
         passed += [self._passed(value, value.shape[1:], 1) for value in inputs[shared:]]
         called = CTranslation(self.tables)
-        found = called._run(inner.jaxpr, inner.consts, [one.inside for one in passed])
-        results, outs = [called._column(one) for one in found], [self.tables.name("r") for _ in found]
+        results = called.run(inner, [one.inside for one in passed])
+        outs = [self.tables.name("r") for _ in results]
         body = called.body(results, outs)
         read = names(body)
         taken = [(one.parameter, one.given) for one in passed if one.parameter and one.parameter.name in read]
@@ -123,8 +123,8 @@ class CTranslation(Translation[np.ndarray]):
             return nested((count,), Call(name, (*(given for _, given in taken), *filled)))
 
         whole = self._filled(int(starts[-1]), fill)
-        parts = zip(np.split(whole, starts[1:-1]), found, strict=True)
-        return [Entries(part, (count, *one.shape)) for part, one in parts]
+        parts = zip(np.split(whole, starts[1:-1]), equation.outvars, strict=True)
+        return [Entries(part, one.aval.shape) for part, one in parts]
 
     def _passed(self, value: Value, shape: tuple[int, ...], stride: int) -> "_Passed":
         """How a value, or an array of this shape in it, comes into a function that is called for each of these."""

@@ -61,10 +61,9 @@ class Translation(ABC, Generic[Column]):
         """The same program on each of several arrays, which most languages here do not know."""
         raise self._refusal(equation)
 
-    def run(self, program: ClosedJaxpr, arguments: Sequence[Column], sizes: Sequence[int]) -> list[Column]:
-        """The results of a program of vectors as columns; ValueError, with its name, for an unknown operation."""
-        inputs = [Entries(column, (size,)) for column, size in zip(arguments, sizes, strict=True)]
-        return [self._column(value) for value in self._run(program.jaxpr, program.consts, inputs)]
+    def run(self, program: ClosedJaxpr, arguments: Sequence["Value"]) -> list[Column]:
+        """The results of a program as columns; ValueError, with its name, for an unknown operation."""
+        return [self._column(value) for value in self._run(program.jaxpr, program.consts, arguments)]
 
     def _run(self, program: Jaxpr, constants: Sequence[Any], arguments: Sequence[Value]) -> list[Value]:
         values: dict[Any, Value] = dict(zip(program.constvars, map(np.asarray, constants), strict=True))

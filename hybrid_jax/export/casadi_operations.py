@@ -9,14 +9,14 @@ import casadi as ca
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from hybrid_jax.codegen.translation import Translation
+from hybrid_jax.codegen.translation import Entries, Translation
 
 Column = ca.SX | ca.DM
 
 
 def evaluate(program: ClosedJaxpr, symbols: Sequence[ca.SX]) -> ca.SX:
     """The result of a program from vectors to one vector, as a dense column; ValueError for an unknown operation."""
-    (result,) = CasadiTranslation().run(program, symbols, [one.numel() for one in symbols])
+    (result,) = CasadiTranslation().run(program, [Entries(one, (one.numel(),)) for one in symbols])
     return ca.densify(ca.SX(result))
 
 

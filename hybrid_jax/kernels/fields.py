@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from hybrid_jax.dynamics.batching import batch_norms
@@ -22,7 +23,7 @@ from hybrid_jax.kernels.trace import Shape, Split, split, traced
 from hybrid_jax.networks.normalisation import AbstractNorm, BatchNorm
 
 MOST = 20_000  # weights: more take long to translate
-REFUSED: dict[str, str] = {}  # name of a field → why there is no kernel for it
+REFUSED: dict[str, str] = {}  # a field, as `_name` has it → why there is no kernel for it
 
 
 class Sizes(NamedTuple):
@@ -46,26 +47,27 @@ class Kernel:
 
     def weights(self, field: PyTree) -> Array:
         """The weights of a field in one array."""
-        return joined(self.forward.weights(*jax.tree.leaves(eqx.filter(field, _is_array))))
+        return _joined(self.forward, jax.tree.leaves(eqx.filter(field, _is_array)))
 
     def apart(self, weights: Array) -> list[Array]:
         """The weights from one array."""
-        shapes = [one.shape for one in self.forward.shapes]
-        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in shapes)]).tolist()
-        return [weights[start:end].reshape(s) for start, end, s in zip(ends, ends[1:], shapes, strict=False)]
+        shapes = self.forward.shapes
+        parts = jnp.split(weights, np.cumsum([one.size for one in shapes])[:-1]) if shapes else []
+        return [part.reshape(one.shape) for part, one in zip(parts, shapes, strict=True)]
 
     def back_weights(self, weights: Array) -> Array:
         """Those of the way back."""
         assert self.back is not None
-        return joined(self.back.weights(*self.apart(weights)))
+        return _joined(self.back, self.apart(weights))
 
     def evaluate(self, weights: Array, x: Array, u: Array, n: Array) -> list[Array]:
         """ẋ, z, W, γ and β, of one sample."""
-        return self.forward.program(*self.apart(weights), x, u, n)
+        return jaxpr_as_fun(self.forward.program)(*self.apart(weights), x, u, n)
 
 
-def joined(arrays: Sequence[Array]) -> Array:
-    return jnp.concatenate([jnp.zeros(0, jnp.float32), *(jnp.ravel(one) for one in arrays)])
+def _joined(apart: Split, arrays: Sequence[Array]) -> Array:
+    found = jaxpr_as_fun(apart.weights)(*arrays)
+    return jnp.concatenate([jnp.zeros(0, jnp.float32), *(jnp.ravel(one) for one in found)])
 
 
 def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
@@ -74,24 +76,38 @@ def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
     shapes, structure = jax.tree.flatten(jax.tree.map(lambda leaf: Shape(jnp.shape(leaf), leaf.dtype), arrays))
     static, frame = jax.tree.flatten(rest)
     try:
-        key = tuple((*one.shape, str(one.dtype)) for one in shapes), structure, tuple(static), frame, d, m, training
-        if key not in _KNOWN:
-            with jax.ensure_compile_time_eval():  # this may be inside of a program that JAX traces
-                _KNOWN[key] = _made(eqx.combine(jax.tree.unflatten(structure, shapes), rest), Sizes(d, m), training)
+        key = tuple((*one.shape, str(one.dtype)) for one in shapes), structure, tuple(static), frame, d, m
+        if (*key, training) not in _KNOWN:
+            whole, both = eqx.combine(jax.tree.unflatten(structure, shapes), rest), _KNOWN.get((*key, True))
+            _check_methods(whole, "train_batch" if training else "infer_batch")
+            if both is None or both.sizes.units:  # or predictions are a part of training
+                with jax.ensure_compile_time_eval():  # this may be inside of a program that JAX traces
+                    both = _made(whole, Sizes(d, m), training)
+            _KNOWN[*key, training] = both
     except Exception as error:  # a user's code may raise anything
         known = isinstance(error, ValueError | library.Unusable)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
-        REFUSED[type(field).__name__] = reason.removeprefix("field: ").partition("\n")[0]
+        REFUSED[_name(field)] = reason.removeprefix("field: ").partition("\n")[0]
         return None
-    return _KNOWN[key]
+    return _KNOWN[*key, training]
 
 
 _KNOWN: dict[Any, Kernel] = {}
 
 
+def _name(field: Any) -> str:
+    """The class of a field, with those of the modules in it, or the name of a function."""
+    modules = [part for part in vars(field).values() if isinstance(part, eqx.Module)] if _is_module(field) else []
+    own = getattr(field, "__qualname__", type(field).__name__)
+    return f"{own}({', '.join(map(_name, modules))})" if modules else own
+
+
+def _is_module(node: Any) -> bool:
+    return isinstance(node, eqx.Module)
+
+
 def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
     """The kernel of a field of shapes in place of arrays."""
-    _check_methods(field, "train_batch" if training else "infer_batch")
     shapes, structure = jax.tree.flatten(eqx.filter(field, _is_shape))
     rest, norm = eqx.filter(field, _is_shape, inverse=True), _norm_of(field) if training else None
     epsilon, units = (norm.epsilon, norm.gain.size) if norm else (0.0, 0)
@@ -102,24 +118,21 @@ def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
         x, u, n = arrays[-3:]
         return _apart(whole, x, u, n) if norm else [whole(x, u), n, jnp.zeros((0, 0), n.dtype), n, n]
 
-    program = traced(evaluate, *shapes, *of_sample)
-    slope, read, weight, *_ = (program.shapes[one] for one in program.outputs)
+    forward = split(traced(evaluate, *shapes, *of_sample), len(shapes))
+    slope, read, weight, *_ = forward.program.out_avals
     if (slope.shape, slope.dtype) != ((sizes.d,), jnp.float32):
-        raise ValueError(f"it returns {slope}")
+        raise ValueError(f"it returns {slope.str_short()}")
     if weight.shape != (units, *read.shape):
         raise ValueError(f"its batch normalisation is of {weight.shape} weights and of {read.shape} numbers")
-    forward, sizes = split(program, len(shapes)), sizes._replace(reads=read.size, units=units)
     if any(one.dtype != jnp.float32 for one in forward.shapes):
         raise ValueError("its numbers are not all in single precision")
-    if (count := sum(int(np.prod(one.shape)) for one in forward.shapes)) > MOST:
+    if (count := sum(one.size for one in forward.shapes)) > MOST:
         raise ValueError(f"it has {count} weights, more than {MOST}")
-    source = Source(forward, of_sample)
-    back = source.add_backward() if training else None
-    source.add_forward()
+    sizes, source = sizes._replace(reads=read.size, units=units), Source(forward, of_sample, training)
     constants = dict(zip("DMZH", sizes, strict=True)) | {"P": count}
-    constants |= dict(zip(("WEIGHT", "GAIN", "SHIFT"), map(forward.place, program.outputs[2:]), strict=True))
-    prefix = library.compiled(source.text(constants, training), source.needs_math())
-    return Kernel(prefix, sizes, forward, back, epsilon)
+    constants |= {name: forward.place(i) for i, name in enumerate(("WEIGHT", "GAIN", "SHIFT"), start=2)}
+    prefix = library.compiled(source.text(constants), source.needs_math())
+    return Kernel(prefix, sizes, forward, source.back, epsilon)
 
 
 def _norm_of(field: PyTree) -> BatchNorm | None:

@@ -1,30 +1,20 @@
 """The C++ of a field: programs of one sample, for a vector of samples at a time, before cpp/rollout.h."""
 
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import jax
 import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from hybrid_jax.codegen import loops, nodes
-from hybrid_jax.codegen.nodes import (
-    Address,
-    Assign,
-    Call,
-    Element,
-    Entry,
-    Expression,
-    Operation,
-    Statement,
-    arranged,
-    nested,
-)
+from hybrid_jax.codegen.nodes import Address, Assign, Call, Element, Entry, Expression, Operation, Statement, arranged
 from hybrid_jax.codegen.operations import LOGICAL, CTranslation, column
 from hybrid_jax.codegen.printer import MATH, CPrinter
 from hybrid_jax.codegen.tables import Tables
-from hybrid_jax.codegen.translation import Entries, Value
-from hybrid_jax.kernels.trace import Products, Program, Shape, Split, split, traced, with_factors
+from hybrid_jax.codegen.translation import Entries
+from hybrid_jax.kernels.trace import Products, Shape, Split, outputs_of, split, traced, with_factors
 
 LONGEST = 4000  # statements of a function: GCC takes long for more, and a program of XLA does as well
 CHEAP = {"add", "sub", "mul", "neg", "max", "min", "select_n", "convert_element_type", *LOGICAL}
@@ -65,16 +55,6 @@ class SampleTranslation(CTranslation):
         end = _merged([_inlined(one, known) for one in end])
         return arranged(steps, nodes.names(tuple(end)), end)
 
-    def columns(self, program: Program, arguments: Sequence[Value]) -> list[np.ndarray]:
-        """The outputs of a program."""
-        values: dict[int, Value] = {number: np.asarray(value) for number, value in program.constants.items()}
-        values.update(zip(program.inputs, arguments, strict=True))
-
-        for step in program.steps:
-            found = self._results(step.equation, [values[one] for one in step.inputs])
-            values.update(zip(step.outputs, found, strict=True))
-        return [self._column(values[one]) for one in program.outputs]
-
 
 def _inlined(statement: Statement, known: dict[tuple[int, ...], dict[Any, Expression]], makes: str = "") -> Statement:
     """A loop over entries with known ones written out; what it makes is known then, if it is cheap."""
@@ -94,7 +74,7 @@ def _inlined(statement: Statement, known: dict[tuple[int, ...], dict[Any, Expres
     operations = [one.name for one in nodes.walk(inner.value) if isinstance(one, Operation)]
     if inner.target.name == makes and len(operations) <= INLINED and CHEAP.issuperset(operations):
         entries[inner.target] = inner.value
-    return nested(shape, inner)
+    return nodes.nested(shape, inner)
 
 
 def _merged(statements: Sequence[Statement]) -> list[Statement]:
@@ -139,68 +119,54 @@ class SamplePrinter(CPrinter):
 
 
 GIVEN = "const float *__restrict w, const Vec *__restrict x, const Vec *__restrict u, "
-INPUTS = ("dx", 0), ("du", 0), ("dn", 0)
+BACK = {
+    "slope_back": "const Vec *__restrict n, const Vec *__restrict d_slope, Vec *dx, Vec *du, Vec *dn, Sums s, Vec *f",
+    "read_back": "const Vec *d_read, Vec *dx, Vec *du, Sums s",
+}
+Outputs = list[tuple[str, int]]  # arrays, and where in them the results begin
 
 
 class Source:
     """The functions of a field, of its weights and of one sample: x, u, and n; see cpp/rollout.h."""
 
-    def __init__(self, forward: Split, of_sample: Sequence[Shape]):
-        self.forward, self.of_sample = forward, list(of_sample)
+    def __init__(self, forward: Split, of_sample: Sequence[Shape], training: bool):
         self.tables = Tables(double=False)
         self.bodies: list[tuple[nodes.Statement, ...]] = []
         self.functions: list[str] = []
-        self.factors = 1
+        self.factors, self.places = 1, _places(forward.shapes)
+        self.back = self._add_backward(forward, of_sample) if training else None
+        for i, (name, given) in enumerate((("slope", "const Vec *__restrict n, Vec *out"), ("read", "Vec *out"))):
+            program = outputs_of(forward.program, [i])
+            self._add(name, given, program, self.places, ("x", "u", "n"), [("out", 0)])
 
-    def add_forward(self) -> None:
-        """`slope` and `read`."""
-        program, places = self.forward.program, _places(self.forward.shapes)
-        slope, read, *_ = program.outputs
-        self._add(
-            "slope",
-            "const Vec *__restrict n, Vec *out",
-            program.of([slope]),
-            places,
-            "xun",
-            [("out", 0)],
-        )
-        self._add("read", "Vec *out", program.of([read]), places, "xun", [("out", 0)])
-
-    def add_backward(self) -> Split:
+    def _add_backward(self, forward: Split, of_sample: Sequence[Shape]) -> Split:
         """`slope_back`, `products` and `read_back`, and what they take for weights, as a function of the weights."""
-        program, count = self.forward.program, len(self.forward.shapes)
-        slope, read = (program.of([output]) for output in program.outputs[:2])
-        samples = [*self.of_sample, self.of_sample[0], program.shapes[program.outputs[1]]]
+        count, (slope, read, *_) = len(forward.shapes), forward.program.out_avals
+        parts = [jaxpr_as_fun(outputs_of(forward.program, [i])) for i in range(2)]
 
         def pulled_back(*arrays):
             *arrays, d_slope, d_read = arrays
-            parts = jax.vjp(lambda *arrays: slope(*arrays)[0], *arrays)[1](d_slope)
-            return [*parts, *jax.vjp(lambda *arrays: read(*arrays)[0], *arrays)[1](d_read)]
+            ways = (jax.vjp(part, *arrays)[1]([slope]) for part, slope in zip(parts, (d_slope, d_read), strict=True))
+            return [slope for way in ways for slope in way]
 
-        back = split(traced(pulled_back, *self.forward.shapes, *samples), count)
-        ways, places = back.program.outputs, _places(back.shapes)
-        whole, products = with_factors(back.program.of(ways[: count + 3]), count)
-        outputs = [*self._sums(products), *INPUTS, *self._factors(products)]
-        given = "const Vec *__restrict n, const Vec *__restrict d_slope, Vec *dx, Vec *du, Vec *dn, Sums s, Vec *f"
-        self._add("slope_back", given, whole, places, ("x", "u", "n", "d_slope", "d_read"), outputs)
-        outputs = [*self._sums(()), *INPUTS[:2]]
-        of_reading = back.program.of(ways[count + 3 : -1])
-        given, inputs = "const Vec *d_read, Vec *dx, Vec *du, Sums s", ("x", "u", "n", "d_slope", "d_read")
-        self._add("read_back", given, of_reading, places, inputs, outputs)
+        back = split(traced(pulled_back, *forward.shapes, *of_sample, slope, read), count)
+        whole, products = with_factors(outputs_of(back.program, range(count + 3)), count)
+        reading = outputs_of(back.program, range(count + 3, 2 * count + 5))
+        ways: Outputs = [("dx", 0), ("du", 0), ("dn", 0)]
+        sums: Outputs = [("s", place) for place in self.places]
+        kept = [one for i, one in enumerate(sums) if i not in products]
+        inputs, places = ("x", "u", "n", "d_slope", "d_read"), _places(back.shapes)
+        self._add("slope_back", BACK["slope_back"], whole, places, inputs, [*kept, *ways, *self._factors(products)])
+        self._add("read_back", BACK["read_back"], reading, places, inputs, [*sums, *ways[:2]])
         return back
 
-    def _sums(self, without: Container[int]) -> list[tuple[str, int]]:
-        """Where the derivatives begin that are summed number by number."""
-        return [("s", place) for i, place in enumerate(_places(self.forward.shapes)) if i not in without]
-
-    def _factors(self, products: Products) -> list[tuple[str, int]]:
-        """Where the factors of others begin; `products` is the function that multiplies and sums them."""
+    def _factors(self, products: Products) -> Outputs:
+        """Where the factors of products begin; `products` is the function that multiplies and sums them."""
         outputs, at, calls = [], 0, []
         for i, pairs in products.items():
             for rows, columns in pairs:
                 outputs += [("f", at), ("f", at + rows)]
-                place = _places(self.forward.shapes)[i]
-                where = f"sums + {place}, factors + {at}, F, factors + {at + rows}, F, slots"
+                where = f"sums + {self.places[i]}, factors + {at}, F, factors + {at + rows}, F, slots"
                 calls.append(f"    add_products<{rows}, {columns}>({where});")
                 at += rows + columns
         self.factors = at | 1  # an even number of vectors may put all slots into the same lines of the cache
@@ -208,16 +174,15 @@ class Source:
         self.functions.append("\n".join([head, *calls, "}\n"]))
         return outputs
 
-    def _add(self, name, parameters, program, weights, inputs, outputs) -> None:
+    def _add(self, name: str, parameters: str, program: ClosedJaxpr, weights, inputs, outputs: Outputs) -> None:
         """A function of weights, which begin at these places of `w`, and inputs, that fills the outputs."""
-        arguments = []
-        for i, variable in enumerate(program.inputs):
-            array, first = ("w", weights[i]) if i < len(weights) else (inputs[i - len(weights)], 0)
-            shape = program.shapes[variable].shape
-            arguments.append(Entries(column(Entry(array, first + k) for k in range(int(np.prod(shape)))), shape))
+        starts = [*(("w", place) for place in weights), *((name, 0) for name in inputs)]
+        arguments = [
+            Entries(column(Entry(array, first + k) for k in range(one.size)), one.shape)
+            for (array, first), one in zip(starts, program.in_avals, strict=True)
+        ]
         translation = SampleTranslation(self.tables)
-        found = translation.columns(program, arguments)
-        pairs = zip(outputs, found, strict=True)
+        pairs = zip(outputs, translation.run(program, arguments), strict=True)
         written = [(*out, one) for out, one in pairs if len(one) and not (out[0] == "s" and _is_zero(one))]
         outs, begins, results = zip(*written, strict=True) if written else ((), (), ())
         body = translation.body(results, outs, begins)
@@ -228,12 +193,11 @@ class Source:
         text = SamplePrinter(double=False).body(body)
         self.functions.append(f"void {name}({GIVEN}{parameters}) {{\n{text}\n}}\n")
 
-    def text(self, constants: dict[str, int], training: bool) -> str:
+    def text(self, constants: dict[str, int]) -> str:
         """The whole source."""
         printer, read = SamplePrinter(double=False), nodes.names(tuple(self.bodies))
-        constants = constants | {"F": self.factors}
-        head = [f"#define TRAINING {int(training)}", '#include "samples.h"', "namespace {"]
-        head += [f"constexpr int64_t {name} = {value};" for name, value in constants.items()]
+        head = [f"#define TRAINING {int(self.back is not None)}", '#include "samples.h"', "namespace {"]
+        head += [f"constexpr int64_t {name} = {value};" for name, value in (constants | {"F": self.factors}).items()]
         tables = [printer.table(name, numbers) for name, numbers in self.tables.numbers.items() if name in read]
         lines = [*head, *(table.replace("real", "float", 1) for table in tables), *self.functions]
         return "\n".join([*lines, "}  // namespace", '#include "rollout.h"', ""])
@@ -250,4 +214,4 @@ def _is_zero(entries: np.ndarray) -> bool:
 
 def _places(shapes: Sequence[Shape]) -> list[int]:
     """Where each array begins of arrays one after the other."""
-    return np.cumsum([0, *(int(np.prod(one.shape)) for one in shapes)])[:-1].tolist()
+    return np.cumsum([0, *(one.size for one in shapes)])[:-1].tolist()

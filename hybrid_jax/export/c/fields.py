@@ -14,6 +14,7 @@ from hybrid_jax.codegen.nodes import Entry, Statement
 from hybrid_jax.codegen.operations import CTranslation, column
 from hybrid_jax.codegen.printer import CPrinter
 from hybrid_jax.codegen.tables import Tables
+from hybrid_jax.codegen.translation import Entries
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.export.c.templates import HEADER, SOURCE
 from hybrid_jax.export.program import Size, prepared, sizes_of, vehicle_in
@@ -104,9 +105,9 @@ def body_of(
 ) -> tuple[Statement, ...]:
     """The statements of a C function of some arrays, x and u by default, that fills others."""
     translation = CTranslation(tables)
-    sizes = [like.shape[0] for like in likes]
-    arguments = [column(Entry(name, i) for i in range(size)) for name, size in zip(inputs, sizes, strict=True)]
-    results = translation.run(jax.make_jaxpr(function)(*likes), arguments, sizes)
+    pairs = zip(inputs, likes, strict=True)
+    arguments = [Entries(column(Entry(name, i) for i in range(like.size)), like.shape) for name, like in pairs]
+    results = translation.run(jax.make_jaxpr(function)(*likes), arguments)
     return translation.body(results, outputs)
 
 
