@@ -1,5 +1,6 @@
 """How well models predict recorded flights that they were not trained on: python -m experiments.real_flight --help."""
 
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,9 +25,8 @@ from experiments.runner.stages import stages_of
 from hybrid_jax.cli.command import BAD_INPUT, ChecksFailed, split_lists
 from hybrid_jax.dynamics.vehicle_file import LAG, NEED_PURPOSE, VehicleModel, learned_by_field, vehicle_model_of
 from hybrid_jax.estimation.least_squares import fit_least_squares
-from hybrid_jax.flights.checks.cleaning import choose_time_constant
+from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
 from hybrid_jax.flights.checks.consistency import FAILS
-from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import cut_windows, require_common_interval
 from hybrid_jax.sweep import hosts
@@ -135,16 +135,18 @@ def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleMo
 
 def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:
     """Choose the rotors' time constant [s]: physics fitted to the source's training flights predicts the others."""
-    train, validation = hold_out_validation(source.logs, config)
-    baseline = thrust_baseline(model)
+    parts, baseline = hold_out_validation(source.logs, config), thrust_baseline(model)
 
-    def error(cleaned: list[FlightLog]) -> float:
-        parts = cleaned[: len(train)], cleaned[len(train) :]
-        known, unknown = (cut_windows(part, INTERVAL_STEPS).windows for part in parts)
+    def error(lag: float) -> float:
+        lagging = ([lag_motors(log, lag)[0] for log in logs] for logs in parts)
+        known, unknown = (cut_windows(logs, INTERVAL_STEPS).windows for logs in lagging)
         field = fit_least_squares(model.physics(), evenly_spaced(known, LAG_WINDOWS)).field
         return relative_error(flight_errors(field, unknown), flight_errors(baseline, unknown), (INTERVAL_STEPS,))
 
-    return choose_time_constant([*train, *validation], error)[0]
+    errors = {lag: found for lag in TIME_CONSTANTS if math.isfinite(found := error(lag))}
+    if not errors:
+        raise ValueError("no time constant of the rotors has a finite error, so none can be chosen")
+    return min(errors, key=lambda lag: errors[lag])
 
 
 if __name__ == "__main__":

@@ -152,7 +152,7 @@ def forged(metadata, arrays, rng):
     """Content that no `save` wrote, under a checksum that is right."""
     tree, arrays = json.loads(json.dumps(metadata)), {name: array.copy() for name, array in arrays.items()}
     for _ in range(rng.integers(1, 4)):
-        found, name = [*places(tree)], str(rng.choice([*arrays]))
+        found, name = [*places(tree)] or [(tree, "new")], str(rng.choice([*arrays]))
         node, key = found[int(rng.integers(len(found)))]
         match int(rng.integers(6)):
             case 0:
@@ -160,7 +160,7 @@ def forged(metadata, arrays, rng):
             case 1:
                 node["class" if "class" in node else key] = str(rng.choice(NAMES))
             case 2:
-                node.pop(key)
+                node.pop(key) if key in node or isinstance(node, list) else None
             case 3:
                 arrays[name] = np.full_like(arrays[name], rng.choice([np.nan, np.inf, 1e30, -1.0, 0.0]))
             case 4:
