@@ -9,12 +9,11 @@ import hybrid_jax
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.simulated import csv_of
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.vehicle import IRIS
 
 DT, SAMPLES = 0.01, 90
-CONFIG = RealFlightConfig(horizon=(5,), n=(100,), validation=10)
+CONFIG = RealFlightConfig(horizon=(5, 10), n=(20,), seeds=1)
 
 
 @jax.jit
@@ -35,17 +34,6 @@ def flights(names, seed=0):
 
 LOGS = flights([f"/logs/{kind}_run{i}.csv" for kind in ("chirp", "random", "square") for i in (1, 2, 3)])
 OTHERS = flights([f"/more/{kind}_run4.csv" for kind in ("chirp", "random", "square", "melon")], seed=1)
-
-
-def windows_of_fold(fold, steps, stride):
-    parts = ((fold.train, stride), (fold.validation, 1), (fold.test, stride))
-    return [cut_windows(logs, steps, every).windows for logs, every in parts]
-
-
-def samples(windows):
-    """Every state in some windows, as bytes."""
-    states = np.concatenate([windows.x0[:, None], windows.x], axis=1).reshape(-1, 13)
-    return {state.tobytes() for state in states}
 
 
 def write(folder, logs):

@@ -1,266 +1,231 @@
-"""Write the report, rows, figures and models of an experiment on recorded flights."""
+"""Write the report, rows and figure of an experiment on recorded flights."""
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any
+from itertools import product
 
 import numpy as np
 from rich.console import Console
 
-import hybrid_jax
-from experiments.real_flight import scoring
-from experiments.real_flight.figures import make_figures
-from experiments.real_flight.folds import Fold, motion_of_logs
-from experiments.real_flight.log_tables import log_tables
-from experiments.real_flight.models import RECIPES
-from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, cell_name, cells, pooled, score_labels
-from experiments.real_flight.selection import Selection
-from experiments.real_flight.study import Outputs
-from experiments.real_flight.train import Experiment
-from experiments.reporting import names, report
-from experiments.reporting.claims import verdict_table
+from experiments.real_flight.config import RealFlightConfig
+from experiments.real_flight.study import ADAPTED, BASELINES, LEARNED, MODELS, Fold, key_of
+from experiments.reporting import names
+from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evaluate, every, verdict_table
 from experiments.reporting.plots import save_figures
+from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
-from experiments.reporting.statistics import spread
-from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_tables, spread_text, tabulate
+from experiments.reporting.statistics import Interval, mean_interval, spread
+from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, spread_text, tabulate
 from experiments.runner.run_record import environment
+from experiments.runner.stages import Stages
+from hybrid_jax.cli import errors
 from hybrid_jax.cli.choice import LEVEL
-from hybrid_jax.estimation.uncertainty import named_parameters
-from hybrid_jax.extrapolation import WARN, shares_outside
+from hybrid_jax.cli.logs import STEPS, Flights
 from hybrid_jax.flights.windows import flight_of
 
-NOTES = (
-    "Validation flights stop every training and are not among the N windows.",
-    "An interval of θ_p takes the network as given and comes from windows of 10 steps that share no sample; it does "
-    "not account for errors of the model.",
-)
+NAME = "real_flight"
+LABELS = names.LABELS | {
+    LEARNED: "hybrid-jax fit",
+    ADAPTED: "hybrid-jax adapt",
+    names.SCRATCH: "physics adapted from nominal",
+    names.PHYSICS_ONLY: "its physics alone",
+    names.LINEAR_RESIDUAL: "rigid body + linear residual",
+}
+Cell = tuple[str, int]  # model, n_train
+HEAD = f"""# {NAME}
+
+Flights held out are predicted open loop with the recorded motors, by models that the calls of `hybrid-jax fit` and
+`hybrid-jax adapt` made of the other flights.
+
+- **hybrid-jax fit**: physics, or physics with a network, whichever predicts flights left out better
+- **its physics alone**: the multirotor in it, without a network
+- **hybrid-jax adapt**: the same adapted to N windows of ten intervals after the change
+- **physics adapted from nominal**: the vehicle file's multirotor adapted to the same windows, without a past
+- **rigid body + linear residual**: a linear map of state and input that is fitted to the residuals of a rigid body
+
+Errors are lengths of vectors, of rotation the angle; an RMSE over flights counts each flight once."""
 
 
-def write_report(name: str, experiment: Experiment, outputs: Outputs, console: Console) -> None:
-    """Write models, figures and, last, the report; print its main tables."""
-    out, rows, stages = experiment.config.out / name, outputs.table, experiment.stages
-    save_models(out / "models", experiment, outputs)
-    claims, nominal = scoring.verdicts(outputs.replicates), named_parameters(experiment.before.physics())
-    shares = {log: (fold.name, each) for fold in outputs.folds for log, each in outside_of_training(fold).items()}
-    main = [expected_table(outputs.selections), *score_tables(rows, experiment.dt)]
-    main += [verdict_table(claims, "Hypotheses")] if claims else []
-    records = [record for logs in experiment.logs.values() for record in logs.records]
-    more = [*fold_tables(rows), choice_table(outputs.selections), *parameter_tables(rows, nominal)]
-    parts = ("train", "validation", "test")
-    extra = {
-        "vehicle": {"before": asdict(experiment.before), "after": asdict(experiment.after)},
-        "folds": [
-            {"tested_on": fold.name} | {part: [flight_of(log) for log in getattr(fold, part)] for part in parts}
-            for fold in outputs.folds
-        ],
-        "selections": [selected.described() for selected in outputs.selections],
-        "outside": {flight: each for flight, (_, each) in shares.items()},
-        "logs": {label: logs.records for label, logs in experiment.logs.items()},
-    }
-    figures = save_figures(out, make_figures(experiment, outputs))
-    given = (experiment.config.described(), environment(stages.seconds), rows, claims, figures)
-    head = introduction(name, experiment, outputs)
-    tables = [*log_tables(records), main[0], outside_table(shares), *main[1:], *more]
-    notes = [*stages.notes(), *NOTES]
-    warned = warnings_of(shares)
-    made = report.Report(name, *given, notes, extra, head, tables, conclusion=conclusion(outputs), warnings=warned)
-    report.write_report(out, made)
-    print_tables(console, [table for table in main if not (made.meaningless and table.verdicts)])
-    for line in (*warned, *made.conclusions()):
-        console.print(line, highlight=False, soft_wrap=True, style="yellow" * (line in warned), markup=False)
-    console.print(
-        f"Report, with folds, parameters and log checks: {out / report.HTML_NAME}", highlight=False, soft_wrap=True
+def write(
+    config: RealFlightConfig,
+    sets: Mapping[str, Flights],
+    folds: Sequence[Fold],
+    rows: Results,
+    curves: Mapping[str, np.ndarray],
+    stages: Stages,
+) -> None:
+    """Write the report into the folder of the run, and print its tables."""
+    out, found = config.out / NAME, cells(rows)
+    best = max((cell for cell in found if cell[0] in (ADAPTED, LEARNED)), key=lambda cell: cell[1])
+    drawn = [(names.HOLD, 0), (names.THRUST, 0), (names.PHYSICS_ONLY, 0), *dict.fromkeys([(LEARNED, 0), best])]
+    figure = errors.figure(
+        {label(*cell): np.stack([curves[key_of(row)] for row in found[cell]]) for cell in drawn}, config.dt
     )
-
-
-def conclusion(outputs: Outputs) -> list[str]:
-    """What was chosen, and the position error to expect of it in the last fold, with the largest N."""
-    if not outputs.selections:
-        return []
-    selected = outputs.selections[-1]
-    place, label = max((i, label) for i, label in enumerate(selected.labels) if label != SUM)
-    value, low, high = (end[place, 0] for end in selected.expected)
-    interval = f" ({LEVEL:.0%} interval {low:.2g} to {high:.2g})" if np.isfinite(high) else ""
-    chosen = ", ".join(dict.fromkeys(str(each.chosen) for each in outputs.selections))
-    return [
-        f"Chosen by flights left out of training: {chosen}.",
-        f"After {label} steps of a flight not seen, expect a position RMSE of {value:.2g} m{interval}.",
-    ]
-
-
-def introduction(name: str, experiment: Experiment, outputs: Outputs) -> str:
-    config, logs = experiment.config, experiment.logs
-    flights = ", ".join(f"{len(each.logs)} {label}" for label, each in logs.items())
-    of = ", ".join(f"{label} {sum(record['seconds'] for record in each.records):.0f} s" for label, each in logs.items())
-    recipes = "\n".join(f"- recipe **{recipe}**: {RECIPES[recipe].about}" for recipe in config.tried)
-    adapted = f"the source's flights, then on N windows of the target's ({config.draw}),"
-    failed = sum(record["fails"] for each in logs.values() for record in each.records)
-    anyway = (
-        f"**{failed} checks of the logs failed, and --anyway went on: no number below counts until they pass.**\n\n"
-    )
-    return f"""{anyway if failed else ""}# {name}
-
-Models are trained on {adapted if "target" in logs else "flights"} and predict \
-held-out flights, open loop from every sample with the recorded rotor speeds.
-{flights} flights ({of}{"; simulated" if config.simulated else ""}), in {len(outputs.folds)} folds by \
-{config.folds_by}; {len(outputs.tests)} tests, {config.seeds} seeds.
-
-- **hybrid**: a multirotor that learns {", ".join(experiment.before.learn)} (or what its recipe says), plus a small \
-network of body-frame inputs
-- **no-physics**: the same network with ṗ = v and the attitude's kinematics
-- **physics-only**: the multirotor alone
-- **rigid body + linear residual**: the nominal rigid body, and a linear map of state and input fitted to its residuals
-- **chosen**: what flights left out of training in turn chose among baselines, physics-only and hybrids of each recipe
-- **fine-tuned**: from the source's model; **scratch**: from nominal values; **zero-shot**: the source's model as it is
-{recipes}
-
-Errors are lengths of vectors, of rotation the angle. An RMSE is over all test windows."""
-
-
-def save_models(folder: Path, experiment: Experiment, outputs: Outputs) -> None:
-    """Save every trained model, and what was chosen, with what is known about it."""
-    rows = {tuple(row[tag] for tag in TAGS): row for row in outputs.table}
-    fields: dict[tuple[Any, ...], Any] = {
-        (number, model, mode, trained.size(run), seed): trained.run(run)
-        for (number, model, mode), trained in outputs.trained.items()
-        for run, seed in enumerate(trained.seeds)
-    }
-    for (number, size, seed), each in outputs.chosen.items():
-        fields[number, names.CHOSEN, names.FINE_TUNED if size else names.SOURCE_ONLY, size, seed] = each
-    for (number, model, mode, size, seed), each in fields.items():
-        tags = (outputs.folds[number].name, model, mode, size, seed)
-        about = dict(zip(("tested_on", *TAGS[1:]), tags, strict=True)) | {"dt": experiment.dt}
-        about |= {name: rows[tags][name] for name in ("recipe", "scores")}
-        hybrid_jax.save(folder / f"fold{number}-{model}-{mode}-{size}-seed{seed}.npz", each, about)
-
-
-def expected_table(selections: Sequence[Selection]) -> Table:
-    """Make a table of the error to expect of what was chosen on a flight not seen, and of what came out."""
-
-    def cells_of(selected: Selection, label: int) -> Iterator[str]:
-        came_out, inside = np.array(list(selected.observed.values())), selected.inside()
-        for quantity in range(len(QUANTITIES)):
-            value, low, high = (end[label, quantity] for end in selected.expected)
-            text = f"{value:.3g} [{low:.2g}, {high:.2g}]" if np.isfinite(high) else f"{value:.3g} [?]"
-            tested = f": {np.median(came_out[:, label, quantity]):.3g}, {inside[label, quantity]} of {len(came_out)}"
-            yield text + tested * bool(len(came_out))
-
-    lines = [
-        (each.fold, str(each.chosen), str(each.n_train or EMPTY), label, *cells_of(each, place))
-        for each in selections
-        for place, label in enumerate(each.labels)
-    ]
-    title = (
-        f"Error to expect on a flight not seen [{LEVEL:.0%} interval], from those left out of training; after the "
-        "colon what came out on test flights: median, and how many lie inside"
-    )
-    return Table(title, ("tested on", "chosen", "N", "step", *_errors("")), lines, labels=4)
-
-
-def outside_of_training(fold: Fold) -> dict[str, dict[str, float]]:
-    """Of each test flight, the shares of its samples outside what its fold was trained on."""
-    known = motion_of_logs([*fold.train, *fold.validation])
-    return {flight_of(log): shares_outside(known, motion_of_logs([log])) for log in fold.test}
-
-
-def outside_table(shares: Mapping[str, tuple[str, Mapping[str, float]]]) -> Table:
-    """Make a table of `outside_of_training` of all folds, by flight."""
-    lines = [
-        (flight, fold, *(f"{share:.0%}{' !' * (share > WARN)}" for share in each.values()))
-        for flight, (fold, each) in shares.items()
-    ]
-    title = "Test flights against those trained on: share of samples outside the 1 to 99 % range; ! above 10 %"
-    return Table(title, ("flight", "tested on", *next(iter(shares.values()))[1]), lines, labels=2)
-
-
-def warnings_of(shares: Mapping[str, tuple[str, Mapping[str, float]]]) -> list[str]:
-    """A line if test flights lie outside of what was trained on: for those no interval above may hold."""
-    parts = []
-    for name in next(iter(shares.values()))[1]:
-        far = {flight: each[name] for flight, (_, each) in shares.items() if each[name] > WARN}
-        if far:
-            most = max(far, key=far.__getitem__)
-            share = f"{far[most]:.0%} of its samples"
-            parts.append(f"{name} in {len(far)} of {len(shares)} flights, most in {most} ({share})")
-    beyond = "test flights are outside of what was trained on, so that the errors to expect may be too small"
-    return [f"{beyond}: {'; '.join(parts)}"] * bool(parts)
-
-
-def score_tables(rows: Results, dt: float) -> list[Table]:
-    """Make a table per horizon: a line per model, mode and N, over the test windows of all folds."""
-    titles = {label: f"RMSE at step {label} ({int(label) * dt:.3g} s)" for label in score_labels(rows) if label != SUM}
-    if SUM in score_labels(rows):
-        titles[SUM] = "Mean error of steps 1 to 50, summed"
-    named, of = {cell_name(*cell): group for cell, group in cells(rows).items()}, mean_over_seeds(rows)
-    return [tabulate(f"{at}; {of}, test windows of all folds", named, _errors(label)) for label, at in titles.items()]
-
-
-def fold_tables(rows: Results) -> list[Table]:
-    """With several folds, make a table of baselines and best hybrids in each, at each horizon."""
-    folds, found = rows.unique("fold"), cells(rows)
-    if len(folds) < 2:
-        return []
-    most = max(n for _, _, n in found)
-    simple, learned = (names.HOLD, names.THRUST), (names.CHOSEN, names.HYBRID)
-    kept = [cell for cell in found if cell[0] in simple or (cell[0] in learned and cell[2] in (0, most))]
-    lines = [
-        (fold, cell_name(*cell), label, *(text(found[cell].where(fold=fold)) for text in _errors(label).values()))
+    caption = "RMSE over the time since a prediction began, on flights held out"
+    claims = verdicts(found, best)
+    tables = [expected_table(found), *score_tables(rows, found, config.dt), verdict_table(claims, "Hypotheses")]
+    tables += [by_flight_table(found, best, max(config.horizon)), parameter_table(found)]
+    parts = {"train": lambda fold: fold.train, "test": lambda fold: fold.test}
+    split = [
+        {"tested_on": fold.name} | {part: [flight_of(log) for log in of(fold)] for part, of in parts.items()}
         for fold in folds
-        for cell in kept
-        for label in score_labels(rows)
     ]
+    said = [f"{name}: {line}" for name, each in sets.items() for line in each.said]
+    flown = ", ".join(f"{len(each.logs)} {name} ({each.seconds:.0f} s)" for name, each in sets.items())
+    made = Report(
+        experiment=NAME,
+        config=config.described(),
+        environment=environment(stages.seconds),
+        rows=rows,
+        claims=claims,
+        figures=save_figures(out, {"errors_by_step": (figure, caption)}),
+        notes=[*stages.notes(), *said],
+        extra={"folds": split},
+        head=f"{HEAD}\n\nFlights: {flown}, in {len(folds)} folds.",
+        tables=[table for table in tables if table.lines],
+        conclusion=conclusion(found, best, config.dt),
+    )
+    write_report(out, made, Console())
+
+
+def cells(rows: Results) -> dict[Cell, Results]:
+    """Rows over flights and seeds, in the order of MODELS."""
+    return rows.sort(model=MODELS, n_train=None, seed=None).group("model", "n_train")
+
+
+def label(model: str, n: int) -> str:
+    return f"{LABELS[model]}{f', N = {n}' if n else ''}"
+
+
+def pooled(rows: Results, horizon: str, quantity: str) -> np.ndarray:
+    """The RMSE of each seed over the test flights."""
+    groups = rows.sort(seed=None).group("seed").values()
+    return np.array([np.sqrt(np.mean(own.numbers(f"scores.{horizon}.{quantity}") ** 2)) for own in groups])
+
+
+def conclusion(found: Mapping[Cell, Results], best: Cell, dt: float) -> list[str]:
+    """How much better the tool's model is than the best baseline, by velocity after the longest horizon."""
+    horizon = max(found[best][0]["scores"], key=int)
+    errs = {cell: pooled(rows, horizon, "velocity").mean() for cell, rows in found.items()}
+    simple = min((cell for cell in errs if cell[0] in BASELINES), key=errs.__getitem__)
+    told = f"{label(*best)} errs by {errs[best]:.3g} m/s after {int(horizon) * dt:.3g} s of a flight held out"
+    return [f"{told}, {errs[best] / errs[simple]:.2f} times as much as the best baseline ({label(*simple)})."]
+
+
+def expected_table(found: Mapping[Cell, Results]) -> Table:
+    """The errors that the tool expected on a flight not seen, what came out, and how many lie in the interval."""
+    lines = []
+    for cell, rows in found.items():
+        known = rows.where(lambda row: row["expected"] is not None)
+        if len(known):
+            texts = []
+            for name in errors.UNITS:
+                told, came = (
+                    np.exp(np.log(known.numbers(f"{of}.{name}")).mean()) for of in ("expected", f"scores.{STEPS}")
+                )
+                inside = int(sum(row["inside"][name] for row in known))
+                texts.append(f"{told:.3g}: {came:.3g}, {inside} of {len(known)}")
+            lines.append((label(*cell), *texts))
+    title = (
+        f"Error to expect after {STEPS} intervals: what came out, and how many flights lie in the {LEVEL:.0%} interval"
+    )
+    return Table(title, ("model", *_titles()), lines)
+
+
+def score_tables(rows: Results, found: Mapping[Cell, Results], dt: float) -> list[Table]:
+    """A table for each horizon, a line for each model and N."""
+
+    def text(horizon: str, name: str, rows: Results) -> str:
+        return spread_text(spread(pooled(rows, horizon, name)), ".4g", ".2g")
+
+    named = {label(*cell): group for cell, group in found.items()}
     return [
-        Table("Fold by fold (mean ± std over seeds)", ("tested on", "model", "step", *_errors("")), lines, labels=3)
+        tabulate(
+            f"RMSE after {int(horizon) * dt:.3g} s; {mean_over_seeds(rows)}, all test flights",
+            named,
+            {title: partial(text, horizon, name) for title, name in zip(_titles(), errors.UNITS, strict=True)},
+        )
+        for horizon in rows[0]["scores"]
     ]
 
 
-def parameter_tables(rows: Results, nominal: Mapping[str, Any]) -> list[Table]:
-    """Make a table of θ_p: nominal value, mean over folds and seeds, spread, and mean 95 % interval."""
-    found = cells(rows.where(lambda row: bool(row["theta"])))
-    most = max((n for _, _, n in found), default=0)
-    kept = {cell: group for cell, group in found.items() if cell[1] != "scratch" and cell[2] in (0, most)}
-    names = dict.fromkeys(name for group in kept.values() for row in group for name in row["theta"])
+def by_flight_table(found: Mapping[Cell, Results], best: Cell, horizon: int) -> Table:
+    """The error of the best model on each flight over that of thrust with frozen rates, mean over seeds."""
+    frozen = found[names.THRUST, 0].group("flight")
     lines = []
-    for name in names:
-        stated = f"{float(nominal[name]):.3g}" if name in nominal else EMPTY
-        lines.append((name, stated, *(_parameter(rows, name) for rows in kept.values())))
-    title = "Physical parameters, SI units (mean ± std over folds and seeds; mean ends of the 95 % intervals)"
-    return [Table(title, ("", "nominal", *(cell_name(*cell) for cell in kept)), lines)] if lines else []
+    for flight, own in found[best].group("flight").items():
+        ratios = [
+            pooled(own, str(horizon), name).mean() / pooled(frozen[flight], str(horizon), name).mean()
+            for name in errors.UNITS
+        ]
+        lines.append((flight, ", ".join(own.unique("chosen")), *(f"{ratio:.3g}" for ratio in ratios)))
+    title = f"{label(*best)}: error after {horizon} intervals over that of thrust with frozen rates"
+    return Table(title, ("flight", "chosen", *errors.UNITS), lines, labels=2, folded=True)
 
 
-def choice_table(selections: Sequence[Selection]) -> Table:
-    """Make a table of the candidates of each fold and N."""
+def parameter_table(found: Mapping[Cell, Results]) -> Table:
+    """θ_p: mean ± std over folds and seeds, and mean ends of the 95 % intervals."""
+    told = {cell: rows for cell, rows in found.items() if rows[0]["theta"]}
+    every_name = dict.fromkeys(name for rows in told.values() for row in rows for name in row["theta"])
     lines = []
-    for selected in selections:
-        for name, scores in selected.scores.items():
-            ratios = np.exp(scores.mean(axis=1))
-            worst = f"{ratios.max():.3f} ({selected.left_out[int(ratios.argmax())]})"
-            mark = "yes" * (name == selected.chosen)
-            mean = f"{np.exp(scores.mean()):.3f}"
-            lines.append((selected.fold, str(selected.n_train or EMPTY), str(name), mean, worst, mark))
-    title = "Candidates: error on flights left out of training over that of thrust with frozen rates (geometric mean)"
-    return Table(title, ("tested on", "N", "candidate", "mean", "worst", "chosen"), lines, labels=3)
+    for name in every_name:
+        texts = []
+        for rows in told.values():
+            having = rows.where(lambda row, name=name: name in row["theta"])
+            values = having.numbers(f"theta.{name}", missing=np.nan)
+            ends = [row["theta_interval"][name] for row in having if row["theta_interval"]]
+            known = np.array([end for end in ends if None not in end], float)
+            around = f" [{known[:, 0].mean():.3g}, {known[:, 1].mean():.3g}]" if len(known) else ""
+            over = f" ± {values.std(ddof=1):.1g}" if len(values) > 1 else ""
+            texts.append(f"{values.mean():.3g}{over}{around}" if len(values) else EMPTY)
+        lines.append((name, *texts))
+    title = "Physical parameters, SI units (mean ± std over flights and seeds; mean ends of the 95 % intervals)"
+    return Table(title, ("", *(label(*cell) for cell in told)), lines, folded=True)
 
 
-def _errors(label: str) -> dict[str, Callable[[Results], str]]:
+def verdicts(found: Mapping[Cell, Results], best: Cell) -> list[Verdict]:
+    """Evaluate each hypothesis that the rows can answer."""
+    baselines = [cell for cell in found if cell[0] in BASELINES]
+    claims = [
+        _better("F1", best, baselines, "every simple baseline"),
+        _better("F2", best, [(names.PHYSICS_ONLY, 0)], "the physics alone that was learned before"),
+    ]
+    if best[0] == ADAPTED:
+        few = min(n for model, n in found if model == ADAPTED)
+        claims += [
+            _better("F3", (ADAPTED, few), [(names.SCRATCH, few)], "physics adapted from nominal"),
+            _better("F4", (ADAPTED, few), [(LEARNED, 0)], "the model before the change"),
+        ]
+    return evaluate(claims, found)
 
-    def text(quantity: str, rows: Results) -> str:
-        return spread_text(spread(pooled(rows, label, quantity)), ".4g", ".2g")
 
-    return {f"{name.replace('_', ' ')} [{unit}]": partial(text, name) for name, unit in QUANTITIES.items()}
+def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Mapping[Cell, Results]]:
+    """Claim that a cell has a smaller error than each of the others, in every quantity and at every horizon."""
+
+    def predicate(found: Mapping[Cell, Results]) -> Part:
+        known = [found[other] for other in others if other in found]
+        if not known:
+            raise Undecided("none of these was run")
+        outcomes, words = [], []
+        for horizon, quantity in product(found[cell][0]["scores"], errors.UNITS):
+            ratios = [_log_ratio(found[cell], rows, f"scores.{horizon}.{quantity}") for rows in known]
+            outcomes += [ratio.below(0.0) for ratio in ratios]
+            worst = Interval(*np.exp(max(ratios, key=lambda ratio: ratio.value)))
+            words.append(f"step {horizon} {quantity} {worst.text('.3f')}")
+        return every(outcomes), f"error over that of the best of them: {', '.join(words)}"
+
+    text = f"{label(*cell)}, has smaller errors than {of} in every quantity"
+    return Claim(name, f"{text} (95 % interval of the geometric mean ratio, over test flights and seeds).", predicate)
 
 
-def _parameter(rows: Results, name: str) -> str:
-    having = rows.where(lambda row: name in row["theta"])  # the recipe of another fold may not learn it
-    if not len(having):
-        return EMPTY
-    values = having.numbers(f"theta.{name}", missing=math.nan)
-    text = f"{values.mean():.3g}" + (f" ± {values.std(ddof=1):.1g}" if len(values) > 1 else "")
-    ends = [(row["theta_interval"] or {}).get(name) for row in having]
-    known = np.array([end for end in ends if end is not None and None not in end], float)
-    text += f" [{known[:, 0].mean():.3g}, {known[:, 1].mean():.3g}]" if len(known) else ""
-    folds, all_folds = (len(group.unique("fold")) for group in (having, rows))
-    return text if folds == all_folds else f"{text} ({folds} of {all_folds} folds)"
+def _log_ratio(rows: Results, others: Results, column: str) -> Interval:
+    """log(error / other error), of the same flight and seed; a baseline, without seeds, of the same flight."""
+    theirs = {(row["flight"], row["seed"]): error for row, error in zip(others, others.numbers(column), strict=True)}
+    pairs = [(row["flight"], row["seed"] if len(others.unique("seed")) > 1 else others[0]["seed"]) for row in rows]
+    with np.errstate(all="ignore"):
+        ratios = np.log(rows.numbers(column) / np.array([theirs[pair] for pair in pairs]))
+    return mean_interval(ratios, rows["seed"], rows["flight"])
+
+
+def _titles() -> list[str]:
+    return [f"{name.replace('_', ' ')} [{unit}]" for name, unit in errors.UNITS.items()]

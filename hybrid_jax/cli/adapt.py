@@ -8,19 +8,18 @@ from typing import Annotated
 import tyro
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation import Adaptation, Parameter, adapt
-from hybrid_jax.adaptation.auto import NETWORK
-from hybrid_jax.cli import errors, page
+from hybrid_jax.adaptation import Adaptation, Parameter
+from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
-from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, windows_of
-from hybrid_jax.cli.model import Known, flights_for, load_known, unlike
+from hybrid_jax.cli.learning import adapted
+from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights
+from hybrid_jax.cli.model import Known, flights_for, known_of, unlike
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.io.files import json_value
-from hybrid_jax.io.models import save
+from hybrid_jax.io.models import load, save
 
 __all__ = ["LISTS", "Options", "run"]
 Change = tuple[str, float, Parameter]  # a name, its value before, and after
-MOST = 600  # windows
 SHOWN = 5  # parameters beside the answer
 LACKED = (
     "Effects that the model lacked explain these flights as well: {}. Flights before may have had them: name those "
@@ -48,29 +47,32 @@ class Options(FlightOptions):
 def run(options: Options) -> int:
     checks.writable_folder("--out", options.out)
     checks.writable_folder("--output", options.output.parent)
-    known = load_known(options.source)
+    model = load(options.source)
+    if "identified" in model.about:
+        return identified.adapt(options, model)
+    known = known_of(options.source, model)
     flights = flights_for(known, options.after, options, changed=True)
-    windows = windows_of(flights.logs, known.steps, known.steps, MOST).windows
-    with step(f"adapting to {len(windows)} windows") as told:
-        found = adapt(known.field, windows)
-        told(f"chose {found.chosen}")
+    with step("adapting") as told:
+        found = adapted(known.field, flights.logs)
+        told(f"{found.windows} windows, chose {found.chosen}")
     changed = _changed(known, found)
-    same = not changed and found.chosen != NETWORK
-    if not same:
+    if changed:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
         save(options.output, found.field, json_value(about))
-    model = None if same else options.output
-    page.write(options.out, "adapt", _page(options, known, flights, found, changed), found.to_dict() | {"model": model})
-    return NOTHING_CHANGED if same else 0
+    told = found.to_dict() | {"model": options.output if changed else None}
+    page.write(options.out, "adapt", _page(options, known, flights, found, changed), told)
+    return 0 if changed else NOTHING_CHANGED
 
 
 def _changed(known: Known, found: Adaptation) -> list[Change]:
     """The parameters whose intervals leave the value before out, the surest first."""
     before = {name: float(value) for name, value in named_parameters(known.field).items()}
-    changed = [
-        (name, before.get(name, 0.0), one) for name, one in found.parameters.items() if _other(one, before, name)
+    # A term that was not there was 0, an efficiency 1.
+    every = [
+        (name, before.get(name, float(name.startswith("efficiency"))), one) for name, one in found.parameters.items()
     ]
+    changed = [each for each in every if each[2].has_interval and not each[2].low <= each[1] <= each[2].high]
     return sorted(changed, key=lambda each: -abs(each[2].value - each[1]) / max(each[2].high - each[2].low, 1e-30))
 
 
@@ -85,7 +87,7 @@ def _page(options: Options, known: Known, flights: Flights, found: Adaptation, c
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
     told = f"Changed: {what}." if own else "These flights differ from the model, and no parameter of its own says how."
     todo = [f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."]
-    if not changed and found.chosen != NETWORK:
+    if not changed:
         told = "Nothing changed that these flights can tell."
         todo = ["Keep the model; if something did change, fly what excites the vehicle more."]
     rows = [(name, f"{value:.4g}", str(one)) for name, value, one in [*own, *lacked][:SHOWN]]
@@ -113,9 +115,3 @@ def _page(options: Options, known: Known, flights: Flights, found: Adaptation, c
         ],
         [*flights.said, *found.report().splitlines()],
     )
-
-
-def _other(one: Parameter, before: dict[str, float], name: str) -> bool:
-    """Whether the interval leaves the value before out; a term that was not there was 0, an efficiency 1."""
-    value = before.get(name, 1.0 if name.startswith("efficiency") else 0.0)
-    return one.has_interval and not one.low <= value <= one.high

@@ -9,13 +9,14 @@ import tyro
 from jaxtyping import Float
 
 from hybrid_jax import checks
-from hybrid_jax.cli import errors, page
+from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights
-from hybrid_jax.cli.model import Known, flights_for, load_known, unlike
+from hybrid_jax.cli.model import Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.baselines import FrozenRates, Kinematics
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.windows import flight_of
+from hybrid_jax.io.models import load
 
 __all__ = ["LISTS", "Options", "run"]
 LONGER = 5  # times the window that the model learned from
@@ -36,7 +37,10 @@ class Options(FlightOptions):
 
 def run(options: Options) -> int:
     checks.writable_folder("--out", options.out)
-    known = load_known(options.model)
+    model = load(options.model)
+    if "identified" in model.about:
+        return identified.check(options, model)
+    known = known_of(options.model, model)
     flights = flights_for(known, options.flights, options, changed=False)
     with step("predicting") as told:
         others = {"thrust, rates frozen": FrozenRates(rigid_body(known.vehicle)), "no forces": Kinematics()}
@@ -45,7 +49,10 @@ def run(options: Options) -> int:
         curves = {"model": np.stack([errors.rmse(one) for one in each])}
         curves |= {name: errors.rmse_by_flight(field, flights.logs, steps) for name, field in others.items()}
         told(f"{sum(map(len, each))} windows")
-    ends = {name: {"short": found[:, known.steps - 1], "long": found[:, -1]} for name, found in curves.items()}
+    places = {"short": known.steps - 1, "long": -1}
+    ends = {name: {end: found[:, at] for end, at in places.items()} for name, found in curves.items()}
+    for each in ends.values():  # over all flights
+        each["mean"] = errors.rmse(each["short"])
     shown = _page(options, known, flights, curves, each)
     page.write(options.out, "check", shown, {"flights": list(flights.contents), "units": errors.UNITS, "rmse": ends})
     return 0

@@ -11,7 +11,6 @@ share the flight.
 2. Of the others, the best is that with the smallest mean. A mean over few flights is uncertain, so the simplest
    candidate within one standard error of it, of the paired differences, is chosen (Breiman et al., "Classification and
    regression trees", 1984).
-3. Where two learned candidates are within that error, the mean of their vector fields is one more candidate.
 """
 
 from collections.abc import Collection, Mapping
@@ -32,13 +31,6 @@ def choose(scores: Scores[Named], baselines: Collection[Named]) -> Named:
     considered = _considered(scores, baselines)
     best = min(considered, key=lambda name: scores[name].mean())
     return next(name for name in considered if _within_error(scores[name], scores[best]))
-
-
-def undecided(scores: Scores[Named], baselines: Collection[Named]) -> list[Named]:
-    """The two best learned candidates, if both are within one standard error of the best candidate, else none."""
-    ordered = sorted(_considered(scores, baselines), key=lambda name: scores[name].mean())
-    near = [name for name in ordered if _within_error(scores[name], scores[ordered[0]]) and name not in baselines]
-    return near[:2] if len(near) > 1 else []
 
 
 def _considered(scores: Scores[Named], baselines: Collection[Named]) -> list[Named]:

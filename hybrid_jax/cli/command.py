@@ -99,7 +99,7 @@ def parsed(kind: type[Options], program: str, arguments: Sequence[str] | None, *
     if "--help-all" in given:
         given = ["--help"]
     elif {"-h", "--help"} & {*given} and (rare := _rare(kind)):
-        asked = make_dataclass(kind.__name__, rare, bases=(kind,), frozen=True)
+        asked = make_dataclass(kind.__name__, rare, bases=(kind,), frozen=True, kw_only=True)
         more["description"] += f"\n\n--help-all lists {len(rare)} more options."
     try:
         with contextlib.redirect_stderr(output):
@@ -108,9 +108,13 @@ def parsed(kind: type[Options], program: str, arguments: Sequence[str] | None, *
         if not stop.code:
             raise  # --help
         message = _message(output.getvalue())
-        wrong = re.search(r"Unrecognized options: (--[\w-]+)", message)
         known = [f"--{field.name.replace('_', '-')}" for field in fields(kind)]  # pyright: ignore[reportArgumentType]
-        raise ValueError(f"{message}{_meant(wrong[1], known) if wrong else ''}; see --help") from None
+        asked = [re.split(r"[=.]", word)[0] for word in given if word.startswith("--")]
+        # One that is wrong is named even where an argument is missing, which the parser finds first.
+        for word in asked:
+            if word.replace("--no-", "--", 1) not in (*known, "--help"):
+                message = f"Unrecognized options: {word}{_meant(word, known)}"
+        raise ValueError(f"{message}; see --help") from None
 
 
 def _rare(kind: type) -> list[tuple[str, Any, Any]]:

@@ -36,6 +36,11 @@ def rmse(errors: Float[np.ndarray, "n t 4"]) -> Float[np.ndarray, "t 4"]:
     return np.sqrt(np.mean(np.square(errors), axis=0))
 
 
+def ratio(errors: Float[np.ndarray, "*n 4"], others: Float[np.ndarray, "*n 4"]) -> float:
+    """The geometric mean of errors over others."""
+    return float(np.exp(np.log(errors / others).mean()))
+
+
 def texts(values: Float[np.ndarray, " 4"]) -> list[str]:
     """A number with its unit for each of UNITS."""
     return [f"{value:.3g} {unit}" for value, unit in zip(values, UNITS.values(), strict=True)]

@@ -8,9 +8,7 @@ from typing import Annotated, Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
 import tyro
-from jaxtyping import Float
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
@@ -20,17 +18,16 @@ from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.export import casadi_function, export_adaptation_c, export_c, export_program
-from hybrid_jax.export.program import sizes_of, vehicle_in
+from hybrid_jax.export.program import sizes_of
 from hybrid_jax.io.models import load
 from hybrid_jax.networks import smoothed
+from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.online import OnlineAdaptation
 from hybrid_jax.state import SENSOR_NOISE, STATE_SIZE
-from hybrid_jax.vehicle import Vehicle
 
 __all__ = ["LISTS", "Options", "run"]
 LISTS = ("--to", "--noise", "--process", "--prior", "--disturbance", "--platforms")
 FILTER = ("period", "noise", "process", "prior", "disturbance")
-COUNT = 10_000  # states over which a smooth model is compared
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
 PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.md
 PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
@@ -57,8 +54,7 @@ class Options:
     """C in double precision."""
     smooth: float | None = None
     """Put ½ (z + √(z² + 1/β²)) with this β in the place of ReLU, as solvers of optimal control problems need it, and
-    say how much ẋ changes over a box of states. With 5 they converge where with 30 they mostly do not: see
-    docs/howto/solvers.md."""
+    say how much ẋ changes. With 5 they converge where with 30 they mostly do not: see docs/howto/solvers.md."""
     dt: float | None = None
     """Length of a step [s]; by default that of the flights that the model was trained on."""
     out: Path = Path("runs/export")
@@ -90,22 +86,23 @@ class Options:
 
 def run(options: Options) -> int:
     model = load(options.model)
-    dt = model.about.get("dt") if options.dt is None else options.dt
+    field, dt = model.field, model.about.get("dt") if options.dt is None else options.dt
     if dt is None:
         raise ValueError(f"--dt is needed: {options.model} does not say how long the steps of its flights were")
     checks.positive(f"{options.model}: dt" if options.dt is None else "--dt", dt, "a positive number of seconds")
     if "c" not in options.to and any(getattr(options, name) for name in FILTER):
         raise ValueError(f"--{', --'.join(FILTER)} need --to c: the filter is written as C alone")
-    if options.smooth is not None:
-        checks.positive("--smooth", options.smooth)
-    field, d, m = model.field, *sizes_of(model.field, options.state_size, options.input_size)
+    for name in ("smooth", "period"):
+        if (value := getattr(options, name)) is not None:
+            checks.positive(f"--{name}", value)
+    d, m = sizes_of(field, options.state_size, options.input_size)
     sizes: dict[str, Any] = {"state_size": d, "input_size": m}
     own: dict[str, Any] = sizes | {"smooth": options.smooth}
-    said: list[str] = []
     adaptation = _filter(options, field, dt, d) if "c" in options.to else ""
-    for folder in (options.output, options.out):
-        checks.writable_folder("--output" if folder is options.output else "--out", folder)
+    checks.writable_folder("--output", options.output)
+    checks.writable_folder("--out", options.out)
     written: list[Path] = []
+    said: list[str] = []
     with step(f"writing {', '.join(options.to)}"):
         if "c" in options.to:
             written += export_c(options.output, field, dt, name=options.name, double=options.double, **own)
@@ -115,15 +112,14 @@ def run(options: Options) -> int:
             said.append(f"{name} adapts {', '.join(adaptation.names)}, with a sample every {adaptation.dt:g} s.")
         elif adaptation:
             said.append(f"No filter is written: {adaptation}.")
-        for kind, length in (("field", None), ("step", dt)) if "stablehlo" in options.to else ():
-            more: dict[str, Any] = {"batched": options.batched, "platforms": options.platforms, "about": model.about}
-            export_program(options.output / f"{kind}.npz", field, length, **own, **more)
-            written.append(options.output / f"{kind}.npz")
-        if "casadi" in options.to:
-            for kind, length, letter in (("field", None, "f"), ("step", dt, "F")):
-                function = casadi_function(field, length, name=letter, **own)
-                function.save(str(options.output / f"{kind}.casadi"))
+        for kind, length, letter in (("field", None, "f"), ("step", dt, "F")):
+            if "stablehlo" in options.to:
+                more: dict[str, Any] = {"batched": options.batched, "platforms": options.platforms}
+                written.append(options.output / f"{kind}.npz")
+                export_program(written[-1], field, length, about=model.about, **own, **more)
+            if "casadi" in options.to:
                 written.append(options.output / f"{kind}.casadi")
+                casadi_function(field, length, name=letter, **own).save(str(written[-1]))
     if options.smooth is not None:
         said.append(_change(field, options.smooth))
     page.write(options.out, "export", _page(options, dt, written, said), {"files": list(map(str, written)), "dt": dt})
@@ -146,16 +142,13 @@ def _page(options: Options, dt: float, written: Sequence[Path], said: Sequence[s
 def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> OnlineAdaptation | str:
     """The filter, or why there is none; ValueError for options that do not fit the model."""
     rigid = state_space(field) == RIGID_BODY_SPACE and d == STATE_SIZE
-    if options.period is not None:
-        checks.positive("--period", options.period)
     try:
         ravel_parameters(field)
     except ValueError as error:  # it has no parameters
         if any(getattr(options, name) for name in FILTER):
             raise
         return str(error)
-    sensors = options.noise or SENSOR_NOISE * rigid
-    if not sensors:
+    if not (sensors := options.noise or SENSOR_NOISE * rigid):
         return "--noise must say how exactly the states are measured"
     if options.disturbance and not rigid:
         raise ValueError("--disturbance is that of a rigid body, and the model is none")
@@ -196,26 +189,13 @@ def _prior(words: tuple[str, ...], field: AbstractVectorField) -> float | dict[s
 
 def _change(field: AbstractVectorField, beta: float) -> str:
     """The largest difference in ẋ between the smooth field and the field, as a sentence."""
-    vehicle = vehicle_in(field)
-    if vehicle is None or state_space(field) != RIGID_BODY_SPACE:
-        return "How much smoothing changes ẋ was not looked at: the model is not of a multirotor."
-    x, u = _box(vehicle)
-    columns = jnp.asarray(x.T), jnp.asarray(u.T)
+    if (motion := motion_of(field)) is None:
+        return "How much smoothing changes ẋ was not looked at: the model holds no windows that it learned from."
+    columns = jnp.asarray(motion.x0.T), jnp.asarray(motion.u[:, 0].T)
     before, after = (np.asarray(eqx.filter_jit(one.infer_batch)(*columns)) for one in (field, smoothed(field, beta)))
     off = np.abs(after - before).max(axis=1)
     entry = int(off.argmax())
-    size = np.sqrt(np.mean(np.square(before[entry])))
-    told = f"smooth {beta:g}: ẋ differs by at most {off[entry]:.2g}"
-    return f"{told}, in {RIGID_BODY_SPACE.names[entry]}, of RMS {size:.2g}; {COUNT} states of a box."
-
-
-def _box(vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 13"], Float[np.ndarray, "n m"]]:
-    """States within 2 m of a place at 1.5 m, tilted by up to 45°, at any yaw, at up to 3 m/s and 3 rad/s for each axis,
-    and rotor speeds of 0.7 … 1.3 times that of hover."""
-    rng, rotation = np.random.default_rng(0), scipy.spatial.transform.Rotation
-    tilt, axis, yaw = rng.uniform(0, np.pi / 4, COUNT), *rng.uniform(0, 2 * np.pi, (2, COUNT))
-    lean = rotation.from_rotvec(np.stack([tilt * np.cos(axis), tilt * np.sin(axis), 0 * tilt], axis=1))
-    q = (rotation.from_euler("z", yaw[:, None]) * lean).as_quat()[:, [3, 0, 1, 2]]
-    position = rng.uniform(-1, 1, (COUNT, 3)) * [2, 2, 1.5] + [0, 0, 1.5]
-    x = np.concatenate([position, q, rng.uniform(-3, 3, (COUNT, 6))], axis=1)
-    return x, vehicle.hover_speed * rng.uniform(0.7, 1.3, (COUNT, vehicle.rotors))
+    told = f"smooth {beta:g}: ẋ differs by at most {off[entry]:.2g}, in entry {entry}"
+    return (
+        f"{told}, of RMS {np.sqrt(np.mean(np.square(before[entry]))):.2g}; {len(motion)} states that it learned from."
+    )

@@ -1,11 +1,11 @@
 """`hybrid-jax identify`: learn a vehicle from logs of its commands and of whatever was measured beside them."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple, cast
 
 import matplotlib as mpl
 import numpy as np
@@ -18,21 +18,23 @@ from hybrid_jax.cli import page
 from hybrid_jax.cli.command import RARE, step
 from hybrid_jax.cli.compared import check_consistent, check_whole, unlearned_drag
 from hybrid_jax.cli.flags import in_flags
-from hybrid_jax.cli.log_options import LogOptions, require_distinct
-from hybrid_jax.cli.logs import content_of, raw_logs
+from hybrid_jax.cli.logs import LogOptions, content_of, raw_logs, require_distinct
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
-from hybrid_jax.dynamics.measurement import MEASURED
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, prediction_errors
-from hybrid_jax.identification.recordings import Initial, Layout
+from hybrid_jax.identification.recordings import Layout
+from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
+from hybrid_jax.vehicle import Vehicle
 
 __all__ = ["LISTS", "Options", "run"]
-LISTS = ("--learn", "--measured", "--motor-order", "--topics", "--test")
+LISTS = ("--learn", "--motor-order", "--topics")
+ENDS = ("value", "low", "high")
 LINES = 5  # of what is not folded
+FITS = ("dt", "steps", "windows")  # options that a model remembers
 ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below counts until they pass."
 
 
@@ -63,18 +65,10 @@ class Options(LogOptions):
     """Vehicle file (TOML)."""
     learn: tuple[str, ...] = ()
     """Names of parameters, in the place of those of the vehicle file."""
-    test: tuple[Path, ...] = ()
-    """Logs left out of the fit, and predicted with its result."""
     anyway: bool = False
     """Go on although checks of the logs failed: the page then says so first."""
     out: Path = Path("runs/identify")
     """Folder of the page."""
-    measured: Annotated[tuple[str, ...], RARE] = ()
-    """Quantities that are compared, such as rates specific_force; by default all that every log has."""
-    together: Annotated[bool, RARE] = False
-    """Fit all parameters at once; by default those of the thrust first, from the accelerometer, where there is one."""
-    initial: Annotated[Initial, RARE] = "estimated"
-    """The state that a window starts from: estimated from the samples before it, or the last sample as it is."""
     dt: Annotated[float, RARE] = 0.005
     """Steps of the solver, and of the grid on which measurements are compared [s]."""
     steps: Annotated[int, RARE] = 20
@@ -84,59 +78,83 @@ class Options(LogOptions):
 
     @property
     def layout(self) -> Layout:
-        return Layout(self.dt, self.steps, self.windows, initial=self.initial)
+        return Layout(self.dt, self.steps, self.windows)
+
+
+class Read(NamedTuple):
+    """Recordings by the names of their files, the field to start from, lines for the page, and failed checks."""
+
+    logs: dict[str, Recording]
+    field: Any
+    said: list[str]
+    failed: list[str]
+
+    @property
+    def contents(self) -> dict[str, str]:
+        return {name: content_of(log) for name, log in self.logs.items()}
 
 
 def run(options: Options) -> int:
     for name in ("steps", "windows"):
         checks.count(f"--{name}", getattr(options, name))
-    for name in options.measured:
-        if name not in MEASURED:
-            raise ValueError(f"--measured must be of {', '.join(MEASURED)}, got {name!r}")
-    layout = options.layout
     checks.writable_folder("--out", options.out)
     checks.writable_folder("--output", options.output.parent)
-    logs, left_out, field, said, failed = checked(options)
-    with step(f"identifying by {len(logs)} logs") as told:
-        if options.together or options.measured or not isinstance(field, Actuated):
-            found = identify(field, logs, layout, options.measured)
-        else:
-            found = identify_in_turn(field, logs, layout)
-        told(f"{found.windows} windows, {found.seconds:.4g} s of flight")
-    save(options.output, found.field, {"dt": options.dt})
-    shown = _page(options, found, logs, left_out, said, failed)
-    units = {name: _parameter_unit(found, name) for name in found.intervals}
-    parameters = {
-        name: dict(zip(("value", "low", "high"), map(float, each), strict=True)) | {"unit": units[name]}
-        for name, each in found.intervals.items()
-    }
-    page.write(options.out, "identify", shown, {"parameters": parameters, "model": options.output})
+    read = checked(options)
+    found = identified(read, options.layout)
+    about = {"dt": options.dt, "learned_from": read.contents, "parameters": values_of(found)}
+    about |= {"identified": {name: getattr(options, name) for name in FITS}}
+    save(options.output, found.field, json_value(about))
+    shown = _page(options, found, read)
+    page.write(options.out, "identify", shown, {"parameters": about["parameters"], "model": options.output})
     return 0
 
 
-def checked(options: Options) -> tuple[list[Recording], list[Recording], Any, list[str], list[str]]:
-    """The logs to learn from, those left out, the field to start from, lines for the page, and failed checks.
+def checked(options: Options) -> Read:
+    """The logs of a folder, checked against the vehicle file and against each other; ChecksFailed without --anyway."""
+    model = _model_of(options)
+    return read_checked(
+        options.folder, options, model.vehicle, model.learn, lambda logs: _field_of(options, model, logs)
+    )
 
-    Raises:
-        ChecksFailed: a check failed, without --anyway.
-    """
-    model, read = _model_of(options), partial(read_recording, **options.reading)
-    left_out, test = [read(path) for path in options.test], {path.resolve() for path in options.test}
-    raws, said = raw_logs(options.folder, lambda path: None if path.resolve() in test else read(path))
-    logs = [log for _, log in raws if log is not None]
-    if not logs:
-        raise ValueError(f"{options.folder}: holds no log besides those of --test")
-    # It could be fitted and predicted.
-    named = [*((log.name, log) for log in logs), *((f"--test {log.name}", log) for log in left_out)]
-    require_distinct([(name, content_of(log)) for name, log in named])
-    said += [f"{Path(log.name).name}: {note}" for log in (*logs, *left_out) for note in log.notes]
-    failed = check_whole([*logs, *left_out], model.vehicle, options.anyway)
-    field = _field_of(options, model, logs, left_out)
-    failed += check_consistent([*logs, *left_out], field, model.learn, options.anyway)
+
+def read_checked(
+    folder: Path, options: Any, vehicle: Vehicle, learn: Sequence[str], start: Callable[[Sequence[Recording]], Any]
+) -> Read:
+    """The logs of a folder, as `checked`, for the field that `start` makes for them."""
+    raws, said = raw_logs(folder, partial(read_recording, **options.reading))
+    logs = {path.name: log for path, log in raws}
+    require_distinct([(log.name, content_of(log)) for log in logs.values()])
+    said += [f"{name}: {note}" for name, log in logs.items() for note in log.notes]
+    failed = check_whole([*logs.values()], vehicle, options.anyway)
+    field = start([*logs.values()])
+    failed += check_consistent([*logs.values()], field, learn, options.anyway)
     failed = [in_flags("identify", line) for line in failed]
     for line in (*said, *failed):
         print(f"  {line}", file=sys.stderr)
-    return logs, left_out, field, said, failed
+    return Read(logs, field, said, failed)
+
+
+def identified(read: Read, layout: Layout) -> Identified:
+    """What the logs tell, from where the field is: of commands first the thrust, then what turns the vehicle."""
+    with step(f"identifying by {len(read.logs)} logs") as told:
+        fit = identify_in_turn if isinstance(read.field, Actuated) else identify
+        found = fit(read.field, [*read.logs.values()], layout)
+        told(f"{found.windows} windows, {found.seconds:.4g} s of flight")
+    return found
+
+
+def values_of(found: Identified) -> dict[str, Any]:
+    """Each parameter, with its interval and unit, as JSON values."""
+    units = cast(Any, found.field).parameter_units
+    return {
+        name: {
+            "value": float(value),
+            "low": float(low),
+            "high": float(high),
+            "unit": units.get(name.partition("[")[0], ""),
+        }
+        for name, (value, low, high) in found.intervals.items()
+    }
 
 
 def _model_of(options: Options) -> VehicleModel:
@@ -150,22 +168,18 @@ def _model_of(options: Options) -> VehicleModel:
     return model
 
 
-def _field_of(options: Options, model: VehicleModel, logs: list[Recording], left_out: list[Recording]):
+def _field_of(options: Options, model: VehicleModel, logs: Sequence[Recording]) -> Any:
     """The field to start from: told commands if the logs have any and the vehicle file has a table [actuator]."""
-    for log in (*logs, *left_out):
+    for log in logs:
         if log.rotors != model.vehicle.rotors:
             raise ValueError(f"{log.name}: has {log.rotors} motors, {options.vehicle} has {model.vehicle.rotors}")
     speeds_alone = [log.name for log in logs if "command" not in log.signals]
-    told = "command" if model.actuator is not None and not speeds_alone else "rotor_speed"
-    for log in logs if told == "rotor_speed" else ():
-        if told not in log.signals:
+    if model.actuator is not None and not speeds_alone:
+        return model.commanded()
+    for log in logs:
+        if "rotor_speed" not in log.signals:
             mend = f"leave out {speeds_alone[0]}" if speeds_alone else "give it a table [actuator]; see --help"
             raise ValueError(f"{options.vehicle}: {log.name} has commands and no rotor speeds: {mend}")
-    for log in left_out:
-        if told not in log.signals:
-            raise ValueError(f"--test {log.name}: has no {told}, which the other logs have; leave it out")
-    if told == "command":
-        return model.commanded()
     if lost := [name for name in model.learn if name in NAMES]:
         why = f"need commands, and {speeds_alone[0]} has rotor speeds alone"
         raise ValueError(f"{options.vehicle}: learn: {', '.join(lost)}: {why}: {_learn(model.learn, lost)}")
@@ -177,34 +191,31 @@ def _learn(names: Sequence[str], without: Sequence[str]) -> str:
     return f"give --learn {' '.join(name for name in names if name not in without) or 'Ix Iy'}"
 
 
-def _page(options: Options, found: Identified, logs, left_out, said: list[str], failed: list[str]) -> page.Page:
-    lines = [
-        (name, *(f"{float(each):.4g}" for each in interval), _parameter_unit(found, name))
-        for name, interval in found.intervals.items()
-    ]
-    told = [name for name, interval in found.intervals.items() if np.isfinite(float(interval[2]))]
-    unseen = [name for name in found.intervals if name not in told]
+def _page(options: Options, found: Identified, read: Read) -> page.Page:
+    values, logs = values_of(found), [*read.logs.values()]
+    lines = [(name, *(f"{one[end]:.4g}" for end in ENDS), one["unit"]) for name, one in values.items()]
+    unseen = [name for name, one in values.items() if not np.isfinite(one["high"])]
     header = ("parameter", "estimate", "from", "to", "unit")
     fitted = [(name, _unit(name), "  ".join(f"{e:.3g}" for e in errors)) for name, errors in found.errors.items()]
-    which = "logs left out" if left_out else "the logs fitted"
-    caption = f"Errors of predictions from the state that earlier samples tell: {which}."
-    again = (
-        f"Fly what excites {', '.join(unseen)}, or learn less." if unseen else "Predict logs left out with --test LOG."
-    )
+    again = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     return page.Page(
         f"What do {len(logs)} logs of {options.folder} tell of the vehicle?",
-        f"{len(told)} of {len(lines)} numbers are told by {found.seconds:.4g} s of flight.",
+        f"{len(values) - len(unseen)} of {len(lines)} numbers are told by {found.seconds:.4g} s of flight.",
         page.Table("Parameters, with 95 % intervals", header, lines[:LINES]),
-        [(caption, _figure(found, logs, left_out, options.layout))],
-        [*([ANYWAY.format(len(failed))] if failed else []), *_notes(found, logs, unseen)],
-        [again],
+        [("Errors of predictions from the state that earlier samples tell", figure(found.field, logs, options.layout))],
+        [*warned(read, found), *_notes(found, logs, unseen)],
+        [f"Fly what excites {', '.join(unseen)}, or learn less." if unseen else again],
         [
             *([page.Table("All parameters, with 95 % intervals", header, lines)] * (len(lines) > LINES)),
             page.Table("RMS of the errors over the windows fitted", ("quantity", "unit", "x, y, z …"), fitted),
-            *(_predicted(found, each, options.layout) for each in left_out),
         ],
-        [*said, *failed],
+        [*read.said, *read.failed],
     )
+
+
+def warned(read: Read, found: Identified) -> list[str]:
+    stopped = "The fit stopped before it converged: start nearer, or learn less."
+    return [ANYWAY.format(len(read.failed))] * bool(read.failed) + [stopped] * (not found.converged)
 
 
 def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) -> list[str]:
@@ -212,34 +223,27 @@ def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) 
     slow = [signal.interval for signal in commands if slow_commands.is_slow(signal)]
     shares = ", ".join(f"{axis} {share:.2f}" for axis, share in zip("xyz", found.explained, strict=True))
     learned = {name.partition("[")[0] for name in found.intervals}
-    dragged = "" if "drag" in learned else unlearned_drag(logs)
     notes = {
         f"Not told by these logs, left as they were: {', '.join(unseen)}.": unseen,
         f"Commands {max(slow, default=0):.3g} s apart: they changed in between, which the intervals count; a delay and "
         "a lag are hardly told apart by such a log.": slow,
         f"Share of the body rates within a window, less their trend, that commands explain: {shares}; inertia and "
         "torque have intervals that hold both regressions, of torque on acceleration and the other way round.": True,
-        dragged: dragged,
-        "The fit stopped before it converged: start nearer, or learn less.": not found.converged,
+        ("" if "drag" in learned else unlearned_drag(logs)): True,
     }
-    return [note for note, holds in notes.items() if holds]
-
-
-def _parameter_unit(found: Identified, name: str) -> str:
-    units: Any = found.field
-    return units.parameter_units.get(name.partition("[")[0], "")
+    return [note for note, holds in notes.items() if note and holds]
 
 
 def _unit(name: str) -> str:
     return "rad" if name == "attitude" else AXES[name][1] if name in AXES else ROTOR_UNITS[name]
 
 
-def _predicted(found: Identified, recording: Recording, layout: Layout) -> page.Table:
-    errors = prediction_errors(found.field, [recording], layout, tuple(found.errors))
+def predicted(field: Any, recordings: Sequence[Recording], layout: Layout, what: str) -> page.Table:
+    errors = prediction_errors(field, recordings, layout)
     asked = max(1, layout.steps // 4), layout.steps
     lines = [(name, _unit(name), *(_nearest(part, each, layout.dt) for each in asked)) for name, part in errors.items()]
     ends = [f"after {layout.dt * each:.3g} s" for each in asked]
-    return page.Table(f"RMS of what was predicted of {Path(recording.name).name}", ("quantity", "unit", *ends), lines)
+    return page.Table(f"RMS of what was predicted: {what}", ("quantity", "unit", *ends), lines)
 
 
 def _by_step(part: Float[np.ndarray, "n t k"]) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
@@ -259,9 +263,9 @@ def _nearest(part: Float[np.ndarray, "n t k"], asked: int, dt: float) -> str:
 
 
 @mpl.rc_context(page.STYLE)
-def _figure(found: Identified, logs, left_out, layout: Layout) -> Figure:
-    """Errors of predictions against time, of logs left out where there are any."""
-    errors = prediction_errors(found.field, left_out or logs, layout, tuple(found.errors))
+def figure(field: Any, logs: Sequence[Recording], layout: Layout) -> Figure:
+    """Errors of predictions against time."""
+    errors = prediction_errors(field, logs, layout)
     picture = Figure(figsize=(3.2 * len(errors), 2.8), layout="constrained")
     for panel, (name, part) in zip(np.atleast_1d(picture.subplots(1, len(errors))), errors.items(), strict=True):
         steps, rms = _by_step(part)

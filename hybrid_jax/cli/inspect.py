@@ -16,8 +16,7 @@ from hybrid_jax.cli import page
 from hybrid_jax.cli.command import BAD_INPUT
 from hybrid_jax.cli.estimates import estimate
 from hybrid_jax.cli.flags import in_flags
-from hybrid_jax.cli.log_options import SpeedOptions
-from hybrid_jax.cli.logs import LISTS, look, raw_logs
+from hybrid_jax.cli.logs import LISTS, SpeedOptions, look, raw_logs
 from hybrid_jax.cli.vehicle_text import vehicle_text
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
@@ -34,16 +33,6 @@ BORNE = ("quantities", "slowest signal", "gaps", "repeated samples")
 SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
 NOT_RUN = f"not checked for want of --vehicle: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
 EMPTY = "–"
-LEGEND = {
-    "whole file": "the log ends where its program ended it, and no bit was changed",
-    "airframe": "a multirotor flew; a model of one stands for nothing else",
-    "quantities": "position, velocity, attitude, body rates and motors, which training on states needs",
-    "number of motors": "as many as the vehicle file has rotors; none is dropped in silence",
-    "slowest signal": "every signal is as fast as the model's interval (--dt), before anything is interpolated",
-    "longest gap": "no clock jumps; shorter gaps are kept as gaps and nothing is interpolated across them",
-    "motors within limits": "commands from 0 to 1, speeds up to the vehicle's largest",
-    "motors turn": "something flew",
-}
 
 
 @dataclass(frozen=True)
@@ -114,7 +103,11 @@ def run(options: Options) -> int:
     logs = [log for _, log in read]
     left = [printable(line) for line in left]
     for log in logs:
-        print(f"{log.name}: {described(log)}{log.result}")
+        kind = [
+            f"{format}, {vehicle}, {seconds} s, {motors} motors: "
+            for format, vehicle, *_, seconds, motors in _facts(log)
+        ]
+        print(f"{log.name}: {''.join(kind)}{log.result}")
     rows = [{"log": log.name, "result": log.result} for log in logs]
     page.write(options.out, "inspect", _page(options, logs, left), {"rows": rows})
     if options.write_vehicle is not None:
@@ -130,7 +123,7 @@ def inspected(path: Path, vehicle: Vehicle | None, options: Any) -> Inspected:
     except ValueError as error:
         why = str(error).removeprefix(f"{path}: ")
         return Inspected(name, None, refusal=printable(in_flags("inspect", why)))
-    found = look(path, raw, vehicle, options.dt, options.polynomial)
+    found = look(path, raw, vehicle, options.dt, options)
     told = [replace(each, suggestion=in_flags("inspect", each.suggestion)) for each in found.checks]
     return Inspected(name, raw, told, in_flags("inspect", found.refusal), (*raw.notes, *found.notes))
 
@@ -159,14 +152,6 @@ def printable(text: str) -> str:
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
-def described(log: Inspected) -> str:
-    """Format, vehicle, length and motors of a log that was read."""
-    if (found := log.recording) is None:
-        return ""
-    kind = found.facts.get("vehicle", "unknown vehicle")
-    return f"{found.facts.get('format')}, {kind}, {found.duration:.1f} s, {found.rotors} motors: "
-
-
 def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> page.Page:
     ready = sum(log.result == "ready" for log in logs)
     mends = [(log.name, c.name, c.suggestion) for log in logs for c in log.checks if c.verdict in (FAILS, WARNS)] + [
@@ -189,23 +174,26 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
         if not ready
         else [f"Learn from them: {learn}"],
         [
-            _overview(logs),
+            page.Table(
+                "All logs",
+                ("log", "result", "format", "vehicle", "airframe", "program", "s", "motors"),
+                [(log.name, log.result, *(*_facts(log), (EMPTY,) * 6)[0]) for log in logs],
+            ),
             page.Table("What to do", ("log", "check", "what it found, and what mends it"), mends),
             _signals(read),
-            *_checks(read),
+            _checks(read),
         ],
         [*(f"{log.name}: {note}" for log in logs for note in log.notes), *left],
     )
 
 
-def _overview(logs: Sequence[Inspected]) -> page.Table:
-    lines = []
-    for log in logs:
-        found = log.recording
-        told = (found.facts.get(key, EMPTY) if found else EMPTY for key in ("format", "vehicle", "airframe", "program"))
-        size = (f"{found.duration:.1f}", str(found.rotors)) if found else (EMPTY, EMPTY)
-        lines.append((log.name, log.result, *told, *size))
-    return page.Table("All logs", ("log", "result", "format", "vehicle", "airframe", "program", "s", "motors"), lines)
+def _facts(log: Inspected) -> list[tuple[str, ...]]:
+    """Format, vehicle, airframe, program, length [s] and motors of a log that was read."""
+    if (found := log.recording) is None:
+        return []
+    known = {"vehicle": "unknown vehicle", **found.facts}
+    told = (str(known.get(key, EMPTY)) for key in ("format", "vehicle", "airframe", "program"))
+    return [(*told, f"{found.duration:.1f}", str(found.rotors))]
 
 
 def _signals(logs: Sequence[Inspected]) -> page.Table:
@@ -225,29 +213,19 @@ def _unit(name: str) -> str:
     return ROTOR_UNITS[name] if name in ROTOR_UNITS else AXES[name][1]
 
 
-def _checks(logs: Sequence[Inspected]) -> tuple[page.Table, page.Table]:
-    """What came of each check, and what it asks."""
-    every = {check.name: check for log in logs for check in log.checks}
+def _checks(logs: Sequence[Inspected]) -> page.Table:
+    """What came of each check."""
+    every = dict.fromkeys(check.name for log in logs for check in log.checks)
     lines = []
     for log in logs:
         own = {check.name: check for check in log.checks}
         lines.append((log.name, *(_verdict(own[name]) if name in own else EMPTY for name in every)))
-    said = "two records of one motion agree: docs/howto/own_flights.md"
-    limits = [
-        (name, LEGEND.get(name, said), _number(check.limit, check.unit) or EMPTY) for name, check in every.items()
-    ]
-    return (
-        page.Table("Checks (? cannot tell)", ("log", *every), lines),
-        page.Table("What the checks ask", ("check", "passes if", "limit"), limits),
-    )
+    return page.Table("Checks (? cannot tell; docs/howto/logs.md says what each asks)", ("log", *every), lines)
 
 
 def _verdict(check: Check) -> str:
-    return f"{SHOWN.get(check.verdict, 'ok')} {_number(check.value, check.unit)}".rstrip()
-
-
-def _number(value: float, unit: str) -> str:
-    return f"{value:.3g} {unit}" if unit and math.isfinite(value) else ""
+    number = f"{check.value:.3g} {check.unit}" if check.unit and math.isfinite(check.value) else ""
+    return f"{SHOWN.get(check.verdict, 'ok')} {number}".rstrip()
 
 
 @mpl.rc_context(page.STYLE)

@@ -2,15 +2,14 @@
 
 import itertools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from hybrid_jax.cli.command import ChecksFailed, step
-from hybrid_jax.cli.log_options import SpeedOptions, require_distinct
+from hybrid_jax.cli.command import RARE, ChecksFailed, step
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.checks.consistency import RATIO, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures
@@ -27,6 +26,39 @@ STEPS = 10  # intervals of a window
 ONE_TO_ONE = (0.0, 1.0)  # rotor speed = command, in whatever unit: motors are still compared with the motion
 CUT = ("time on the ground",)  # is cut out
 CHANGED = 2.0  # factor by which thrust may differ from the vehicle's where a change is asked for
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogOptions:
+    """How the logs of a folder are read."""
+
+    columns: Path | None = None
+    """TOML file of the columns, units and frames of CSV logs: see docs/howto/logs.md."""
+    topics: tuple[str, ...] = ()
+    """Topics of ROS bags, such as odometry=/odom motors=/rotors:data:rpm; also pose, imu, voltage."""
+    motor_order: tuple[int, ...] = ()
+    """Which motor of the log, from 0, each rotor of the vehicle file is, such as 2,0,3,1."""
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """The arguments of the functions of `hybrid_jax.flights.load`; ValueError for topics that are no pairs."""
+        for word in self.topics:
+            if "=" not in word:
+                raise ValueError(f"--topics must be words such as odometry=/odom, got {word!r}")
+        topics = dict(word.split("=", 1) for word in self.topics)
+        return {"columns": self.columns, "topics": topics, "motor_order": self.motor_order}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedOptions(LogOptions):
+    """How the logs of a folder are read, for models whose inputs are rotor speeds."""
+
+    polynomial: tuple[float, ...] = ()
+    """For logs of commands without rotor speeds: rotor speed [rad/s] = c0 + c1 command + c2 command² …, the command
+    from 0 (stop) to 1 (full). It comes from a test stand, or from two points: 100,1000 if a motor turns with 100 rad/s
+    as it starts and with 1100 at the full command. PWM of 1000 … 2000 µs and DShot are turned into 0 … 1 beforehand."""
+    delay: Annotated[float, RARE] = 0.0
+    """Delay of the motors [s], where a check found that they lead the gyro."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +104,26 @@ class Looked(NamedTuple):
     notes: list[str]
 
 
+def require_distinct(flights: Sequence[tuple[str, Any]]) -> None:
+    """Refuse a flight that occurs twice, whatever its files are called; `flights` are names and what tells them apart.
+
+    It could be both in training and in a test.
+    """
+    first: dict[Any, str] = {}
+    for name, content in flights:
+        if content in first:
+            raise ValueError(f"{name}: the same flight as {first[content]}; leave one of the two out")
+        first[content] = name
+
+
+def require_unseen(learned_from: Mapping[str, str], contents: Mapping[str, str]) -> None:
+    """Refuse a flight that a model learned from."""
+    names = {content: name for name, content in learned_from.items()}
+    for name, content in contents.items():
+        if content in names:
+            raise ValueError(f"{name}: the same flight as {names[content]}, which the model learned from; leave it out")
+
+
 def content_of(recording: Recording) -> str:
     """What tells a recording apart from others, whatever its file is called."""
     parts = itertools.product(recording.signals.items(), ("t", "values"))
@@ -109,7 +161,7 @@ def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptio
         require_distinct(list(contents.items()))
         logs, failed = [], []
         for path, raw in raws:
-            one = look(path, raw, vehicle, dt, options.polynomial, changed)
+            one = look(path, raw, vehicle, dt, options, changed)
             lines = failures(one.checks, path.name) or [f"{path.name}: no flight: {one.refusal}"] * bool(one.refusal)
             said += [f"{path.name}: {note}" for note in (*raw.notes, *one.notes)]
             failed += lines
@@ -127,15 +179,15 @@ def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptio
 
 
 def look(
-    path: Path, raw: Recording, vehicle: Vehicle | None, dt: float, polynomial: Sequence[float], changed: bool = False
+    path: Path, raw: Recording, vehicle: Vehicle | None, dt: float, options: SpeedOptions, changed: bool = False
 ) -> Looked:
     """Check a log and cut it to its flight; what cannot be compared with the vehicle is compared with itself."""
     checks, notes = check_recording(raw, vehicle, dt), []
-    scaled = "rotor_speed" in raw.signals or bool(polynomial)
+    scaled = "rotor_speed" in raw.signals or bool(options.polynomial)
     try:
-        log = flight_at(raw, dt, polynomial if scaled else ONE_TO_ONE)
+        log = flight_at(raw, dt, options.polynomial if scaled else ONE_TO_ONE)
         fits = log.dt == dt and not unevenness(log).any()
-        log, notes = clean(log, Cleaning(in_flight=True, resample=None if fits else dt), vehicle)
+        log, notes = clean(log, Cleaning(in_flight=True, resample=None if fits else dt, delay=options.delay))
         other = vehicle is not None and log.u.shape[1] != vehicle.rotors  # a check that failed says so
         checks += check_log(log, None if other or not scaled else vehicle)
         require_length([log], STEPS)

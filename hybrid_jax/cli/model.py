@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybrid_jax.cli.logs import FlightOptions, Flights, read_flights
+from hybrid_jax.cli.learning import lagged
+from hybrid_jax.cli.logs import FlightOptions, Flights, read_flights, require_unseen
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.export.program import vehicle_in
 from hybrid_jax.extrapolation import WARN, shares_outside
-from hybrid_jax.io.models import load
+from hybrid_jax.io.models import Model
 from hybrid_jax.vehicle import Vehicle
 
 
@@ -38,12 +39,13 @@ class Known(NamedTuple):
         return self.about["steps"]
 
 
-def load_known(path: Path) -> Known:
-    """Read a model; ValueError if `fit` or `adapt` did not write it."""
-    model = load(path)
+def known_of(path: Path, model: Model) -> Known:
+    """A model that was read from a file; ValueError if `fit` or `adapt` did not write it."""
     vehicle = vehicle_in(model.field)
+    if "identified" in model.about:
+        raise ValueError(f"{path}: was identified without states, which replay draws; hybrid-jax check predicts logs")
     if vehicle is None or not {"dt", "steps", "learned_from", "motion"} <= model.about.keys():
-        raise ValueError(f"{path}: is no model that hybrid-jax fit wrote")
+        raise ValueError(f"{path}: is no model that hybrid-jax fit or adapt wrote")
     return Known(model.field, vehicle, model.about)
 
 
@@ -57,11 +59,8 @@ def reading_of(known: Known, options: FlightOptions) -> Any:
 def flights_for(known: Known, folder: Path, options: FlightOptions, changed: bool) -> Flights:
     """The flights of a folder, of which none may be one that the model learned from."""
     found = read_flights(folder, known.vehicle, known.dt, reading_of(known, options), changed)
-    names = {content: name for name, content in known.about["learned_from"].items()}
-    for name, content in found.contents.items():
-        if content in names:
-            raise ValueError(f"{name}: the same flight as {names[content]}, which the model learned from; leave it out")
-    return found
+    require_unseen(known.about["learned_from"], found.contents)
+    return found._replace(logs=lagged(found.logs, known.about.get("lag", 0.0)))
 
 
 def unlike(known: Known, flights: Flights) -> list[str]:

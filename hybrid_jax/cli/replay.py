@@ -16,9 +16,10 @@ from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.logs import LISTS, FlightOptions, read_flights, windows_of
-from hybrid_jax.cli.model import load_known, reading_of
+from hybrid_jax.cli.model import known_of, reading_of
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.files import write_atomic
+from hybrid_jax.io.models import load
 from hybrid_jax.state import POSITION, QUATERNION
 from hybrid_jax.trajectories import Trajectories
 
@@ -54,7 +55,7 @@ def run(options: Options) -> int:
     for name in ("ahead", "seconds"):
         checks.positive(f"--{name}", getattr(options, name), "a positive number of seconds")
     checks.writable_folder("--out", options.out)
-    models = {path: load_known(path) for path in (options.model, options.other) if path is not None}
+    models = {path: known_of(path, load(path)) for path in (options.model, options.other) if path is not None}
     first = models[options.model]
     logs = read_flights(options.flight, first.vehicle, first.dt, reading_of(first, options), changed=True).logs
     if len(logs) > 1:

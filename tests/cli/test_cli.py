@@ -48,6 +48,7 @@ def test_help_of_a_verb_has_at_most_a_dozen_options(called, verb):
     [
         (["fitt"], "hybrid-jax fitt: no such verb; did you mean fit?; see hybrid-jax --help"),
         (["check", "m.npz", "flights", "--otu", "x"], "did you mean --out?"),
+        (["check", "--otu", "x"], "Unrecognized options: --otu; did you mean --out?"),  # besides, arguments are missing
         (["inspect", "none"], "hybrid-jax inspect: none: no such file or folder"),
         (["check", "none.npz", "flights"], "none.npz"),
         (["fit", "none", "-o", "m.npz", "--vehicle", "none.toml"], "none.toml: not a readable TOML file"),

@@ -10,6 +10,7 @@ import pytest
 import hybrid_jax as hj
 from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.export import export_adaptation_c, load_program
+from hybrid_jax.networks.standardise import with_motion
 
 ca = pytest.importorskip("casadi")
 X, U = np.array([0, 0, 1, 1.0, 0, 0, 0, 0.3, 0, 0, 0, 0, 0.1]), np.full(4, 650.0)
@@ -24,7 +25,7 @@ def test_all_that_is_written_is_the_model(field, tmp_path, called):
     model, out = tmp_path / "model.npz", tmp_path / "files"
     hj.save(model, field, {"seed": 3, "dt": 0.02})
     called("export", model, "-o", out, "--to", "casadi,stablehlo", "--out", tmp_path)
-    names = ["field.npz", "step.npz", "field.casadi", "step.casadi"]
+    names = ["field.npz", "field.casadi", "step.npz", "step.casadi"]
     assert json.loads((tmp_path / "report.json").read_text())["files"] == [str(out / name) for name in names]
     step, field = load_program(out / "step.npz"), load_program(out / "field.npz")
     assert (step.dt, step.about["seed"], field.dt) == (0.02, 3, None)
@@ -37,7 +38,9 @@ def test_all_that_is_written_is_the_model(field, tmp_path, called):
 
 def test_c_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, called, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    hj.save("model.npz", field, {"dt": 0.02})
+    x0, u = np.tile(X, (20, 1)), np.full((20, 10, 4), 650.0)
+    motion = hj.Trajectories(x0, u, np.tile(x0[:, None], (1, 10, 1)), 0.02)
+    hj.save("model.npz", with_motion(field, motion), {"dt": 0.02})
     _, said, _ = called("export", "model.npz", "-o", "board", "--name", "iris", "--double", "--smooth", "30")
     assert {path.name for path in (tmp_path / "board").iterdir()} == {
         *("iris.h", "iris.c", "iris_adaptation.h", "iris_adaptation.c")

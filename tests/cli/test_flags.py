@@ -14,13 +14,9 @@ SAID = {
     "columns: u0 never changes": "columns: u0 never changes",  # the name of a check
     "v.toml: [motors]: polynomial must be numbers": "v.toml: [motors]: polynomial must be numbers",  # a key
     "polynomial=(c0, c1, …) maps them": "--polynomial c0,c1 maps them",
-    "cut it out: in_flight=True": "cut it out: --cleaning.in-flight",
-    "resample=… with longest_gap=…": "--cleaning.resample with --cleaning.longest-gap",
-    "11.9 ms later: delay=0.0119, or learn": "11.9 ms later: --cleaning.delay 0.0119, or learn",
-    "a.csv: low_pass: cutoff must lie": "a.csv: --cleaning.low-pass: cutoff must lie",
-    "longest_gap needs resample": "--cleaning.longest-gap needs resample",
+    "11.9 ms later: delay=0.0119, or learn": "11.9 ms later: --delay 0.0119, or learn",
     'use what is whole: failed="warn"': "use what is whole: --anyway",
-    "resample all logs with dt=0.02": "resample all logs with --cleaning.resample 0.02",
+    "resample all logs with dt=0.02": "resample all logs with --dt 0.02",
 }
 
 
@@ -28,7 +24,3 @@ SAID = {
 def test_arguments_become_options(said, printed):
     assert in_flags("real_flight", said) == printed
     assert in_flags("external_force", said) == said  # which reads no logs
-
-
-def test_each_command_names_its_own_option():
-    assert in_flags("inspect", "put the samples on even times first: dt=0.01").endswith("--dt 0.01")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
+from hybrid_jax.cli.command import NOTHING_CHANGED
 from hybrid_jax.cli.identify import _by_step, _nearest
 from hybrid_jax.vehicle import IRIS
 
@@ -57,8 +58,8 @@ def files(tmp_path):
 
 def test_a_folder_of_commands_becomes_a_page_and_a_model(files, called):
     folder, arguments = files
-    test = folder / "logs" / "two.csv"
-    short = ["--dt", "0.01", "--steps", "40", "--windows", "20", "--test", test]
+    short = ["--dt", "0.01", "--steps", "40", "--windows", "20"]
+    (folder / "logs" / "two.csv").rename(folder / "two.csv")
     code, said, _ = called("identify", *arguments, *short)
     assert code == 0
     assert "2 of 2 numbers are told" in said
@@ -67,8 +68,22 @@ def test_a_folder_of_commands_becomes_a_page_and_a_model(files, called):
     np.testing.assert_allclose(theta["k"], 1.1 * IRIS.thrust_coefficient, rtol=0.01)
     np.testing.assert_allclose(theta["time_constant"], 0.08, rtol=0.05)
     page = (folder / "out" / "report.html").read_text()
-    assert all(words in page for words in ("time_constant", "two.csv", "data:image/png;base64,"))
+    assert all(words in page for words in ("time_constant", "data:image/png;base64,"))
     assert json.loads((folder / "out" / "report.json").read_text())["parameters"]["k"]["low"] > 0
+    options = ["--columns", folder / "columns.toml", "--out", folder / "out"]
+    code, said, _ = called("check", folder / "model.npz", folder / "two.csv", *options)
+    assert (code, "After 0.4 s it errs in specific_force by" in said) == (0, True)
+    code, _, why = called("check", folder / "model.npz", folder / "logs", *options)
+    assert (code, why.splitlines()[-1].endswith("which the model learned from; leave it out")) == (2, True)
+    code, said, _ = called("adapt", folder / "model.npz", folder / "two.csv", "-o", folder / "after.npz", *options)
+    assert (code, "Nothing changed that these logs can tell." in said) == (NOTHING_CHANGED, True), said
+    table = np.genfromtxt(folder / "two.csv", delimiter=",", names=True)
+    table["az"] *= 0.8
+    np.savetxt(folder / "weak.csv", table, "%.9g", ",", header="t,ax,ay,az,c0,c1,c2,c3", comments="")
+    code, said, _ = called("adapt", folder / "model.npz", folder / "weak.csv", "-o", folder / "after.npz", *options)
+    assert (code, "Changed: k from " in said) == (0, True)
+    found = json.loads((folder / "out" / "report.json").read_text())["parameters"]["k"]["value"]
+    np.testing.assert_allclose(found, 0.8 * 1.1 * IRIS.thrust_coefficient, rtol=0.01)
 
 
 def test_errors_are_shown_at_steps_that_were_measured():
@@ -86,7 +101,6 @@ def test_errors_are_shown_at_steps_that_were_measured():
     ("more", "said"),
     [
         (["--learn", "gain"], "'gain'"),
-        (["--measured", "speed"], "--measured must be of"),
         (["--steps", "0"], "--steps must be an integer of at least 1"),
         (["--windows", "0"], "--windows must be an integer of at least 1"),  # it named a field that is no option
         (

@@ -55,17 +55,8 @@ MENDS = {"anyway": ({"anyway": True}, ["motor order"]), "mended": ({"motor_order
 def test_it_goes_on_when_asked_or_mended(folder, more, failed):
     write(folder / "logs", [SWAPPED])
     config = Options(folder / "logs", folder / "m.npz", folder / "v.toml", learn=("Ix",), **more)
-    *_, lines = checked(config)
+    lines = checked(config).failed
     assert [line.split(": ")[1].split(" against")[0] for line in lines] == failed
-
-
-def test_a_flight_is_not_both_fitted_and_predicted(folder, ended):
-    """Under another name its predictions would look like those of an unseen flight."""
-    write(folder / "logs", LOGS[:2])
-    write(folder, [LOGS[1]])
-    code, (line,) = ended("--learn", "Ix", "--test", "chirp_run2.csv.gz")
-    assert code == 2
-    assert "--test chirp_run2.csv.gz: the same flight as logs/chirp_run2.csv.gz" in line
 
 
 @pytest.mark.parametrize(("learn", "rest"), [("Ix,curve,delay", "Ix"), ("curve", "Ix Iy")])

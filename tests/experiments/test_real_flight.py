@@ -1,69 +1,57 @@
-"""Training on recorded flights: training, validation and test share no sample."""
+"""Folds around what the tool learns: which flights train and test, what is refused, and what a run writes."""
 
+import json
 import os
 import re
-from dataclasses import replace
-from itertools import pairwise
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 import pytest
-from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples, windows_of_fold
+from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, write
 from rich.console import Console
+from smoke import command, experiments, refused
 
-import hybrid_jax
-from experiments.real_flight import study, train
-from experiments.real_flight.config import LEARN
-from experiments.real_flight.figures import errors_by_size
-from experiments.real_flight.folds import make_folds, non_overlapping, sampled_indices
-from experiments.real_flight.logs import LogSet, load_logs
-from experiments.real_flight.models import RECIPES, thrust_baseline, untrained
-from experiments.real_flight.report import parameter_tables
-from experiments.real_flight.scoring import QUANTITIES, TAGS, parameters, pooled, scores, verdicts
-from experiments.real_flight.study import run_folds
-from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
+from experiments.real_flight.__main__ import LISTS, main, prepare
+from experiments.real_flight.config import PRESETS, RealFlightConfig
+from experiments.real_flight.report import cells, expected_table, parameter_table, pooled, verdicts
+from experiments.real_flight.simulated import vehicle_toml
+from experiments.real_flight.study import ADAPTED, LEARNED, TAGS, make_folds, run_folds
+from experiments.reporting import names
 from experiments.reporting.results import Results
+from experiments.runner.command import read
 from experiments.runner.stages import Stages
-from hybrid_jax.dynamics.baselines import Kinematics
-from hybrid_jax.dynamics.vehicle_file import VehicleModel
-from hybrid_jax.flights.windows import LogWindows, count_windows, cut_windows, require_common_interval
-from hybrid_jax.integrate import rollout
-from hybrid_jax.networks.mlp import ResidualNetwork
-from hybrid_jax.training.channels import ChannelLoss, channels_from
+from hybrid_jax.cli.command import FAILED_CHECKS, split_lists
+from hybrid_jax.cli.errors import UNITS
+from hybrid_jax.cli.logs import Flights
+from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
+from hybrid_jax.flights.windows import (
+    count_windows,
+    cut_windows,
+    manoeuvre_of,
+    require_common_interval,
+)
 from hybrid_jax.vehicle import IRIS
 
 ROOT = Path(__file__).parents[2]
 REAL = Path(os.environ.get("HYBRID_JAX_FLIGHTS", ROOT.parent / "shared" / "flights"))
-MODEL = VehicleModel(IRIS, learn=LEARN)
-
 CASES = {
-    "by flight": ({}, None),
-    "by manoeuvre": ({"folds_by": "manoeuvre", "validate_by": "manoeuvre"}, None),
-    "tests given": ({}, OTHERS),
-    "tests given, by manoeuvre": ({"folds_by": "manoeuvre"}, OTHERS[:3]),
+    "by flight": ("flight", None),
+    "by manoeuvre": ("manoeuvre", None),
+    "tests given": ("flight", OTHERS),
+    "tests given, by manoeuvre": ("manoeuvre", OTHERS[:3]),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_training_validation_and_test_share_no_sample(case):
-    options, tested = CASES[case]
-    config = replace(CONFIG, **options)
-    folds = make_folds(LOGS, tested, config)
-    held_out = [log.name for fold in folds for log in fold.test]
-    assert sorted(held_out) == sorted(log.name for log in tested or LOGS)  # each is tested once
+def test_every_flight_is_tested_once_by_models_of_others(case):
+    by, tested = CASES[case]
+    folds = make_folds(LOGS, tested, replace(CONFIG, folds_by=by))
+    assert sorted(log.name for fold in folds for log in fold.test) == sorted(log.name for log in tested or LOGS)
+    of = {"flight": lambda log: log.name, "manoeuvre": manoeuvre_of}[by]
     for fold in folds:
-        train, validation, test = map(samples, windows_of_fold(fold, 5, 2))
-        assert not train & test
-        assert not validation & test
-        assert not train & validation
-
-
-def test_test_manoeuvres_are_not_trained_on():
-    for fold in make_folds(LOGS, OTHERS[:3], replace(CONFIG, folds_by="manoeuvre")):
-        trained = {log.name.split("_run")[0].split("/")[-1] for log in (*fold.train, *fold.validation)}
-        assert not trained & set(fold.name.split(", "))
+        assert not {of(log) for log in fold.train} & {of(log) for log in fold.test}
 
 
 def test_counted_windows_are_those_of_the_logs():
@@ -71,188 +59,187 @@ def test_counted_windows_are_those_of_the_logs():
     assert count_windows([LOGS[0], gap], 25) == len(cut_windows([LOGS[0], gap], 25)) == 65 + 25
 
 
-SHORT = [log[:30] for log in LOGS]
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (lambda t: 2 * t, r"chirp_run2.*0.02 s apart.*dt=0.02"),
+        (
+            lambda t: t + DT / 3 * (np.arange(SAMPLES) == 10),
+            r"chirp_run2.*at 0.09 s is 0.0133\d+ s, the median is 0.01 s; .*dt=0.01",
+        ),
+    ],
+)
+def test_uneven_samples_and_different_intervals_are_refused(times, message):
+    with pytest.raises(ValueError, match=message):
+        require_common_interval([LOGS[0], replace(LOGS[1], t=times(LOGS[1].t))])
 
 
 @pytest.mark.parametrize(
-    ("options", "flights", "message"),
+    ("options", "sets", "message"),
     [
-        ({"n": (100, 400)}, {"source": LOGS, "target": LOGS}, "--n 400: the training flights have only 325 windows"),
-        ({"horizon": (40,)}, {"source": LOGS, "target": [*LOGS[:3], *SHORT[3:]]}, "no window of 40 intervals"),
-        ({}, {"source": LOGS, "test": [log[:5] for log in OTHERS]}, "no window of 5 intervals"),
-        ({"recipes": ("frozen_rates",)}, {"source": SHORT, "target": LOGS}, "no window of 50 intervals"),
-        ({"recipes": ("frozen_rates",)}, {"source": LOGS, "target": SHORT}, "no window of 50 intervals"),
-        ({"horizon": (40,), "recipes": ("staged", "turning")}, {"source": SHORT, "test": LOGS}, "no window of 40"),
+        ({}, {"source": LOGS[:1]}, "--folds-by flight: all flights are of one name"),
+        ({}, {"source": LOGS[:2]}, "--source: without chirp_run. one flight is left; two at least"),
+        ({"horizon": (200,)}, {"source": LOGS}, "--horizon: no window of 200 intervals without gaps in /logs/"),
     ],
 )
-def test_short_flights_are_refused_before_training(options, flights, message, monkeypatch, tmp_path):
-    monkeypatch.setattr(Stages, "sweep", lambda *_: pytest.fail("training has begun"))
-    config = replace(CONFIG, cache=tmp_path, target=tmp_path if "target" in flights else None, **options)
-    logs = {name: LogSet(name, each, []) for name, each in flights.items()}
+def test_too_few_or_short_flights_are_refused_before_training(options, sets, message, monkeypatch, tmp_path):
+    monkeypatch.setattr(Stages, "kept", lambda *_: pytest.fail("training has begun"))
+    flights = {name: Flights(each, {}, []) for name, each in sets.items()}
     with pytest.raises(ValueError, match=message):
-        run_folds(Experiment(config, MODEL, MODEL, logs, DT, Stages(tmp_path, Console(quiet=True))))
+        run_folds(replace(CONFIG, **options), VehicleModel(IRIS), flights, Stages(tmp_path, Console(quiet=True)))
 
 
-def test_random_samples_are_nested_and_contiguous_ones_are_runs():
-    sizes = [40, 60, 50]
-    few, many = (sampled_indices(sizes, n, "random", 3) for n in (20, 100))
-    np.testing.assert_array_equal(few, many[:20])
-    starts = np.cumsum([0, *sizes])
-    for seed in range(5):
-        for n in (30, 60, 75, 150):
-            found = sampled_indices(sizes, n, "contiguous", seed)
-            assert len(set(found.tolist())) == n
-            runs = [found[(found >= a) & (found < b)] for a, b in pairwise(starts)]
-            assert all((np.diff(run) == 1).all() for run in runs)
-            assert sum(0 < len(run) < size for run, size in zip(runs, sizes, strict=True)) <= 1
-    begins = {int(sampled_indices([3, 6, 4], 4, "contiguous", seed)[0]) for seed in range(200)}
-    assert begins == {3, 4, 5, 9}  # all that leave room in one flight
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"horizon": (0,)}, "--horizon must be an integer of at least 1"),
+        ({"simulated": True, "source": Path("a")}, "--simulated makes its own logs"),
+        ({"learn": ("wings",)}, "learn must be names of"),
+        ({"dt": 0.0}, "--dt must be a positive finite number"),
+    ],
+)
+def test_invalid_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        replace(CONFIG, **options)
 
 
-def test_networks_have_the_activation_of_the_options(monkeypatch):
-    monkeypatch.setattr(train, "in_stages", lambda *given: given[2])  # the models as training would begin
-    experiment = Experiment(replace(CONFIG, activation="tanh"), MODEL, MODEL, {}, DT, None)
-    windows = cut_windows(LOGS, 10, 5)
-    data = TrainingData(windows, windows.windows, None, len(windows))
-    first = train.train_on_source(experiment, "source", "hybrid", "staged", data, 1)
-    for each in (first, train.adapt(experiment, "target", "scratch", first, data, [20])):
-        nodes = jax.tree.leaves(each.fields, is_leaf=lambda node: isinstance(node, ResidualNetwork))
-        assert [node.activation for node in nodes if isinstance(node, ResidualNetwork)] == ["tanh"]
+@pytest.mark.parametrize(
+    ("arguments", "message"), [([], "no logs at hand?"), (["--folds-by", "day"], "'day' for argument '--folds-by'")]
+)
+def test_guide_is_printed_without_flights_but_a_wrong_option_is_named_first(arguments, message, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err.lower()
 
 
-def test_non_overlapping_windows_share_no_sample():
-    np.testing.assert_array_equal(non_overlapping(np.array([9, 0, 3, 5, 11, 10]), [10, 5], 4), [0, 5, 9, 10])
+def test_lists_may_be_comma_separated():
+    given = ["--n", "100,300", "--horizon=10,50", "--source", "1,2", "--test=3,4", "--learn", "Ix,Iy", "k", "--anyway"]
+    given += ["--motor-order", "2,0,3,1", "--topics", "imu=/imu,motors=/m:data:rpm", "--polynomial", "-150.5,9e2"]
+    expected = ["--n", "100", "300", "--horizon", "10", "50", "--source", "1,2", "--test=3,4"]
+    expected += ["--learn", "Ix", "Iy", "k", "--anyway", "--motor-order", "2", "0", "3", "1"]
+    expected += ["--topics", "imu=/imu", "motors=/m:data:rpm", "--polynomial", "-150.5", "9e2"]
+    assert split_lists(given, LISTS) == expected
+    config: Any = read("real_flight", "", expected, PRESETS)
+    assert (config.polynomial, config.learn, config.test) == ((-150.5, 900.0), ("Ix", "Iy", "k"), Path("3,4"))
+    several = {f"--{each.name.replace('_', '-')}" for each in fields(RealFlightConfig) if "tuple" in str(each.type)}
+    assert several == set(LISTS)
 
 
-def test_kinematics_move_and_turn_at_constant_rates():
-    x0 = np.array([1, 2, 3, 1, 0, 0, 0, 0.5, -1, 2, 0.3, -0.2, 0.5], np.float32)
-    x = rollout(Kinematics(), x0, np.zeros((50, 4), np.float32), DT)
-    np.testing.assert_allclose(x[-1, :3], x0[:3] + 0.5 * x0[7:10], rtol=1e-5)
-    np.testing.assert_array_equal(x[-1, 7:], x0[7:])
-    angle = 2 * np.arctan2(np.linalg.norm(x[-1, 4:7]), x[-1, 3])
-    np.testing.assert_allclose(angle, 0.5 * np.linalg.norm(x0[10:]), rtol=1e-4)
+@pytest.fixture
+def vehicle(tmp_path):
+    path = tmp_path / "vehicle.toml"
+    path.write_text(vehicle_toml(IRIS))
+    return path
 
 
-def test_parameters_have_intervals_around_them():
-    windows = cut_windows(LOGS, 10, 5)
-    noise = np.random.default_rng(0).normal(0, 1e-3, windows.windows.x.shape).astype(np.float32)
-    noisy = eqx.tree_at(lambda w: w.x, windows.windows, windows.windows.x + noise)
-    objective = ChannelLoss(channels_from(thrust_baseline(MODEL), noisy), 1.0)
-    data = TrainingData(LogWindows(noisy, windows.sizes, windows.stride), noisy, objective, len(noisy))
-
-    def found(seeds, indices):
-        fields = untrained("hybrid", replace(MODEL, learn=("Ix", "k_rotors")), RECIPES["staged"], 4, seeds)
-        model = TrainedModel("hybrid", "source_only", "staged", fields, range(seeds), [indices] * seeds)
-        return parameters(model, data)
-
-    for each in found(2, np.arange(len(windows))):
-        assert set(each["theta"]) == {"Ix", *(f"k_rotors[{i}]" for i in range(4))}
-        for name, (low, high) in each["theta_interval"].items():
-            assert 0 < low < each["theta"][name] < high
-            # Positive: symmetric in the logarithm.
-            np.testing.assert_allclose(low * high, each["theta"][name] ** 2, rtol=1e-4)
-    (few,) = found(1, np.arange(3))
-    assert few["theta"]["Ix"] == pytest.approx(IRIS.inertia[0])
-    assert few["theta_interval"] is None
+def test_a_flight_that_is_there_twice_is_refused(vehicle, tmp_path):
+    same = replace(LOGS[0], name="/logs/chirp_run9.csv")
+    folders = {"source": write(tmp_path / "source", LOGS[:2]), "test": write(tmp_path / "test", [same])}
+    config = replace(CONFIG, vehicle=vehicle, **folders)
+    with pytest.raises(ValueError, match=r"--test chirp_run9.csv.gz: the same flight as --source chirp_run1.csv.gz"):
+        prepare(config)
+    prepare(replace(config, folds_by="manoeuvre"))  # each is tested by models of other manoeuvres
+    write(folders["source"], [same])
+    with pytest.raises(ValueError, match=r"chirp_run9.*the same flight as chirp_run1"):
+        prepare(config)
 
 
-def test_nanodrone_score_sums_the_mean_error_of_each_step():
-    rms, mean = np.full((4, 60), 2.0), np.tile(np.arange(1.0, 61), (4, 1))
-    found = scores(rms, mean, replace(CONFIG, protocol="nanodrone"))
-    assert found["5"] == dict.fromkeys(QUANTITIES, 2.0)
-    assert found["sum"] == dict.fromkeys(QUANTITIES, 50 * 51 / 2)
+@pytest.mark.slow
+def test_logs_that_all_fail_their_checks_end_with_exit_code_3(vehicle, tmp_path):
+    source = write(tmp_path / "source", [replace(log, u=log.u + 900) for log in LOGS[:3]])
+    run = command("real_flight", "--vehicle", str(vehicle), "--source", str(source), folder=tmp_path)
+    assert run.returncode == FAILED_CHECKS
+    assert "motors within limits" in run.stderr
+    assert "Traceback" not in run.stderr
 
 
-def row(mode, value, *, n=100, seed=0, fold="a", windows=1, model="hybrid", **columns):
-    errors = dict.fromkeys(QUANTITIES, value)
-    tags = dict(zip(TAGS, (fold, model, mode, n, seed), strict=True))
-    return tags | {"windows": windows, "scores": {"10": errors, "sum": errors}} | columns
+@pytest.mark.slow
+def test_bad_log_is_refused_with_file_row_and_field(vehicle, tmp_path):
+    source = write(tmp_path / "source", LOGS[:3])
+    rows = ("0,0,0,1,1,0,0,0,0,0,0,0,0,0,600,600,600,600", "0.01,0,0,1,1,0,0,0,fast,0,0,0,0,0,600,600,600,600")
+    (source / "bad.csv").write_text("\n".join(["t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3", *rows]))
+    run = command("real_flight", "--vehicle", str(vehicle), "--source", str(source), folder=tmp_path)
+    run.stderr = run.stderr.splitlines()[-1]  # after that of the step
+    line = refused(run, "real_flight")
+    assert line.startswith(f"real_flight: {source / 'bad.csv'}: row 3, field vx: ")
+    left = (tmp_path / "out" / "real_flight").iterdir()
+    assert [path.name for path in left] == [".lock"]  # no partial results
 
 
-def test_folds_are_pooled_by_their_windows():
-    rows = Results([row("scratch", 1.0), row("scratch", 3.0, fold="b", windows=3), row("scratch", 5.0, seed=1)], TAGS)
-    np.testing.assert_allclose(pooled(rows, "10", "velocity"), [np.sqrt((1 + 3 * 9) / 4), 5])
-    np.testing.assert_allclose(pooled(rows, "sum", "velocity"), [(1 + 9) / 4, 5])
+def row(model, value, *, n=0, seed=0, flight="a", **columns):
+    scores = {"10": dict.fromkeys(UNITS, value)}
+    tags = dict(zip(TAGS, (flight, model, n, seed), strict=True))
+    return tags | {"scores": scores, "theta": None, "theta_interval": None, "expected": None, "inside": None} | columns
+
+
+def test_flights_count_once():
+    rows = Results([row(LEARNED, 1.0), row(LEARNED, 3.0, flight="b"), row(LEARNED, 5.0, seed=1)], TAGS)
+    np.testing.assert_allclose(pooled(rows, "10", "velocity"), [np.sqrt((1 + 9) / 2), 5])
 
 
 @pytest.mark.parametrize(("noise", "decided"), [(0.01, True), (1.0, False)])
 def test_verdicts_are_decided_by_ratios_of_errors_over_flights_and_seeds(noise, decided):
     rng = np.random.default_rng(0)
 
-    def runs(mode, value, seeds=range(3), **columns):
-        sizes = np.exp(noise * rng.normal(size=(4, len(seeds))))
+    def runs(model, value, seeds=(0, 1, 2), n=0):
         return [
-            row(mode, value * sizes[i, s], seed=s, replicate=flight, **columns)
-            for i, flight in enumerate("abcd")
-            for s in seeds
+            row(model, value * np.exp(noise * rng.normal()), seed=seed, flight=flight, n=n)
+            for flight in "abcd"
+            for seed in seeds
         ]
 
-    rows = runs("fine_tuned", 1.0) + runs("scratch", 2.0) + runs("zero_shot", 0.5, n=0)
-    rows += runs("nominal", 4.0, [0], n=0, model="hold") + runs("fine_tuned", 0.9, model="no_physics")
-    found = {each.id: each for each in verdicts(Results(rows, (*TAGS, "replicate")))}
+    rows = runs(ADAPTED, 1.0, n=100) + runs(names.SCRATCH, 2.0, n=100) + runs(LEARNED, 0.5)
+    rows += runs(names.HOLD, 4.0, (0,)) + runs(names.PHYSICS_ONLY, 0.9)
+    found = {each.id: each for each in verdicts(cells(Results(rows, TAGS)), (ADAPTED, 100))}
     if decided:
         assert {id: each.holds for id, each in found.items()} == {"F1": True, "F2": False, "F3": True, "F4": False}
-        ratio = float(re.search(r"step 10 velocity (\S+) \(", found["F1"].measured)[1])
-        assert ratio == pytest.approx(0.25, rel=0.03)
+        (ratio,) = re.findall(r"step 10 velocity (\S+) \(", found["F1"].measured)
+        assert float(ratio) == pytest.approx(0.25, rel=0.03)
     else:
         assert found["F2"].holds is None
 
 
-@pytest.mark.parametrize(
-    ("second", "text"),
-    [
-        ({"Ix": 3.0, "drag": 5.0}, "4 ± 1 [3, 5]"),
-        ({"Ix": 3.0}, "3 [2, 4] (1 of 2 folds)"),  # its recipe learns no drag
-        ({"Ix": 3.0, "drag": None}, "nan ± nan [2, 4]"),  # its drag is not finite
-    ],
-)
-def test_parameter_is_the_mean_over_folds_that_learn_it(second, text):
-    rows = []
-    for fold, theta in {"a": {"Ix": 2.0, "drag": 3.0}, "b": second}.items():
-        ends = {name: [value - 1, value + 1] for name, value in theta.items() if value is not None}
-        rows.append(row("source_only", 1.0, n=0, fold=fold, theta=theta, theta_interval=ends))
-    (table,) = parameter_tables(Results(rows, TAGS), {"Ix": 1.0, "drag": 0.0})
-    assert [line[-1] for line in table.lines] == ["2.5 ± 0.7 [1.5, 3.5]", text]
-
-
-@pytest.mark.parametrize("sizes", [(20,), (100, 1000)])
-def test_errors_are_drawn_over_the_baselines_at_their_number_of_windows(sizes):
-    rows = [row("zero_shot", 1.0, n=0), row("nominal", 2.0, n=0, model="thrust")]
-    rows += [row(mode, 1.0, n=n) for n in sizes for mode in ("fine_tuned", "scratch")]
-    rows = Results([each | {"scores": {"10": each["scores"]["10"]}} for each in rows], TAGS)
-    for axes in errors_by_size(rows, DT, "").axes:
-        curves = [line for line in axes.lines if line.get_marker() == "o"]
-        assert [list(line.get_xdata()) for line in curves] == [list(sizes)] * 2
-        np.testing.assert_allclose([line.get_ydata() for line in curves], 0.5)
-        np.testing.assert_array_less(1.04, [min(sizes) / axes.get_xlim()[0], axes.get_xlim()[1] / max(sizes)])
+def test_parameters_and_expected_errors_are_means_over_those_that_have_them():
+    theta = [{"Ix": 2.0, "drag": 3.0}, {"Ix": 3.0, "drag": None}]
+    rows = [
+        row(LEARNED, 1.0, flight=flight, theta=each, theta_interval={name: [1.0, 5.0] for name in each})
+        | {"expected": dict.fromkeys(UNITS, 2.0), "inside": dict.fromkeys(UNITS, flight == "a")}
+        for flight, each in zip("ab", theta, strict=True)
+    ]
+    found = cells(Results(rows, TAGS))
+    assert [line[-1] for line in parameter_table(found).lines] == ["2.5 ± 0.7 [1, 5]", "nan ± nan [1, 5]"]
+    assert expected_table(found).lines == [("hybrid-jax fit", *["2: 1, 1 of 2"] * 4)]
 
 
 @pytest.mark.skipif(not (REAL / "nanodrone").exists(), reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder")
-@pytest.mark.parametrize(
-    ("name", "by", "count"), [("crazyflie_payload/payload", "flight", 3), ("nanodrone/train", "manoeuvre", 3)]
-)
-def test_folds_of_real_flights_share_no_sample(name, by, count):
-    vehicle = hybrid_jax.load_vehicle(REAL / name.split("/")[0] / "vehicle.toml")
-    logs = load_logs("source", REAL / name, vehicle, 0.0, CONFIG).logs
-    assert require_common_interval(logs) == DT
-    folds = make_folds(logs, None, replace(CONFIG, folds_by=by))
-    assert len(folds) == count
-    for fold in folds:
-        train, validation, test = map(samples, windows_of_fold(fold, 25, 25))
-        assert not (train | validation) & test
+def test_manoeuvres_of_real_flights_are_held_out():
+    folder = REAL / "nanodrone"
+    _, sets = prepare(replace(CONFIG, vehicle=folder / "vehicle.toml", source=folder / "train"))
+    folds = make_folds(sets["source"].logs, None, replace(CONFIG, folds_by="manoeuvre"))
+    assert {fold.name for fold in folds} == {"chirp", "random", "square"}
 
 
 @pytest.mark.slow
-def test_programs_of_the_previous_fold_are_freed(monkeypatch):
-    """Otherwise many folds need more memory maps than Linux gives a process."""
-    kept, twice = [], jax.jit(lambda x: 2 * x)
-
-    def run_fold(experiment, outputs, number, source):
-        twice(np.zeros(number + 3)).block_until_ready()  # another program for each shape
-        kept.append(len(jax.devices()[0].client.live_executables()))
-
-    monkeypatch.setattr(study, "_run_fold", run_fold)
-    config = replace(CONFIG, stride=1)
-    run_folds(Experiment(config, MODEL, MODEL, {"source": LogSet("source", LOGS, [])}, DT, None))
-    assert len(kept) > 1
-    assert kept[-1] <= kept[0]
+def test_simulated_run_writes_a_complete_report(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("simulated")
+    (run,) = experiments("real_flight", "real_flight", folder=folder, options=("--simulated",))
+    assert run.returncode == 0, run.stderr
+    assert "Traceback" not in run.stderr
+    out = folder / "out" / "real_flight"
+    assert load_vehicle_model(out / "logs" / "vehicle.toml").vehicle == IRIS
+    report = json.loads((out / "report.json").read_text())
+    assert {"versions", "hardware", "seconds"} <= set(report["environment"])
+    # Three baselines; physics, what was learned, adapted, and adapted from nominal: of each of six flights.
+    assert len(report["rows"]) == 6 * (3 + 2 + 2)
+    for found in report["rows"]:
+        assert set(found["scores"]) == {"5", "10"}
+        assert all(set(each) == set(UNITS) for each in found["scores"].values())
+    tested = {flight for fold in report["folds"] for flight in fold["test"]}
+    assert tested == {found["flight"] for found in report["rows"]} == {f"flight_{i:02d}" for i in range(6)}
+    for fold in report["folds"]:
+        assert not set(fold["test"]) & set(fold["train"])
+    page = (out / "report.md").read_text()
+    parts = "Error to expect", "RMSE after 0.05 s", "Physical parameters"
+    assert sorted(parts, key=page.index) == [*parts]
+    assert (out / "errors_by_step.png").read_bytes().startswith(b"\x89PNG")

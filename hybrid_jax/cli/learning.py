@@ -1,0 +1,127 @@
+"""Learn a vehicle from flights, by physics alone or with a network: what `fit` decides, and what experiments score."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from hybrid_jax.adaptation import METHODS, Adaptation, Auto, adapt
+from hybrid_jax.cli import errors
+from hybrid_jax.cli.choice import choose, expected
+from hybrid_jax.cli.logs import STEPS, windows_of
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.baselines import FrozenRates
+from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
+from hybrid_jax.flights.checks.cleaning import choose_time_constant, lag_motors
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.networks.factory import make_residual
+from hybrid_jax.networks.mlp import InputScaling, zero_output
+from hybrid_jax.training import Settings, fit, rates_by_group
+from hybrid_jax.training.channels import scaled_loss
+from hybrid_jax.trajectories import Trajectories
+
+TRAINED, VALIDATED, ADAPTED, OF_LAG = 2000, 500, 600, 300  # windows at most
+FOLDS = 3  # at most so many groups of flights are left out in turn
+HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
+PHYSICS, OUTPUTS = "theta_least_squares", "accelerations"
+FROZEN, CANDIDATES = "thrust, rates frozen", ("physics", "hybrid")  # the simplest first
+
+
+class Learned(NamedTuple):
+    """A model of a vehicle.
+
+    Attributes:
+        field: the model.
+        physics: its physics alone, with intervals.
+        chosen: one of CANDIDATES.
+        lag: of the rotors behind the motors of the logs [s].
+        left_out: RMSE of FROZEN and each candidate on flights left out, after each interval.
+        expected: error on a flight that nobody has recorded, of each of `errors.UNITS`: value, low, high.
+    """
+
+    field: AbstractVectorField
+    physics: Adaptation
+    chosen: str
+    lag: float
+    left_out: dict[str, Float[np.ndarray, "flights t 4"]]
+    expected: Float[np.ndarray, "3 4"]
+
+
+def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Learned:
+    """Learn from all flights what flights that are left out in turn choose: physics alone, or with a network.
+
+    Args:
+        model: what is known, and in `learn` what is not.
+        logs: two flights or more; rotors lag as `model` says, or as is chosen where it is to be learned.
+        seed: of the network.
+    """
+    lag = _lag(model, logs) if LAG in model.learn else model.terms.motor_time_constant
+    logs = lagged(logs, lag)
+    # One scale of errors for all flights, so that all trainings share a program.
+    settings = Settings(objective=scaled_loss(model.physics(), _windows(logs, TRAINED)))
+    parts: dict[str, list[Float[np.ndarray, "f t 4"]]] = {name: [] for name in (FROZEN, *CANDIDATES)}
+    groups = [range(i, len(logs), min(FOLDS, len(logs))) for i in range(min(FOLDS, len(logs)))]
+    for group in groups:
+        kept = [log for i, log in enumerate(logs) if i not in group]
+        train = _windows(kept, TRAINED)
+        physics = METHODS[PHYSICS].solve(model.physics(), train, train, settings).field
+        fields = FrozenRates(model.physics()), physics, _hybrid(physics, kept, seed, settings)
+        for name, field in zip(parts, fields, strict=True):
+            parts[name].append(errors.rmse_by_flight(field, [logs[i] for i in group], STEPS))
+    order = np.argsort(np.concatenate(groups))
+    found = {name: np.concatenate(each)[order] for name, each in parts.items()}
+    ends = {name: each[:, -1] for name, each in found.items()}
+    scores = {name: np.log(ends[name] / ends[FROZEN]).mean(axis=1)[:, None] for name in CANDIDATES}
+    chosen = choose(scores, CANDIDATES[:1])
+    windows = windows_of(logs, STEPS, STEPS, TRAINED).windows
+    physics = adapt(model.physics(), windows, method=PHYSICS, settings=settings)
+    field = physics.field if chosen == "physics" else _hybrid(physics.field, logs, seed, settings)
+    return Learned(field, physics, chosen, lag, found, expected(np.log(ends[chosen])))
+
+
+def adapted(field: AbstractVectorField, logs: Sequence[FlightLog], most: int = ADAPTED) -> Adaptation:
+    """Adapt a model to at most so many windows of flights after a change, whose rotors lag as the model has it.
+
+    Its network stays as it is: ten seconds of flight do not tell hundreds of weights.
+    """
+    return adapt(field, windows_of(logs, STEPS, STEPS, most).windows, method=Auto(networks=False))
+
+
+def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:
+    """The flights with rotors that follow the motors of the logs with a lag [s]."""
+    return [lag_motors(log, lag)[0] for log in logs] if lag else list(logs)
+
+
+def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
+    """The lag with which physics that is fitted to all but the last flight predicts that flight best."""
+
+    def error(logs: list[FlightLog]) -> float:
+        train = _windows(logs[:-1], OF_LAG)
+        settings = Settings(objective=scaled_loss(model.physics(), train))
+        field = METHODS[PHYSICS].solve(model.physics(), train, train, settings).field
+        ends = [errors.rmse_by_flight(each, logs[-1:], STEPS)[:, -1] for each in (field, FrozenRates(model.physics()))]
+        return float(np.log(ends[0] / ends[1]).mean())
+
+    return choose_time_constant(logs, error)[0]
+
+
+def _windows(logs: Sequence[FlightLog], count: int) -> Trajectories:
+    """So many windows, spread evenly, some twice where there are fewer, so that trainings share a program."""
+    windows = windows_of(logs, STEPS, 1, count).windows
+    return windows[np.arange(count) % len(windows)]
+
+
+def _hybrid(physics: Any, logs: Sequence[FlightLog], seed: int, settings: Settings) -> AbstractVectorField:
+    """Physics with a network that adds accelerations; of more than two flights the last one tells when to stop."""
+    learned, validating = (logs[:-1], logs[-1:]) if len(logs) > 2 else (logs, logs)
+    vehicle, key = physics.vehicle, jax.random.key(seed)
+    scaling = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
+    options: dict[str, Any] = {"hidden": HIDDEN, "norm": "none", "scaling": scaling, "vehicle": vehicle}
+    residual = zero_output(make_residual(key, inputs="body_motion", outputs=OUTPUTS, **options))
+    field = Hybrid(physics, residual)
+    train, validation = _windows(learned, TRAINED), _windows(validating, VALIDATED)
+    rates = rates_by_group(field, {"residual": RATE})
+    return fit(field, train, validation, key, rates=rates, min_epochs=0, max_epochs=EPOCHS, settings=settings).best
