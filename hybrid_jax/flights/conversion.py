@@ -37,20 +37,6 @@ PX4_TOPICS |= {"esc_status": 5, "vehicle_status": 100}
 SINCE = {"vehicle_angular_velocity": (1, 10), "vehicle_acceleration": (1, 11), "actuator_motors": (1, 13)}
 
 
-def px4_topics(version: tuple[int, int] | None) -> str:
-    """A shell command, to be run on the SD card, that lists all that a model and its identification need.
-
-    The list takes the place of PX4's profile (logged_topics.cpp: a file of topics is read in place of the profile), so
-    it must be complete.
-
-    Args:
-        version: of PX4, as (1, 14); None if unknown: then topics of all versions are listed, and PX4 passes over those
-            that it does not know.
-    """
-    lines = [f"{name} {ms}" for name, ms in PX4_TOPICS.items() if version is None or SINCE.get(name, (0, 0)) <= version]
-    return "printf '" + "".join(rf"{line}\n" for line in lines) + "' > etc/logging/logger_topics.txt"
-
-
 def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] = ()) -> FlightLog:
     """The flight at intervals of dt [s], from the time on when all signals have begun; a gap of one is a gap of all.
 
@@ -132,13 +118,20 @@ def missing_states(recording: Recording) -> list[str]:
 
 
 def what_to_log(recording: Recording) -> str:
-    """What to change in what is logged, or why a quantity that is logged was left out."""
-    invalid = next((f"{note}; wait for the estimator" for note in recording.notes if "is not valid" in note), "")
-    if recording.facts.get("format") == "PX4 ULog":
-        found = re.match(r"PX4 (\d+)\.(\d+)\.", recording.facts.get("program", ""))
-        version = (int(found[1]), int(found[2])) if found else None
-        return invalid or f"on the SD card: {px4_topics(version)}"
-    return invalid or ADVICE.get(recording.facts.get("format", ""), "log it and fly again")
+    """What to change in what is logged, or why a quantity that is logged was left out.
+
+    A list of topics takes the place of PX4's profile (logged_topics.cpp), so it names all that a model and its
+    identification need; PX4 passes over those that its version does not know.
+    """
+    kind, program = (recording.facts.get(name, "") for name in ("format", "program"))
+    for note in (note for note in recording.notes if "is not valid" in note):
+        return f"{note}; wait for the estimator"
+    if kind != "PX4 ULog":
+        return ADVICE.get(kind, "log it and fly again")
+    found = re.match(r"PX4 (\d+)\.(\d+)\.", program)
+    version = (int(found[1]), int(found[2])) if found else (99, 0)
+    lines = [rf"{name} {ms}\n" for name, ms in PX4_TOPICS.items() if SINCE.get(name, (0, 0)) <= version]
+    return f"on the SD card: printf '{''.join(lines)}' > etc/logging/logger_topics.txt"
 
 
 def without_common_time(recording: Recording) -> str:

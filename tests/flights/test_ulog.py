@@ -15,10 +15,11 @@ from writers import OUTPUTS, PX4_STATES, START, commands, escs, message, outputs
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.checks.suitability import check_recording, failures
-from hybrid_jax.flights.conversion import px4_topics, to_flight
+from hybrid_jax.flights.conversion import to_flight, what_to_log
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.ulog import SOURCES, read_ulog
 from hybrid_jax.flights.load import reordered
+from hybrid_jax.flights.recording import Recording
 from hybrid_jax.vehicle import IRIS
 
 pytest.importorskip("pyulog", reason="reading ULog needs the extra `logs`")
@@ -141,7 +142,8 @@ def test_slow_signals_fail_at_their_own_rates(flight, topics, written):
 @pytest.mark.parametrize("version", [(1, 9), (1, 12), (1, 14)], ids=str)
 def test_advice_for_the_next_flight_is_complete_for_its_version(version):
     """A list of topics takes the place of PX4's profile, so what it lacks is lost."""
-    said = px4_topics(version)
+    facts = {"format": "PX4 ULog", "program": f"PX4 {version[0]}.{version[1]}.0 on PX4_FMU_V5"}
+    said = what_to_log(Recording("log", {}, (), facts))
     listed = {line.split()[0] for line in said.split("'")[1].split(r"\n") if line}
     assert said.endswith("> etc/logging/logger_topics.txt")
     assert listed >= {"vehicle_local_position", "vehicle_attitude", "sensor_combined", "battery_status", "esc_status"}

@@ -57,15 +57,13 @@ def _flights(t, power: Float[np.ndarray, " n"], z=None) -> list[tuple[float, flo
         idle[part] = t[part][-1] - t[part][0] >= RESTING
     found = []
     for run in runs_of(~idle):
-        if z is not None and run.start > 0:
+        rested, rests, time = run.start > 0, run.stop < len(power), t[run]
+        if z is not None and rested:
             clear = runs_of(z[run] > z[run.start - 1] + CLEAR)
-            found += [(float(t[run][part][0]), float(t[run][part][-1])) for part in clear]
-        else:
-            found += _carried(t[run], power[run], run.start > 0, run.stop < len(power))
+            found += [(float(time[part][0]), float(time[part][-1])) for part in clear]
+            continue
+        carries = time[np.argmax(power[run] >= np.median(power[run]))]
+        begin = max(time[0] + MARGIN, carries) if rested else time[0]
+        end = time[-1] - MARGIN * rests
+        found += [(float(begin), float(end))] if end > begin else []
     return found
-
-
-def _carried(t, power, rested: bool, rests: bool) -> list[tuple[float, float]]:
-    begin = max(t[0] + MARGIN, t[np.argmax(power >= np.median(power))]) if rested else t[0]
-    end = t[-1] - MARGIN if rests else t[-1]
-    return [(float(begin), float(end))] if end > begin else []

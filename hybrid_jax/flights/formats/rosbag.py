@@ -56,6 +56,7 @@ READERS: dict[str, dict[str, dict[str, str]]] = {
 # Read in a role only if `topics` says so.
 ASKED_FOR = {("velocity", "Odometry"), ("velocity", "Vector3Stamped"), ("pose", "PointStamped")}
 ROLES = (*READERS, "motors")
+Messages = dict[str, list[tuple[int, Any]]]  # topic → time [ns] and content of each
 
 
 def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Recording:
@@ -67,6 +68,31 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
     topics = topics or {}
     if unknown := topics.keys() - set(ROLES):
         raise ValueError(f"topics: must name {', '.join(ROLES)}, got {', '.join(sorted(unknown))}")
+    types, chosen, messages = _heard(path, topics)
+    parts, notes, used = {}, [], {*messages}
+    for role, (topic, field, unit) in chosen.items():
+        heard, ticks = [message for _, message in messages[topic]], _stamps(messages[topic])
+        if role == "motors":
+            values, name = _motors(path, topic, field, heard)
+            kind = "command" if unit in SHARES else "rotor_speed"
+            parts[kind] = Samples(ticks, of_unit(values, unit), f"{topic} {name}")
+            continue
+        for quantity, place in READERS[role][types[topic].split("/")[-1]].items():
+            found = map(attrgetter(place), heard)
+            values = [[getattr(each, axis, each) for axis in AXES[quantity][0]] for each in found]  # a voltage has none
+            parts[quantity] = Samples(ticks, np.array(values, float), topic)
+    if "velocity" in chosen:
+        _twist_in_world(parts, chosen["velocity"][0])
+    kinds = {topic: kind for topic in messages if (kind := _px4(types[topic]))}
+    tables = {kind: _px4_table(messages[topic]) for topic, kind in kinds.items()}
+    own = states(tables, notes) | motors(tables, {}, 0, notes)
+    parts = {name: part._replace(ticks=1000 * part.ticks) for name, part in own.items()} | parts  # µs, the bag ns
+    notes += [f"topics that are not used: {', '.join(sorted(types.keys() - used))}"] if types.keys() - used else []
+    return raw.record(path, parts, 1e-9, notes, {"format": "ROS bag"})
+
+
+def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, tuple[str, str, str]], Messages]:
+    """Types of all topics, those that are chosen for each role, and the messages of these and of PX4's topics."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -76,10 +102,11 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
         with AnyReader([Path(path)], default_typestore=get_typestore(Stores.LATEST)) as bag:
             types = {each.topic: each.msgtype for each in bag.connections if each.msgcount}
             chosen = _chosen(path, types, topics)
-            wanted = [each for each in bag.connections if each.topic in {topic for topic, *_ in chosen.values()}]
-            of_px4 = [each for each in bag.connections if each.msgtype.startswith(PX4) and _px4(each) in TOPICS]
-            wanted += [each for each in of_px4 if each.msgcount]
-            messages: dict[str, list[tuple[int, Any]]] = {each.topic: [] for each in wanted}
+            names = {topic for topic, *_ in chosen.values()} | {
+                topic for topic in types if _px4(types[topic]) in TOPICS
+            }
+            wanted = [each for each in bag.connections if each.topic in names]
+            messages: Messages = {each.topic: [] for each in wanted}
             for each, at, content in bag.messages(wanted) if wanted else ():
                 messages[each.topic].append((at, bag.deserialize(content, each.msgtype)))
     except ValueError:
@@ -91,19 +118,7 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
         ) from error
     if empty := [topic for topic, found in messages.items() if not found]:
         raise ValueError(f"{path}: topic {empty[0]} has lost its messages; ros2 bag reindex, or copy it again")
-    parts, notes, used = {}, [], {*messages}
-    for role, (topic, field, unit) in chosen.items():
-        kind = types[topic].split("/")[-1]
-        heard = messages[topic]
-        found = _motors(path, topic, field, unit, heard) if field else _states(role, kind, topic, heard)
-        parts |= dict(found)
-    if "velocity" in chosen:
-        _twist_in_world(parts, chosen["velocity"][0])
-    tables = {_px4(each): _px4_table(messages[each.topic]) for each in wanted if each.msgtype.startswith(PX4)}
-    own = states(tables, notes) | motors(tables, {}, 0, notes)
-    parts = {name: part._replace(ticks=1000 * part.ticks) for name, part in own.items()} | parts  # µs, the bag ns
-    notes += [f"topics that are not used: {', '.join(sorted(types.keys() - used))}"] if types.keys() - used else []
-    return raw.record(path, parts, 1e-9, notes, {"format": "ROS bag"})
+    return types, chosen, messages
 
 
 def _twist_in_world(parts: dict[str, Samples], topic: str) -> None:
@@ -115,9 +130,10 @@ def _twist_in_world(parts: dict[str, Samples], topic: str) -> None:
         parts["rates"] = rates._replace(values=rotation_of(q).inv().apply(rates.values))
 
 
-def _px4(connection) -> str:
-    """The topic of PX4 that a message of px4_msgs is of, such as vehicle_attitude of VehicleAttitude."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", connection.msgtype.split("/")[-1]).lower()
+def _px4(kind: str) -> str:
+    """The topic of PX4 that a message of px4_msgs is of, such as vehicle_attitude of VehicleAttitude; else empty."""
+    name = kind.split("/")[-1] if kind.startswith(PX4) else ""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 def _px4_table(messages) -> dict[str, np.ndarray]:
@@ -186,14 +202,6 @@ def _stamps(messages) -> np.ndarray:
     return np.array([at for at, _ in messages], np.int64)
 
 
-def _states(role: str, kind: str, topic: str, messages) -> Iterator[tuple[str, Samples]]:
-    ticks = _stamps(messages)
-    for quantity, field in READERS[role][kind].items():
-        found = [attrgetter(field)(message) for _, message in messages]
-        values = [[getattr(each, axis, each) for axis in AXES[quantity][0]] for each in found]  # a voltage has no axes
-        yield quantity, Samples(ticks, np.array(values, float), topic)
-
-
 def _numbers(message, field: str):
     """A field of a message, or with a point a field of each of its parts, such as esc_telemetry.rpm."""
     whole, _, part = field.partition(".")
@@ -201,18 +209,17 @@ def _numbers(message, field: str):
     return [getattr(each, part, None) for each in found] if part else np.ravel(found)
 
 
-def _motors(path, topic: str, field: str, unit: str, messages) -> Iterator[tuple[str, Samples]]:
+def _motors(path, topic: str, field: str, messages) -> tuple[np.ndarray, str]:
+    """Numbers of each motor, and the name of the field that holds them."""
     fields = field.split("|")
-    name = next((name for name in fields if len(_numbers(messages[0][1], name))), fields[0])
+    name = next((name for name in fields if len(_numbers(messages[0], name))), fields[0])
     try:
-        rows = [np.asarray(_numbers(message, name), float).ravel() for _, message in messages]
+        rows = [np.asarray(_numbers(message, name), float).ravel() for message in messages]
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {topic}: field {name} must hold a number for each motor") from error
     counts = {len(row) for row in rows}
     if len(counts) > 1 or min(counts) < FEWEST_ROTORS:
-        known = ", ".join(each for each in vars(messages[0][1]) if not each.startswith("_"))
+        known = ", ".join(each for each in vars(messages[0]) if not each.startswith("_"))
         found = f"{', '.join(map(str, sorted(counts)))} numbers, must be one for each motor; its fields are {known}"
         raise ValueError(f"{path}: {topic}: field {name} holds {found}")
-    values = of_unit(np.stack(rows), unit)
-    quantity = "command" if unit in SHARES else "rotor_speed"
-    yield quantity, Samples(_stamps(messages), values, f"{topic} {name}")
+    return np.stack(rows), name

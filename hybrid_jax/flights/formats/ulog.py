@@ -60,9 +60,11 @@ def read_ulog(path: str | Path) -> Recording:
     tables, notes = _instances(log.data_list)
     kinds = {0: "generic"} | OTHERS | {kind: f"multirotor of {count} rotors" for kind, count in ROTORS.items()}
     kind = _kind(log.initial_parameters, tables)
-    facts = {"format": "PX4 ULog", "vehicle": kinds.get(kind, "unknown"), "program": _release(log.msg_info_dict)}
-    facts |= {"airframe": str(log.initial_parameters.get("SYS_AUTOSTART", "unknown"))}
-    facts |= {"SDLOG_PROFILE": str(log.initial_parameters.get("SDLOG_PROFILE", "unknown"))}
+    release, hardware = _whole(log.msg_info_dict, "ver_sw_release"), log.msg_info_dict.get("ver_hw", "unknown hardware")
+    version = f" {release >> 24}.{release >> 16 & 255}.{release >> 8 & 255}" * bool(release)
+    facts = {"format": "PX4 ULog", "vehicle": kinds.get(kind, "unknown"), "program": f"PX4{version} on {hardware}"}
+    for name, parameter in (("airframe", "SYS_AUTOSTART"), ("SDLOG_PROFILE", "SDLOG_PROFILE")):
+        facts[name] = str(log.initial_parameters.get(parameter, "unknown"))
     facts |= {"damage": damage} if damage else {}
     if log.dropouts:
         longest = max(each.duration for each in log.dropouts)
@@ -75,18 +77,19 @@ def read_ulog(path: str | Path) -> Recording:
 
 def _instances(data) -> tuple[dict[str, Any], list[str]]:
     """Topic → the first of its instances that changes, else the first; and which that is, where there are several."""
-    tables, chosen = {}, {}
+    chosen = {}
     for each in sorted(data, key=lambda each: each.multi_id):
         values = [column for name, column in each.data.items() if not name.startswith(("timestamp", "noutputs"))]
         changing = sum(len(column) > 1 and bool((column != column[0]).any()) for column in values)
         alive = changing >= (FEWEST_ROTORS if each.name == OUTPUTS else 1)
-        if each.name not in tables or (alive and not chosen[each.name][1]):
-            tables[each.name], chosen[each.name] = each.data, (each.multi_id, alive)
-    several = [(each.name, each.multi_id, chosen[each.name]) for each in data if chosen[each.name][0] != each.multi_id]
-    return tables, [
-        f"{name}: instance {number} is left out" + (f": instance {kept} changes" if kept and alive else "")
-        for name, number, (kept, alive) in several
-    ]
+        if each.name not in chosen or (alive and not chosen[each.name][1]):
+            chosen[each.name] = each, alive
+    notes = []
+    for each in data:
+        kept, alive = chosen[each.name]
+        why = f": instance {kept.multi_id} changes" if kept.multi_id and alive else ""
+        notes += [f"{each.name}: instance {each.multi_id} is left out{why}"] * (each is not kept)
+    return {name: kept.data for name, (kept, _) in chosen.items()}, notes
 
 
 def _load(path: str | Path) -> tuple[Any, str]:
@@ -137,12 +140,6 @@ def _whole(parameters, name: str) -> int:
     """A parameter, 0 where it is no number."""
     given = parameters.get(name, 0)
     return int(given) if isinstance(given, int | float) and np.isfinite(given) else 0
-
-
-def _release(info) -> str:
-    number = _whole(info, "ver_sw_release")
-    version = f"PX4 {number >> 24}.{number >> 16 & 255}.{number >> 8 & 255}" if number else "PX4"
-    return f"{version} on {info.get('ver_hw', 'unknown hardware')}"
 
 
 def _has(tables, topic: str, fields) -> bool:
