@@ -20,8 +20,8 @@ from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import perturbed, perturbed_by
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.io.datasets import Dataset
-from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
+from hybrid_jax.networks.views import make_residual
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.flight import permutation
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, VELOCITY

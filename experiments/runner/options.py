@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hi
 import platformdirs
 
 from hybrid_jax import checks
-from hybrid_jax.networks.activations import ACTIVATIONS
+from hybrid_jax.networks.mlp import ACTIVATIONS
 
 # Numbers with a rule, which `check_numbers` applies wherever an option's type mentions them.
 Count = Annotated[int, checks.count]

@@ -17,8 +17,8 @@ from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.flights.checks.cleaning import choose_time_constant, lag_motors
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, zero_output
+from hybrid_jax.networks.views import make_residual
 from hybrid_jax.training import Settings, fit, rates_by_group
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.trajectories import Trajectories

@@ -1,7 +1,7 @@
 """f_d: a fully connected network with one hidden layer and batch normalisation (paper, App. A.1), and linear maps."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import equinox as eqx
@@ -12,12 +12,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns, ravel_learned
 from hybrid_jax.dynamics.batching import RunningStats, expand_trailing
-from hybrid_jax.networks.activations import ACTIVATIONS, SmoothRelu, function_of
 from hybrid_jax.networks.normalisation import (
     UNROLLED_INPUTS,
     AbstractAffineNorm,
     AbstractNorm,
     AbstractScaling,
+    Activation,
     BatchNorm,
     Bias,
     ChannelScaling,
@@ -26,6 +26,32 @@ from hybrid_jax.networks.normalisation import (
     affine,
     product,
 )
+
+NORMS = ("batch", "layer", "none")
+ACTIVATIONS: dict[str, Activation] = {
+    "relu": jax.nn.relu,
+    "softplus": jax.nn.softplus,
+    "tanh": jnp.tanh,
+    "silu": jax.nn.silu,
+}
+
+
+@dataclass(frozen=True)
+class SmoothRelu:
+    """½ (z + √(z² + 1/β²)): ReLU with all derivatives, at most 1/(2β) above it, at zero. ValueError unless β > 0."""
+
+    beta: float
+
+    def __post_init__(self):
+        checks.positive("beta", self.beta)
+
+    def __call__(self, z: Float[Array, " h *b"]) -> Float[Array, " h *b"]:
+        return (z + jnp.sqrt(jnp.square(z) + self.beta**-2)) / 2
+
+
+def function_of(activation: str | SmoothRelu) -> Activation:
+    """The activation of a network, which holds its name: a function could not be sent to another process."""
+    return ACTIVATIONS[activation] if isinstance(activation, str) else activation
 
 
 class FusedNetwork(AbstractVectorField):
@@ -50,8 +76,7 @@ class FusedNetwork(AbstractVectorField):
     def layer(self, z: Float[Array, " m *b"]) -> tuple[Float[Array, " h *b"], Float[Array, " d *b"]]:
         """W₁ z + c and A z + b."""
         both = product(self.weight_in.T, z) if len(z) <= UNROLLED_INPUTS else (z.T @ self.weight_in).T
-        both = both + expand_trailing(self.bias, both)
-        return both[: len(self.weight_out)], both[len(self.weight_out) :]
+        return jnp.split(both + expand_trailing(self.bias, both), [len(self.weight_out)])  # pyright: ignore[reportReturnType]
 
     def linearize(self, x, u, dx, du):
         """The Jacobian with respect to z is one product over the hidden units, whatever the number of directions."""
@@ -197,13 +222,12 @@ def residual_network(
         scaling: by default read off the training windows by `hybrid_jax.fit`; see `standardise.with_scaling`.
         norm: normalisation of the hidden units: "batch", "layer" or "none".
         outputs: size of what it returns, by default `state_size`.
-        activation: of the hidden units: "relu" (paper), "softplus", "tanh" or "silu". Solvers of optimal control
-            problems want one with continuous derivatives; see `smoothed` for a network that has ReLU.
+        activation: of the hidden units: "relu" (paper), "softplus", "tanh" or "silu"; see `smoothed`.
 
     Raises:
         ValueError: another norm or activation, sizes that are no positive integers, or no random key.
     """
-    for name, chosen, known in (("norm", norm, tuple(NORMS)), ("activation", activation, tuple(ACTIVATIONS))):
+    for name, chosen, known in (("norm", norm, NORMS), ("activation", activation, tuple(ACTIVATIONS))):
         if chosen not in known:  # it may not be hashable
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {checks.short_repr(chosen)}")
     outputs = state_size if outputs is None else outputs
@@ -218,27 +242,19 @@ def residual_network(
 @eqx.filter_jit
 def _weights(key: PRNGKeyArray, fan_in: int, hidden: int, outputs: int, norm: str):
     """W₁, the normalisation, W₂ and b₂."""
+
+    def uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
+        return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0) / fan_in**0.5
+
     key_in, key_out, key_bias = jax.random.split(key, 3)
-    return (
-        _uniform(key_in, (hidden, fan_in), fan_in),
-        NORMS[norm](hidden, _uniform(jax.random.fold_in(key, 3), (hidden,), fan_in)),
-        _uniform(key_out, (outputs, hidden), hidden),
-        _uniform(key_bias, (outputs,), hidden),
-    )
-
-
-# Name → the normalisation of some hidden units, from the bias of a plain linear layer.
-NORMS: dict[str, Callable[[int, Array], AbstractNorm]] = {
-    "batch": lambda h, bias: BatchNorm(
-        gain=jnp.ones(h), shift=jnp.zeros(h), running=RunningStats(jnp.zeros(h), jnp.ones(h))
-    ),
-    "layer": lambda h, bias: LayerNorm(jnp.ones(h), jnp.zeros(h)),
-    "none": lambda h, bias: Bias(bias),
-}
-
-
-def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
-    return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0) / fan_in**0.5
+    ones, zeros = jnp.ones(hidden), jnp.zeros(hidden)
+    norms: dict[str, Callable[[], AbstractNorm]] = {
+        "batch": lambda: BatchNorm(ones, zeros, RunningStats(zeros, ones)),
+        "layer": lambda: LayerNorm(ones, zeros),
+        "none": lambda: Bias(uniform(jax.random.fold_in(key, 3), (hidden,), fan_in)),
+    }
+    weight_out, bias_out = uniform(key_out, (outputs, hidden), hidden), uniform(key_bias, (outputs,), hidden)
+    return uniform(key_in, (hidden, fan_in), fan_in), norms[norm](), weight_out, bias_out
 
 
 def zero_output(field: AbstractVectorField) -> AbstractVectorField:
@@ -255,12 +271,10 @@ def zero_output(field: AbstractVectorField) -> AbstractVectorField:
         raise ValueError(f"field: there is no ResidualNetwork in {checks.short_repr(field)}")
 
     def zeroed(node):
-        match node:
-            case LinearSkip():
-                return LinearSkip(jnp.zeros_like(node.weight), zeroed(node.field))
-            case ResidualNetwork():
-                return eqx.tree_at(lambda n: (n.weight_out, n.bias_out), node, replace_fn=jnp.zeros_like)
-        return node
+        if isinstance(node, LinearSkip):
+            return LinearSkip(jnp.zeros_like(node.weight), zeroed(node.field))
+        layer = lambda network: (network.weight_out, network.bias_out)  # noqa: E731
+        return eqx.tree_at(layer, node, replace_fn=jnp.zeros_like) if has_outputs(node) else node
 
     return jax.tree.map(zeroed, field, is_leaf=has_outputs)
 
@@ -268,9 +282,8 @@ def zero_output(field: AbstractVectorField) -> AbstractVectorField:
 def smoothed(field: AbstractVectorField, beta: float) -> AbstractVectorField:
     """The field with `SmoothRelu` in the place of ReLU; other activations stay. ValueError unless β > 0.
 
-    Solvers of optimal control problems that use second derivatives need this: those of ReLU are zero but for its kink.
-    ReLU is found in networks of this library, and where a module holds `jax.nn.relu` as a field, as Equinox' MLP does;
-    not where the code of a module calls it.
+    Solvers that use second derivatives need this: those of ReLU are zero but for its kink. It is found in networks of
+    this library, and where a module holds `jax.nn.relu` as a field, as Equinox' MLP does.
 
     Args:
         field: the field whose networks are changed.
@@ -278,12 +291,10 @@ def smoothed(field: AbstractVectorField, beta: float) -> AbstractVectorField:
     """
     smooth = SmoothRelu(beta)
 
-    def is_network(node) -> bool:
-        return isinstance(node, ResidualNetwork | FusedNetwork)
+    def has_relu(node) -> bool:
+        return isinstance(node, ResidualNetwork | FusedNetwork) and node.activation == "relu"
 
     def changed(node):
-        if is_network(node):
-            return replace(node, activation=smooth) if node.activation == "relu" else node
-        return smooth if node is jax.nn.relu else node
+        return replace(node, activation=smooth) if has_relu(node) else smooth if node is jax.nn.relu else node
 
-    return jax.tree.map(changed, field, is_leaf=is_network)
+    return jax.tree.map(changed, field, is_leaf=has_relu)

@@ -1,8 +1,4 @@
-"""Scaling of what a network reads and returns, and normalisation of its hidden units before the activation.
-
-Batch normalisation (paper, App. A.1), layer normalisation, or a bias: with the last two a network is the same map in
-training and in inference.
-"""
+"""Scaling of what a network reads and returns, and normalisation of its hidden units before the activation."""
 
 from abc import abstractmethod
 from functools import reduce
@@ -15,8 +11,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import AbstractBatchNorm, Moments, RunningStats, expand_trailing, record_moments
-from hybrid_jax.networks.activations import Activation
-from hybrid_jax.networks.normalised_layer import normalised_layer, row_means
+from hybrid_jax.networks.normalised_layer import Activation, normalised_layer, row_means
 from hybrid_jax.trajectories import Trajectories
 
 UNROLLED_INPUTS = 2  # up to this many, W z is a sum: on a CPU, to call a matrix product costs more

@@ -1,31 +1,31 @@
 """Batch normalisation in training mode with the layers around it, and its derivative written out."""
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.networks.activations import Activation
+Activation = Callable[[Float[Array, " h *b"]], Float[Array, " h *b"]]
 
 
 def normalised_layer(
     epsilon: float, activation: Activation, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]
 ) -> Float[Array, "d b"]:
-    """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z."""
+    """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
+
+    The derivative is written out because XLA turns the sums over a minibatch that autodiff asks for into scalar loops
+    on a CPU; as products with a vector of ones they halve the time of a training step. A test compares the two.
+    """
     arrays = weight_in, gain, shift, weight_out, bias_out, z
     precision = jnp.result_type(*arrays)  # each derivative is returned in the precision of its array
     return _layer(epsilon, activation, *(array.astype(precision) for array in arrays))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _layer(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
-    """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
-
-    The derivative is written out because XLA turns the sums over a minibatch that autodiff asks for into scalar loops
-    on a CPU; as products with a vector of ones they halve the time of a training step. A test compares the two.
-    """
-    return _forward(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z)[0]
+def _layer(*arguments):
+    return _forward(*arguments)[0]
 
 
 def _forward(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z):

@@ -57,13 +57,12 @@ def with_motion(field: AbstractVectorField, windows: Trajectories) -> AbstractVe
         return field
     kept = [jax.tree.map(partial(jnp.asarray, dtype=n.weight_in.dtype), windows[places]) for n in networks]
     scalings = [replace(network.scaling, learned_from=own) for network, own in zip(networks, kept, strict=True)]
-    return eqx.tree_at(_all_scalings, field, scalings)
+    return eqx.tree_at(_scalings, field, scalings)
 
 
 def motion_of(field: AbstractVectorField) -> Trajectories | None:
     """Some of the windows that a field was trained on, see `with_motion`; None if it does not hold any."""
-    scalings = (network.scaling for network in _networks(field))
-    return next((one.learned_from for one in scalings if one.learned_from is not None), None)
+    return next((one.learned_from for one in _scalings(field) if one.learned_from is not None), None)
 
 
 def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
@@ -77,23 +76,30 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
         field: a field that contains networks; one without is returned as it is.
         windows: those that the field is to be trained on.
     """
-    if not (networks := _unset(field)):
+    networks = _networks(field)
+    unset = [eqx.tree_equal(network.scaling, ChannelScaling()) for network in networks]
+    if not any(unset):
         return field
     x0, u, after = (np.asarray(part) for part in (windows.x0, windows.u, windows.x))
     before = np.concatenate([x0[:, None], after[:, :-1]], axis=1)
-    every = -(-before.shape[0] * before.shape[1] // max(1, SAMPLES * SMALL // max(SMALL, before.shape[2])))
     samples = before.shape[0] * before.shape[1]
+    every = -(-samples // max(1, SAMPLES * SMALL // max(SMALL, before.shape[2])))
     x, u, after = (rows.reshape(samples, rows.shape[-1])[::every] for rows in (before, u, after))  # u may be empty
-    zeros = [jnp.zeros(network.weight_in.shape[1], jnp.result_type(x)) for network in networks]
-    probed = unfreeze(eqx.tree_at(_scalings, field, [_Probe(RunningStats(zero, zero)) for zero in zeros]))
+    zeros = (jnp.zeros(network.weight_in.shape[1], jnp.result_type(x)) for network in networks)
+    probes = [
+        _Probe(RunningStats(z, z)) if new else n.scaling for n, z, new in zip(networks, zeros, unset, strict=True)
+    ]
+    probed = unfreeze(eqx.tree_at(_scalings, field, probes))
 
     predicted = np.asarray(rollout_batch(probed, x, u[:, None], windows.dt))[:, 0]
     lacking, rate = (np.sqrt(np.mean(np.square(after - start), axis=0)) / windows.dt for start in (predicted, x))
     grids = [node for node in jax.tree.leaves(field, is_leaf=_is_grid) if _is_grid(node)]
-
-    scalings = []
-    for network, moments in zip(networks, _seen(probed, x.T, u.T), strict=True):
-        count, *sums = np.asarray(moments)
+    seen, scalings = iter(_seen(probed, x.T, u.T)), []
+    for network, new in zip(networks, unset, strict=True):
+        if not new:
+            scalings.append(network.scaling)
+            continue
+        count, *sums = np.asarray(next(seen))
         mean, variance = (part / np.maximum(count, 1) for part in sums)
         scale = _positive(np.sqrt(variance), FLOOR * np.abs(mean))
         scalings.append(ChannelScaling(tuple(mean.tolist()), scale, _output(network, grids, lacking, rate)))
@@ -120,17 +126,14 @@ def _output(network: ResidualNetwork, grids: list[GridNetwork], lacking, rate) -
     return _positive(missing, FLOOR * whole)
 
 
+def _positive(scale: Float[np.ndarray, " d"], floor: Float[np.ndarray, " d"]) -> Channels:
+    """The scale of each channel, no less than its floor; 1 where both are zero or the scale is not finite."""
+    scale = np.maximum(scale, floor)
+    return tuple(np.where(np.isfinite(scale) & (scale > 0), scale, 1.0).tolist())
+
+
 def _is_grid(node) -> bool:
     return isinstance(node, GridNetwork)
-
-
-def _unset(field: AbstractVectorField) -> list[ResidualNetwork]:
-    """The networks whose `ChannelScaling` is not set yet."""
-    return [network for network in _networks(field) if eqx.tree_equal(network.scaling, ChannelScaling())]
-
-
-def _all_scalings(field: AbstractVectorField) -> list[AbstractScaling]:
-    return [network.scaling for network in _networks(field)]
 
 
 def _networks(field: AbstractVectorField) -> list[ResidualNetwork]:
@@ -139,10 +142,4 @@ def _networks(field: AbstractVectorField) -> list[ResidualNetwork]:
 
 
 def _scalings(field: AbstractVectorField) -> list[AbstractScaling]:
-    return [network.scaling for network in _unset(field)]
-
-
-def _positive(scale: Float[np.ndarray, " d"], floor: Float[np.ndarray, " d"]) -> Channels:
-    """The scale of each channel, no less than its floor; 1 where both are zero or the scale is not finite."""
-    scale = np.maximum(scale, floor)
-    return tuple(np.where(np.isfinite(scale) & (scale > 0), scale, 1.0).tolist())
+    return [network.scaling for network in _networks(field)]

@@ -1,120 +1,127 @@
-"""Views restrict what a multirotor's residual reads of the state and which derivatives it returns.
-
-Views nest: the outer one selects the inputs, the inner one the outputs. Derivatives that a network does not return are
-those of the physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact for a true state, but not for estimates (see `Motion`).
-"""
+"""`make_residual`: a residual network that reads and returns part of a multirotor's state, chosen by name."""
 
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks, rotation
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns
-from hybrid_jax.dynamics.composition import AbstractWrapper
+from hybrid_jax.dynamics.composition import AbstractWrapper, Hybrid
 from hybrid_jax.dynamics.equations import dot
+from hybrid_jax.networks.mlp import LinearSkip, residual_network, zero_output
+from hybrid_jax.networks.normalisation import AbstractScaling
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
+# Name → how many numbers the network reads besides u (and one of each rotor near the ground), or returns.
+INPUTS = {"all": STATE_SIZE, "no_xy": STATE_SIZE - 2, "no_xy_yaw": 10, "near_ground": 10, "body": 10, "body_motion": 9}
+OUTPUTS = {"all": STATE_SIZE, "accelerations": 6, "rotors": 6, "angular_acceleration": 3, "motion": 12}
+FROM_THE_BODY, OF_ROTORS = ("body", "body_motion"), ("near_ground", "rotors")
+GO_WITH = {"motion": FROM_THE_BODY}  # outputs → the inputs that they go with, where these are not all
 
-class AbstractView(AbstractWrapper):
-    """A wrapper whose state and input are a multirotor's (state.py)."""
+
+def _check(inputs: str, outputs: str, vehicle: Vehicle | None) -> None:
+    for name, value, known in (("inputs", inputs, INPUTS), ("outputs", outputs, OUTPUTS)):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    if inputs not in (needed := GO_WITH.get(outputs, tuple(INPUTS))):
+        raise ValueError(f"outputs {outputs!r} needs inputs of {' or '.join(needed)}, got {inputs!r}")
+    if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
+        raise ValueError(f"{needing[0]!r} needs the vehicle whose rotors feel the ground, got None")
+    if vehicle is not None and inputs == "near_ground":
+        checks.positive("vehicle.rotor_radius", vehicle.rotor_radius)
+
+
+class View(AbstractWrapper):
+    """The field inside reads some features of a multirotor's state and returns some derivatives; see `make_residual`.
+
+    Derivatives that it does not return are zero, and so those of the physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact for
+    a true state, but not for estimates. Seen from the body it returns ṗ and v̇ in the body frame and q̇ as the
+    quaternion r of q̇ = q ⊗ r, so that the whole is equivariant to translation in x and y and to yaw.
+    """
+
+    inputs: str = eqx.field(static=True, default="all")
+    outputs: str = eqx.field(static=True, default="all")
+    vehicle: Vehicle | None = eqx.field(static=True, default=None)
 
     state_size: ClassVar[int] = STATE_SIZE
-    input_size: ClassVar[int] = INPUT_SIZE
-
-
-class DropXY(AbstractView):
-    """Invariant to p_x and p_y: the field inside reads [p_z, q, v, ω] (11)."""
-
-    def read(self, x):
-        return x[2:]
-
-
-class DropXYYaw(AbstractView):
-    """Without p_x, p_y and yaw, but in world axes, in which a wind keeps its direction when the vehicle yaws.
-
-    The field inside reads p_z [m], the world's up in the body frame Rᵀe_z (3), the velocity [m/s, world] and the body
-    rates [rad/s] (10), and returns ẋ.
-    """
-
-    def read(self, x):
-        return jnp.concatenate([x[2:3], _up(x), x[VELOCITY], x[BODY_RATES]])
-
-
-class GroundDistance(AbstractView):
-    """`DropXYYaw` with the distance to the ground: after p_z the field inside reads R / h of each rotor (14).
-
-    The ground effect on a rotor is nearly linear in its radius R over its altitude h (Cheeseman and Bennett 1955). As a
-    function of p_z it is steep and depends on the tilt.
-
-    Raises:
-        ValueError: the rotor radius of `vehicle` is unknown.
-    """
-
-    vehicle: Vehicle = eqx.field(static=True)
+    input_size = property(lambda self: INPUT_SIZE if self.vehicle is None else self.vehicle.rotors)
 
     def __check_init__(self):
-        checks.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
+        _check(self.inputs, self.outputs, self.vehicle)
 
     def read(self, x):
-        up = _up(x)
-        return jnp.concatenate([x[2:3], _nearness(x, up, self.vehicle), up, x[VELOCITY], x[BODY_RATES]])
-
-
-class AbstractBodyView(AbstractView):
-    """Equivariant to translation in x and y and to yaw: inputs and outputs are in the body frame.
-
-    The field inside returns ṗ and v̇ in the body frame, q̇ as the quaternion r of q̇ = q ⊗ r, and ω̇.
-    """
+        if self.inputs in ("all", "no_xy"):
+            return x if self.inputs == "all" else x[2:]
+        up, height, rates = _up(x), x[2:3], x[BODY_RATES]
+        if self.inputs not in FROM_THE_BODY:
+            near = [_nearness(x, self.vehicle)] if self.inputs == "near_ground" and self.vehicle else []
+            return jnp.concatenate([height, *near, up, x[VELOCITY], rates])
+        velocity = rotation.rotate(rotation.conjugate(x[QUATERNION]), x[VELOCITY])
+        return jnp.concatenate([height, -up, velocity, rates] if self.inputs == "body" else [velocity, rates, up])
 
     def write(self, x, inside):
+        zeros = jnp.zeros((STATE_SIZE - len(inside), *inside.shape[1:]), inside.dtype)
+        if self.outputs == "motion":  # r = ½ [0, δω], so that |q| stays 1
+            inside = jnp.concatenate([inside[:3], zeros, inside[3:6] / 2, inside[6:]])
+        else:
+            inside = jnp.concatenate([zeros, inside]) if len(zeros) else inside
+        if self.inputs not in FROM_THE_BODY:
+            return inside
         q = x[QUATERNION]
         position, velocity = rotation.rotate(q, inside[POSITION]), rotation.rotate(q, inside[VELOCITY])
         return jnp.concatenate([position, rotation.multiply(q, inside[QUATERNION]), velocity, inside[BODY_RATES]])
 
 
-class BodyFrame(AbstractBodyView):
-    """The field inside reads p_z [m], the direction of gravity (3), the velocity [m/s] and the body rates [rad/s] (10).
+def make_residual(
+    key: PRNGKeyArray,
+    *,
+    inputs: str = "all",
+    outputs: str = "all",
+    hidden: int = 64,
+    norm: str = "batch",
+    activation: str = "relu",
+    scaling: AbstractScaling | None = None,
+    linear: bool = False,
+    vehicle: Vehicle | None = None,
+) -> AbstractVectorField:
+    """A residual network that reads and returns part of a multirotor's state; by default all of it (paper).
 
-    See `AbstractBodyView`.
+    Args:
+        inputs: what it reads besides u. "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw": p_z, the world's up in
+            the body frame Rᵀe_z, v and ω, in world axes, in which a wind keeps its direction when the vehicle yaws;
+            "near_ground", that and R / h of each rotor after p_z, in which ground effect is nearly linear (Cheeseman
+            and Bennett 1955); "body": p_z, the direction of gravity and Rᵀv [m/s] in the body frame, and ω;
+            "body_motion", Rᵀv, ω and Rᵀe_z, without the height, for flight away from the ground.
+        outputs: "all" 13 derivatives; "accelerations", v̇ and ω̇; "rotors", these and the thrust of each rotor by a
+            second network (`RotorThrust`), which starts at zero; "angular_acceleration", ω̇ alone; "motion",
+            corrections of ṗ, of the body rates in q̇, of v̇ and of ω̇, in the body frame.
+        hidden: units of each network.
+        norm: as in `residual_network`.
+        activation: as in `residual_network`.
+        scaling: as in `residual_network`.
+        linear: add a linear skip connection (`LinearSkip`); the output then starts at zero.
+        vehicle: gives the number of rotors, by default four; needed by "near_ground" and "rotors".
+
+    Raises:
+        ValueError: an unknown name, outputs that do not go with the inputs (see `GO_WITH`), or no vehicle, or none of
+            known rotor radius, where one is needed.
     """
-
-    def read(self, x):
-        to_body = rotation.conjugate(x[QUATERNION])
-        gravity = -rotation.body_z(to_body)
-        return jnp.concatenate([x[2:3], gravity, rotation.rotate(to_body, x[VELOCITY]), x[BODY_RATES]])
-
-
-class BodyMotion(AbstractBodyView):
-    """`BodyFrame` without the height, for flight away from the ground.
-
-    The field inside reads the velocity Rᵀv [m/s], the body rates [rad/s] and the world's up Rᵀe_z (9).
-    """
-
-    def read(self, x):
-        to_body = rotation.conjugate(x[QUATERNION])
-        return jnp.concatenate([rotation.rotate(to_body, x[VELOCITY]), x[BODY_RATES], rotation.body_z(to_body)])
-
-
-class Accelerations(AbstractView):
-    """The field inside returns v̇ and ω̇ (6), or ω̇ alone (3); the derivatives before them are exactly zero."""
-
-    def write(self, x, inside):
-        return jnp.concatenate([jnp.zeros((STATE_SIZE - len(inside), *inside.shape[1:]), inside.dtype), inside])
-
-
-class Motion(AbstractView):
-    """The field inside returns corrections of ṗ, of the body rates in q̇, of v̇ and of ω̇ (12), in the body frame.
-
-    To be used inside a view that maps to the world frame: there r = ½ [0, δω], so that |q| stays 1.
-    """
-
-    def write(self, x, inside):
-        turning = jnp.concatenate([jnp.zeros((1, *inside.shape[1:]), inside.dtype), inside[3:6] / 2])
-        return jnp.concatenate([inside[:3], turning, inside[6:]])
+    _check(inputs, outputs, vehicle)
+    rotors = INPUT_SIZE if vehicle is None else vehicle.rotors
+    reads, writes = INPUTS[inputs] + rotors * (inputs == "near_ground"), OUTPUTS[outputs]
+    options: dict = {"hidden": hidden, "scaling": scaling, "activation": activation}
+    network = residual_network(reads, rotors, key, norm=norm, outputs=writes, **options)
+    field = zero_output(LinearSkip(jnp.zeros((writes, reads + rotors)), network)) if linear else network
+    if (inputs, outputs) != ("all", "all"):
+        field = View(field, inputs, outputs, vehicle)
+    if vehicle is None or outputs != "rotors":
+        return field
+    thrust = residual_network(1, 1, jax.random.fold_in(key, 1), norm="none", **options)
+    return Hybrid(zero_output(RotorThrust(thrust, vehicle)), field)
 
 
 class RotorThrust(AbstractVectorField):
@@ -156,7 +163,7 @@ class RotorThrust(AbstractVectorField):
 
     def read(self, x: Float[Array, " 13 *b"]) -> Float[Array, " rotors *b"]:
         """R / h of each rotor."""
-        return _nearness(x, _up(x), self.vehicle)
+        return _nearness(x, self.vehicle)
 
     def share(self, near: Float[Array, " rotors *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " rotors *b"]:
         """f of each rotor.
@@ -188,8 +195,8 @@ def _up(x: Float[Array, " 13 *b"]) -> Float[Array, " 3 *b"]:
     return rotation.body_z(rotation.conjugate(x[QUATERNION]))
 
 
-def _nearness(x: Float[Array, " 13 *b"], up: Float[Array, " 3 *b"], vehicle: Vehicle) -> Float[Array, " rotors *b"]:
+def _nearness(x: Float[Array, " 13 *b"], vehicle: Vehicle) -> Float[Array, " rotors *b"]:
     """R / h of each rotor, its altitude h at least R / 2."""
-    altitude = x[2]
-    heights = jnp.stack([altitude + along * up[0] + across * up[1] for along, across in vehicle.rotor_positions])
+    up = _up(x)
+    heights = jnp.stack([x[2] + along * up[0] + across * up[1] for along, across in vehicle.rotor_positions])
     return vehicle.rotor_radius / jnp.maximum(heights, vehicle.rotor_radius / 2)

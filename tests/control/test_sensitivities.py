@@ -14,8 +14,8 @@ from hybrid_jax.control.rotor_lag import stage_shares, step_of
 from hybrid_jax.control.sensitivities import advance_lagged, advance_with_jacobian, condensed
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
+from hybrid_jax.networks.views import make_residual
 
 DT = 0.05
 SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)

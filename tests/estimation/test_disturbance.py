@@ -18,7 +18,7 @@ from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.normal_equations import left_out, normal_equations
 from hybrid_jax.estimation.uncertainty import select_disturbance
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.networks.factory import make_residual
+from hybrid_jax.networks.views import make_residual
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.sweep.lanes import stack
 

@@ -24,9 +24,9 @@ from experiments.flying.timing import on_one_core
 from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
 from hybrid_jax.control import Controller, Hardware, fly, performance, sample
-from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.networks.normalisation import BatchNorm
+from hybrid_jax.networks.views import make_residual
 from hybrid_jax.runtime import cores
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 

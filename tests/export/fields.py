@@ -15,8 +15,8 @@ from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.composition import Blend, Frozen, Hybrid
 from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, Terms
-from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
+from hybrid_jax.networks.views import make_residual
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
 

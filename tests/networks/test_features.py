@@ -13,10 +13,9 @@ from evaluations import train_batch
 from hybrid_jax import Hybrid, load, residual_network, rigid_body, rotation, save
 from hybrid_jax.dynamics import base
 from hybrid_jax.dynamics.composition import Frozen
-from hybrid_jax.networks import factory, views
-from hybrid_jax.networks.factory import make_residual
+from hybrid_jax.networks import views
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.networks.views import BodyFrame, BodyMotion
+from hybrid_jax.networks.views import View, make_residual
 from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
@@ -26,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-o
 KEY = jax.random.key(0)
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
 VIEWS = [pair for pair in PAIRS if pair[1] != "rotors"]  # see test_rotors
-FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in factory.FROM_THE_BODY]
+FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in views.FROM_THE_BODY]
 
 
 def view(inputs="all", outputs="all", **options):
@@ -53,7 +52,7 @@ def turned(x, yaw):
 
 
 def network_of(field):
-    return field if not isinstance(field, views.AbstractView) else network_of(field.field)
+    return field if not isinstance(field, views.View) else network_of(field.field)
 
 
 @pytest.mark.parametrize("norm", ["batch", "layer", "none"])
@@ -132,12 +131,12 @@ def test_the_body_s_view_of_a_state():
     q = rotation.from_axis_angle(jnp.array([0.0, 1.0, 0.0]), jnp.asarray(np.pi / 2))
     x = jnp.concatenate([jnp.array([5.0, 6.0, 7.0]), q, jnp.array([2.0, 3.0, 0.0]), jnp.array([0.1, 0.2, 0.3])])
     expected = [7, 1, 0, 0, 0, 3, 2, 0.1, 0.2, 0.3]
-    np.testing.assert_allclose(BodyFrame(rigid_body(IRIS)).read(x), expected, atol=1e-12)
+    np.testing.assert_allclose(View(rigid_body(IRIS), "body").read(x), expected, atol=1e-12)
     motion = [0, 3, 2, 0.1, 0.2, 0.3, -1, 0, 0]
-    np.testing.assert_allclose(BodyMotion(rigid_body(IRIS)).read(x), motion, atol=1e-12)
+    np.testing.assert_allclose(View(rigid_body(IRIS), "body_motion").read(x), motion, atol=1e-12)
 
 
-@pytest.mark.parametrize("inputs", factory.FROM_THE_BODY)
+@pytest.mark.parametrize("inputs", views.FROM_THE_BODY)
 def test_a_correction_of_the_motion_keeps_the_attitude_a_rotation(inputs):
     field, (x, u) = view(inputs, "motion"), samples()
     derivative = deployed(field, x, u)
@@ -173,7 +172,7 @@ def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
 
 
 @pytest.mark.parametrize(("outputs", "written"), [("accelerations", 6), ("angular_acceleration", 3)])
-@pytest.mark.parametrize("inputs", factory.INPUTS)
+@pytest.mark.parametrize("inputs", views.INPUTS)
 def test_what_accelerations_do_not_write_is_left_to_physics(inputs, outputs, written):
     field, (x, u) = view(inputs, outputs), samples()
     for evaluate in (deployed, train_batch):
@@ -193,7 +192,7 @@ class Kinetic(base.AbstractVectorField):
 
 
 def test_isotropic_drag_is_the_same_seen_from_the_body():
-    field, (x, u) = BodyFrame(Kinetic(jnp.asarray(0.4))), samples()
+    field, (x, u) = View(Kinetic(jnp.asarray(0.4)), "body"), samples()
     derivative = deployed(field, x, u)
     np.testing.assert_allclose(derivative[VELOCITY], -0.4 * x[VELOCITY], atol=1e-12)
     assert (derivative[:7] == 0).all()
@@ -206,7 +205,7 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     assert jnp.abs(trained - deployed(field, x, u)).max() > 1e-2
 
     def seen(node, x):
-        return seen(node.field, node.read(x)) if isinstance(node, views.AbstractView) else x
+        return seen(node.field, node.read(x)) if isinstance(node, views.View) else x
 
     network = network_of(field)
     hidden = network.weight_in @ network.inputs(seen(field, x), u)

@@ -13,13 +13,13 @@ from evaluations import infer_batch, train_batch
 from hybrid_jax import load, save
 from hybrid_jax.dynamics import base
 from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.networks.activations import SmoothRelu
 from hybrid_jax.networks.mlp import (
     FusedNetwork,
     InputScaling,
     LinearResidual,
     LinearSkip,
     ResidualNetwork,
+    SmoothRelu,
     residual_network,
     smoothed,
 )

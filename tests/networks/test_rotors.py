@@ -12,11 +12,10 @@ from hybrid_jax import load, rotation, save
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.networks.factory import INPUTS, make_residual
 from hybrid_jax.networks.mlp import InputScaling, ResidualNetwork, residual_network
 from hybrid_jax.networks.normalisation import ChannelScaling
 from hybrid_jax.networks.standardise import with_scaling
-from hybrid_jax.networks.views import RotorThrust
+from hybrid_jax.networks.views import INPUTS, RotorThrust, make_residual
 from hybrid_jax.sim.forces import ground_effect, parameters_of
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.trajectories import Trajectories
