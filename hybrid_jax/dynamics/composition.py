@@ -1,7 +1,8 @@
 """Fields made of fields: physics plus a residual, the mean of models, a view of the state, a frozen field."""
 
+from abc import abstractmethod
 from collections.abc import Iterable
-from typing import ClassVar
+from typing import Self
 
 import equinox as eqx
 import jax
@@ -13,7 +14,63 @@ from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns,
 from hybrid_jax.dynamics.batching import AbstractInferenceOnly, batch_norms, moments_of
 
 
-class Hybrid(AbstractVectorField):
+class AbstractComposite(AbstractVectorField):
+    """ẋ = write(x, f₁(read(x), u), f₂(read(x), u), …) for the fields inside."""
+
+    @property
+    @abstractmethod
+    def inside(self) -> tuple[AbstractVectorField, ...]:
+        """The fields inside, f₁, f₂, …"""
+
+    def read(self, x: Float[Array, " d *b"]) -> Float[Array, " n *b"]:
+        """The features of the state that the fields inside read; by default all."""
+        return x
+
+    @abstractmethod
+    def write(self, x: Float[Array, " d *b"], *inside: Float[Array, " n *b"]) -> Float[Array, " d *b"]:
+        """ẋ from what the fields inside returned.
+
+        Args:
+            inside: what each field inside returned (n).
+        """
+
+    @property
+    def _parts(self) -> list[AbstractVectorField]:
+        return [as_field(field) for field in self.inside]
+
+    def _moved(self, fields: Iterable[AbstractVectorField]) -> Self:
+        return eqx.tree_at(lambda composite: composite.inside, self, tuple(fields))
+
+    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
+        seen = self.read(x)
+        return self.write(x, *(field(seen, u) for field in self.inside))
+
+    def train_batch(self, x, u):
+        seen = self.read(x)
+        return self.write(x, *(field.train_batch(seen, u) for field in self._parts))
+
+    def infer_batch(self, x, u):
+        seen = self.read(x)
+        return self.write(x, *(field.infer_batch(seen, u) for field in self._parts))
+
+    def update_running_stats(self, x, u):
+        seen = self.read(x)
+        return self._moved(field.update_running_stats(seen, u) for field in self._parts)
+
+    def linearize(self, x, u, dx, du):
+        seen, d_seen = jvp_columns(self.read, (x,), (dx,))
+        values, columns = zip(*(field.linearize(seen, u, d_seen, du) for field in self._parts), strict=True)
+        return jvp_columns(self.write, (x, *values), (dx, *columns))
+
+    def fuse_for_inference(self):
+        return self._moved(field.fuse_for_inference() for field in self._parts)
+
+    @property
+    def features_first(self):
+        return any(field.features_first for field in self._parts)
+
+
+class Hybrid(AbstractComposite):
     """ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus what physics leaves out (paper, Eq. 4).
 
     Attributes:
@@ -25,51 +82,28 @@ class Hybrid(AbstractVectorField):
     residual: AbstractVectorField
 
     @property
-    def _parts(self) -> tuple[AbstractVectorField, AbstractVectorField]:
-        return as_field(self.physics), as_field(self.residual)
+    def inside(self) -> tuple[AbstractVectorField, AbstractVectorField]:
+        return self.physics, self.residual
 
-    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        slope, added = self.physics(x, u), self._parts[0].apply_residual(x, self.residual(x, u))
+    def write(self, x, *inside):
+        slope, added = inside[0], self.apply_residual(x, inside[1])
         if jnp.shape(added) != jnp.shape(slope):
             raise ValueError(f"the residual must return {jnp.shape(slope)}, as physics does, got {jnp.shape(added)}")
         return slope + added
 
-    def train_batch(self, x, u):
-        physics, residual = self._parts
-        return physics.train_batch(x, u) + physics.apply_residual(x, residual.train_batch(x, u))
-
-    def infer_batch(self, x, u):
-        physics, residual = self._parts
-        return physics.infer_batch(x, u) + physics.apply_residual(x, residual.infer_batch(x, u))
-
-    def update_running_stats(self, x, u):
-        return Hybrid(*(part.update_running_stats(x, u) for part in self._parts))
-
     def apply_residual(self, x, residual):
-        return self._parts[0].apply_residual(x, residual)
-
-    def linearize(self, x, u, dx, du):
-        physics, d_physics = self._parts[0].linearize(x, u, dx, du)
-        values, columns = zip((x, dx), self._parts[1].linearize(x, u, dx, du), strict=True)
-        added, d_added = jvp_columns(self.apply_residual, values, columns)
-        return physics + added, d_physics + d_added
+        return as_field(self.physics).apply_residual(x, residual)
 
     def parameter_columns(self, x, u):
-        value, columns = self.residual(x, u), self._parts[1].parameter_columns(x, u)
+        physics, residual = self._parts
+        value, columns = residual(x, u), residual.parameter_columns(x, u)
         moved = jvp_columns(lambda value: self.apply_residual(x, value), (value,), (columns,))[1]
         theta, at = ravel_learned(self.physics)
         mapped = jax.jacfwd(lambda theta: as_field(at(theta)).apply_residual(x, value))(theta)
-        return jnp.concatenate([self._parts[0].parameter_columns(x, u) + mapped, moved], axis=1)
-
-    @property
-    def features_first(self):
-        return any(part.features_first for part in self._parts)
-
-    def fuse_for_inference(self):
-        return Hybrid(*(part.fuse_for_inference() for part in self._parts))
+        return jnp.concatenate([physics.parameter_columns(x, u) + mapped, moved], axis=1)
 
 
-class Blend(AbstractVectorField):
+class Blend(AbstractComposite):
     """ẋ = the mean of several fields, such as models between which the data cannot decide.
 
     Attributes:
@@ -78,95 +112,42 @@ class Blend(AbstractVectorField):
 
     fields: tuple[AbstractVectorField, ...]
 
-    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        return self._mean(field(x, u) for field in self.fields)
+    @property
+    def inside(self) -> tuple[AbstractVectorField, ...]:
+        return self.fields
 
-    def train_batch(self, x, u):
-        return self._mean(as_field(field).train_batch(x, u) for field in self.fields)
-
-    def infer_batch(self, x, u):
-        return self._mean(as_field(field).infer_batch(x, u) for field in self.fields)
-
-    def update_running_stats(self, x, u):
-        return Blend(tuple(as_field(field).update_running_stats(x, u) for field in self.fields))
+    def write(self, x, *inside):
+        return sum(inside[1:], start=inside[0]) / len(inside)
 
     def apply_residual(self, x, residual):
-        return self._mean(as_field(field).apply_residual(x, residual) for field in self.fields)
-
-    def linearize(self, x, u, dx, du):
-        values, columns = zip(*(as_field(field).linearize(x, u, dx, du) for field in self.fields), strict=True)
-        return self._mean(values), self._mean(columns)
-
-    @property
-    def features_first(self):
-        return any(as_field(field).features_first for field in self.fields)
-
-    def fuse_for_inference(self):
-        return Blend(tuple(as_field(field).fuse_for_inference() for field in self.fields))
-
-    def _mean(self, parts: Iterable[Array]) -> Array:
-        first, *others = parts
-        return sum(others, start=first) / len(self.fields)
+        return self.write(x, *(field.apply_residual(x, residual) for field in self._parts))
 
 
-class AbstractWrapper(AbstractVectorField):
-    """ẋ = write(x, f(read(x), u)) for the field f inside.
+class AbstractWrapper(AbstractComposite):
+    """ẋ = write(x, f(read(x), u)) for one field f inside; each is the identity by default.
 
     Attributes:
         field: the field inside.
     """
 
-    accepts_batch: ClassVar[bool] = True
-
     field: AbstractVectorField
 
-    def read(self, x: Float[Array, " d *b"]) -> Float[Array, " n *b"]:
-        """The features of the state that the field inside reads; by default all."""
-        return x
+    @property
+    def inside(self) -> tuple[AbstractVectorField, ...]:
+        return (self.field,)
 
-    def write(self, x: Float[Array, " d *b"], inside: Float[Array, " n *b"]) -> Float[Array, " d *b"]:
-        """ẋ from what the field inside returned; by default the same.
-
-        Args:
-            inside: what the field inside returned (n).
-        """
+    def write(self, x, inside):
         return inside
-
-    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        return self.write(x, self.field(self.read(x), u))
-
-    def train_batch(self, x, u):
-        return self.write(x, as_field(self.field).train_batch(self.read(x), u))
-
-    def infer_batch(self, x, u):
-        return self.write(x, as_field(self.field).infer_batch(self.read(x), u))
-
-    def update_running_stats(self, x, u):
-        return eqx.tree_at(
-            lambda wrapper: wrapper.field, self, as_field(self.field).update_running_stats(self.read(x), u)
-        )
 
     def apply_residual(self, x, residual):
         return as_field(self.field).apply_residual(x, residual)
-
-    def linearize(self, x, u, dx, du):
-        features, d_features = jvp_columns(self.read, (x,), (dx,))
-        inside, d_inside = as_field(self.field).linearize(features, u, d_features, du)
-        return jvp_columns(self.write, (x, inside), (dx, d_inside))
-
-    def fuse_for_inference(self):
-        return eqx.tree_at(lambda wrapper: wrapper.field, self, as_field(self.field).fuse_for_inference())
 
 
 class Frozen(AbstractWrapper, AbstractInferenceOnly):
     """A field in inference mode that training does not change: neither parameters nor running statistics move."""
 
-    @property
-    def features_first(self):
-        return as_field(self.field).features_first
-
     def train_batch(self, x, u):
-        return as_field(self.field).infer_batch(x, u)
+        return self.infer_batch(x, u)
 
     def update_running_stats(self, x, u):
         return self

@@ -241,15 +241,13 @@ def residual_network(
 
 @eqx.filter_jit
 def _weights(key: PRNGKeyArray, fan_in: int, hidden: int, outputs: int, norm: str):
-    """W₁, the normalisation, W₂ and b₂."""
-
     def uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
         return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0) / fan_in**0.5
 
     key_in, key_out, key_bias = jax.random.split(key, 3)
     ones, zeros = jnp.ones(hidden), jnp.zeros(hidden)
     norms: dict[str, Callable[[], AbstractNorm]] = {
-        "batch": lambda: BatchNorm(ones, zeros, RunningStats(zeros, ones)),
+        "batch": lambda: BatchNorm(gain=ones, shift=zeros, running=RunningStats(zeros, ones)),
         "layer": lambda: LayerNorm(ones, zeros),
         "none": lambda: Bias(uniform(jax.random.fold_in(key, 3), (hidden,), fan_in)),
     }
@@ -273,8 +271,9 @@ def zero_output(field: AbstractVectorField) -> AbstractVectorField:
     def zeroed(node):
         if isinstance(node, LinearSkip):
             return LinearSkip(jnp.zeros_like(node.weight), zeroed(node.field))
-        layer = lambda network: (network.weight_out, network.bias_out)  # noqa: E731
-        return eqx.tree_at(layer, node, replace_fn=jnp.zeros_like) if has_outputs(node) else node
+        if not has_outputs(node):
+            return node
+        return eqx.tree_at(lambda network: (network.weight_out, network.bias_out), node, replace_fn=jnp.zeros_like)
 
     return jax.tree.map(zeroed, field, is_leaf=has_outputs)
 
