@@ -1,11 +1,4 @@
-"""Vector fields ẋ = f(x, u) and the physics of a multirotor.
-
-`base` defines the field and its operations, `batching` the training mode of a user's own field, `rigid_body` with
-`equations` and `terms` the equations of motion, `actuators` what is between command and rotor, `disturbance` a
-constant disturbance, `estimator` the protocol of what learns in flight, `baselines` reference models, and
-`vehicle_file` reads all of them from a TOML file. `outputs` says what is measured of a state, `hidden` has parts that
-no sensor shows. `grids` has quantities on a periodic grid in space, and diffusion.
-"""
+"""Vector fields ẋ = f(x, u): fields made of fields, the physics of a multirotor, grids, disturbances, hidden parts."""
 
 from hybrid_jax.dynamics.actuators import Actuated, Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
@@ -21,11 +14,9 @@ from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 
 __all__ = ["AbstractVectorField", "Blend", "Frozen", "FrozenRates", "HoldState", "Hybrid", "trainable", "unfreeze"]
-__all__ += ["Actuated", "Actuator", "actuated", "rotor_speeds"]
+__all__ += ["Actuated", "Actuator", "Diffusion", "Grid", "actuated", "check_grid", "diffusion", "rotor_speeds"]
 __all__ += ["AbstractEstimator", "ConstantDisturbance", "disturbed", "with_disturbance"]
-__all__ += ["Diffusion", "Grid", "check_grid", "diffusion"]
-__all__ += ["RigidBody", "Terms", "VehicleModel"]
-__all__ += ["load_vehicle_model", "perturbed", "rigid_body", "with_vehicle"]
+__all__ += ["RigidBody", "Terms", "VehicleModel", "load_vehicle_model", "perturbed", "rigid_body", "with_vehicle"]
 __all__ += [
     "Delay",
     "Lag",

@@ -21,7 +21,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.state_space import Quantity
-from hybrid_jax.vehicle import Vehicle, as_tuple, require_numbers
+from hybrid_jax.vehicle import as_tuple, require_numbers
 
 NAMES = ("curve", "time_constant", "time_constants", "voltage_exponent", "delay")  # of learnable parameters
 GIVES = ("speed", "thrust")
@@ -107,7 +107,7 @@ class Actuated(AbstractVectorField):
     def rotor_states(self) -> int:
         """How many states follow the 13 of the body."""
         lags = {"time_constant", "time_constants"} & self.deviations.keys() or self.actuator.time_constants[0]
-        return self._vehicle.rotors if lags else 0
+        return self.body.vehicle.rotors if lags else 0
 
     @property
     def state_space(self):
@@ -128,16 +128,12 @@ class Actuated(AbstractVectorField):
     @property
     def input_size(self) -> int:
         """How many numbers u has: a command for each rotor, and the voltage if it matters."""
-        return self._vehicle.rotors + self.reads_voltage
+        return self.body.vehicle.rotors + self.reads_voltage
 
     @property
     def reads_voltage(self) -> bool:
         """Whether the last input is the battery's voltage."""
         return self.actuator.nominal_voltage > 0
-
-    @property
-    def _vehicle(self) -> Vehicle:
-        return self.body.vehicle
 
     def theta(self) -> dict[str, Array]:
         """The learned parameters of the body and of the actuator, in SI units."""
@@ -168,7 +164,7 @@ class Actuated(AbstractVectorField):
 
     def steady_speeds(self, u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
         """w∞ [rad/s]: the speeds at which the rotors settle under commands and voltage."""
-        vehicle = self._vehicle
+        vehicle = self.body.vehicle
         commands = u[: vehicle.rotors]
         if self.reads_voltage:
             commands = commands * (u[vehicle.rotors] / self.actuator.nominal_voltage) ** self._value("voltage_exponent")
@@ -182,18 +178,12 @@ class Actuated(AbstractVectorField):
         """w [rad/s]: of the state, or at once those of the commands."""
         return x[STATE_SIZE:] if self.rotor_states else self.steady_speeds(u)
 
-    def accelerations(self, w: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
-        """ẇ [rad/s²].
-
-        Args:
-            w: speeds of the rotors now (n) [rad/s].
-        """
-        missing, (up, down) = self.steady_speeds(u) - w, self.time_constants()
-        return missing / jnp.where(missing > 0, up, down)
-
     def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         moved = self.body(x[:STATE_SIZE], self.speeds(x, u))
-        return jnp.concatenate([moved, self.accelerations(x[STATE_SIZE:], u)]) if self.rotor_states else moved
+        if not self.rotor_states:
+            return moved
+        missing, (up, down) = self.steady_speeds(u) - x[STATE_SIZE:], self.time_constants()
+        return jnp.concatenate([moved, missing / jnp.where(missing > 0, up, down)])
 
     def apply_residual(self, x, residual):
         changed = as_field(self.body).apply_residual(x[:STATE_SIZE], residual[:STATE_SIZE])

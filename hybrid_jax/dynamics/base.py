@@ -1,9 +1,4 @@
-"""Vector fields ẋ = f(x, u). Physics, a network, their sum and a user's own module are all vector fields.
-
-A field maps one state x (d,) and one input u (m,) to ẋ (d,). Any function or Equinox module of this signature will do.
-The methods of an `AbstractVectorField` evaluate it on a batch, features first: x (d, b), u (m, b). Their defaults serve
-code for one sample; a subclass overrides what it can do faster, and `as_field` gives them to any function.
-"""
+"""Vector fields ẋ = f(x, u) of one state x (d,) and one input u (m,): physics, a network, or any function."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -33,6 +28,9 @@ Columns = Float[Array, "d c"]  # derivatives of d numbers in c directions
 
 class AbstractVectorField(eqx.Module):
     """ẋ = f(x, u). Every inexact array inside is learned (see `trainable`).
+
+    Its methods evaluate it on a batch, features first: x (d, b), u (m, b). Their defaults serve code for one sample; a
+    subclass overrides what it can do faster, and `as_field` gives them to any function.
 
     Attributes:
         accepts_batch: whether `__call__` also accepts x (d, b) and u (m, b), for instance since it reads x[0], x[1], …
@@ -91,7 +89,8 @@ class AbstractVectorField(eqx.Module):
     @property
     def state_space(self) -> StateSpace:
         """What its state is: by default what the first field inside it says that knows, else nothing."""
-        return _space_inside(self)
+        spaces = (part.state_space for part in _fields_inside(self))
+        return next((space for space in spaces if space.quantities), StateSpace())
 
     @property
     def parameter_units(self) -> dict[str, str]:
@@ -109,11 +108,6 @@ def _fields_inside(tree) -> list[AbstractVectorField]:
     return [node for node in jax.tree.leaves(tree, is_leaf=is_inside) if is_inside(node)]
 
 
-def _space_inside(tree) -> StateSpace:
-    spaces = (part.state_space for part in _fields_inside(tree))
-    return next((space for space in spaces if space.quantities), StateSpace())
-
-
 def state_space(field: AbstractVectorField, d: int | None = None) -> StateSpace:
     """What a state is to a field, or to what is no `AbstractVectorField` but has one inside.
 
@@ -121,7 +115,7 @@ def state_space(field: AbstractVectorField, d: int | None = None) -> StateSpace:
         field: any field.
         d: how many numbers a state has: those of which the field says nothing are quantities of their own.
     """
-    own = field.state_space if isinstance(field, AbstractVectorField) else _space_inside(field)
+    own = as_field(field).state_space
     return own if d is None else own.padded(d)
 
 
@@ -148,17 +142,11 @@ def check_windows(field: AbstractVectorField, windows: Trajectories, name: str =
 
 def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectories:
     """As `check_windows`, without a look at the states."""
-    windows = _as_precise(field, windows)
+    double = any(eqx.is_inexact_array(leaf) and leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(field))
+    if double and windows.x0.dtype != jnp.float64:  # a step of the solver keeps a type
+        windows = replace(windows, **{part: getattr(windows, part).astype(jnp.float64) for part in ("x0", "u", "x")})
     x = state_space(field, windows.x0.shape[-1]).continuous(windows.x0, windows.x)
     return windows if x is windows.x else replace(windows, x=x)
-
-
-def _as_precise(field, windows: Trajectories) -> Trajectories:
-    """The windows in double precision if the field has a parameter that is, since a step of the solver keeps a type."""
-    double = any(eqx.is_inexact_array(leaf) and leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(field))
-    if not double or windows.x0.dtype == jnp.float64:
-        return windows
-    return replace(windows, **{name: getattr(windows, name).astype(jnp.float64) for name in ("x0", "u", "x")})
 
 
 class _Function(AbstractVectorField):

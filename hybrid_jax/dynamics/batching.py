@@ -1,8 +1,4 @@
-"""Evaluate a field that is written for one sample on a minibatch, and train the batch normalisation inside it.
-
-Under `jax.vmap` every `AbstractBatchNorm` is replaced by its training mode, which takes mean and variance over the
-named axis of that `vmap`. This works for any module around a network.
-"""
+"""A field that is written for one sample on a minibatch, with batch normalisation over the named axis of its `vmap`."""
 
 from abc import abstractmethod
 from typing import Self
@@ -71,9 +67,14 @@ def like(tree: PyTree, leader: Float[Array, "..."]) -> PyTree:
     return jax.tree.map(lambda leaf: jnp.where(number > 0, leaf, leaf), tree)
 
 
+def _unseen(tree: PyTree) -> list[Moments]:
+    shapes = (norm.running.mean for norm in batch_norms(tree))
+    return [jnp.zeros((3, *mean.shape), mean.dtype) for mean in shapes]
+
+
 def training_mode(tree: PyTree, seen: list[Moments] | None = None) -> PyTree:
     """The tree with each `AbstractBatchNorm` in training mode, for use inside `over_samples`."""
-    seen = [_nothing(norm) for norm in batch_norms(tree)] if seen is None else seen
+    seen = _unseen(tree) if seen is None else seen
     return _replaced(tree, [norm.training_mode(one) for norm, one in zip(batch_norms(tree), seen, strict=True)])
 
 
@@ -83,11 +84,7 @@ def moments_of(field, x, u) -> list[Moments]:
     The moments are the derivative with respect to an input that does nothing (`_record`): they add up through any jit,
     scan or vmap around the layer, where values stored during tracing would leak.
     """
-
-    def evaluate(seen):
-        return over_samples(training_mode(field, seen))(x, u)
-
-    slope, pullback = jax.vjp(evaluate, [_nothing(norm) for norm in batch_norms(field)])
+    slope, pullback = jax.vjp(lambda seen: over_samples(training_mode(field, seen))(x, u), _unseen(field))
     return pullback(jnp.zeros_like(slope))[0]
 
 
@@ -111,15 +108,15 @@ def record_moments(hidden: Float[Array, " h *a"], seen: Moments):
 
     Call inside `over_samples`. The mean is also over all axes of the sample but the first.
     """
-    mean, centred = _centred(hidden)
-    variance, _ = _centred(jnp.square(centred))
+
+    def centre(hidden):
+        mean = jax.lax.pmean(jnp.mean(hidden, axis=tuple(range(1, hidden.ndim))), SAMPLES)
+        return mean, hidden - expand_trailing(mean, hidden)
+
+    mean, centred = centre(hidden)
+    variance, _ = centre(jnp.square(centred))
     moments = jnp.stack([jnp.ones_like(mean), mean, variance]).astype(seen.dtype)
     return mean, _record(centred, seen, moments), variance
-
-
-def _centred(hidden):
-    mean = jax.lax.pmean(jnp.mean(hidden, axis=tuple(range(1, hidden.ndim))), SAMPLES)
-    return mean, hidden - expand_trailing(mean, hidden)
 
 
 @jax.custom_vjp
@@ -141,7 +138,3 @@ def _stops(node) -> bool:
 def _replaced(tree: PyTree, norms: list) -> PyTree:
     left = iter(norms)
     return jax.tree.map(lambda n: next(left) if isinstance(n, AbstractBatchNorm) else n, tree, is_leaf=_stops)
-
-
-def _nothing(norm: AbstractBatchNorm) -> Moments:
-    return jnp.zeros((3, *norm.running.mean.shape), norm.running.mean.dtype)

@@ -1,7 +1,4 @@
-"""A constant disturbance of the state derivative: steady wind, a load off centre, a biased actuator.
-
-Least squares finds it together with θ_p: `fit_least_squares(with_disturbance(hybrid), windows).field`.
-"""
+"""A constant disturbance of the state derivative: steady wind, a load off centre, a biased actuator."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -141,7 +138,9 @@ def disturbance_units(field: AbstractVectorField) -> dict[str, str]:
     space = state_space(field)
     if found.points > 1 or not space.size:
         return {f"disturbance[{i}]": "" for i in _indices(field, found)}
-    return {f"disturbance[{space.names[i]}]": _per_second(space.units[i]) for i in _indices(field, found)}
+    units = (f"{unit}²" if unit.endswith("/s") else f"{unit}/s" if unit else "" for unit in space.units)
+    named = dict(enumerate(zip(space.names, units, strict=True)))
+    return {f"disturbance[{name}]": unit for name, unit in map(named.__getitem__, _indices(field, found))}
 
 
 def _indices(field: AbstractVectorField, found: ConstantDisturbance) -> Sequence[int]:
@@ -150,10 +149,6 @@ def _indices(field: AbstractVectorField, found: ConstantDisturbance) -> Sequence
         return found.indices
     k = jnp.size(found.value)
     return range(k) if found.points > 1 else range(max(state_space(field).size, k))[-k:]
-
-
-def _per_second(unit: str) -> str:
-    return f"{unit}²" if unit.endswith("/s") else f"{unit}/s" if unit else ""
 
 
 def without_zeros(field: AbstractVectorField) -> AbstractVectorField:

@@ -1,7 +1,4 @@
-"""Equations of motion of a multirotor; see `rigid_body`.
-
-They take the entries of θ_p, x and u as separate arrays, which spares stacking and unstacking them.
-"""
+"""Equations of motion of a multirotor, in the entries of θ_p, x and u, which spares stacking them; see `rigid_body`."""
 
 from collections.abc import Callable
 from functools import partial
@@ -31,7 +28,10 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     force = _specific_force(constants, velocity, torque)
     faster = _velocity_error(constants, velocity, force)
     turning = rotation.derivative(q, omega)
-    torque = _with_aerodynamic_moments(constants, velocity, omega, torque)
+    if is_present(moment := constants["aerodynamic_moment"]):
+        torque = [part + dot(moment[3 * i : 3 * i + 3], velocity) for i, part in enumerate(torque)]
+    if is_present(damping := constants["rate_damping"]):
+        torque = [part - one * rate for part, one, rate in zip(torque, damping, omega, strict=True)]
     inertia = [constants[name][0] for name in ("Ix", "Iy", "Iz")]
     position = jnp.stack(v)
     if is_present(faster):
@@ -85,15 +85,6 @@ def _velocity_error(constants: Constants, velocity, force):
     return [x, y, z]
 
 
-def _with_aerodynamic_moments(constants: Constants, velocity, omega: Rows, torque):
-    moment, damping = constants["aerodynamic_moment"], constants["rate_damping"]
-    if is_present(moment):
-        torque = [part + dot(moment[3 * i : 3 * i + 3], velocity) for i, part in enumerate(torque)]
-    if is_present(damping):
-        torque = [part - one * rate for part, one, rate in zip(torque, damping, omega, strict=True)]
-    return torque
-
-
 def _euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
     """ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
     (ix, iy, iz), (tx, ty, tz), (wx, wy, wz) = inertia, torque, omega
@@ -126,10 +117,6 @@ def evaluate_columns(of_rows: Callable, theta: PyTree, x: Float[Array, "13 b"], 
     return of_rows(theta, tuple(x), tuple(u))
 
 
-def _columns_forward(of_rows, theta, x, u):
-    return of_rows(theta, tuple(x), tuple(u)), (theta, x, u)
-
-
 def _columns_backward(of_rows, saved, d_derivative: Float[Array, "13 b"]):
     theta, x, u = saved
     own = jax.tree.map(lambda parameter: jnp.broadcast_to(parameter, x.shape[1:]), theta)  # one for each column
@@ -140,4 +127,6 @@ def _columns_backward(of_rows, saved, d_derivative: Float[Array, "13 b"]):
     return jax.tree.unflatten(structure, leaves), jnp.stack(d_x), jnp.stack(d_u)
 
 
-evaluate_columns.defvjp(_columns_forward, _columns_backward)
+evaluate_columns.defvjp(
+    lambda of_rows, theta, x, u: (of_rows(theta, tuple(x), tuple(u)), (theta, x, u)), _columns_backward
+)

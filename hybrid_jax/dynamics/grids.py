@@ -1,7 +1,4 @@
-"""Fields on periodic grids: a state x of d numbers as `components` × grid points, its Laplacian, diffusion as physics.
-
-Central differences of second order; explicit steps are stable up to a bound, see `Grid.largest_step`.
-"""
+"""Fields on periodic grids: a state of `components` × grid points, its Laplacian, diffusion as physics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -85,7 +82,7 @@ class Grid:
         Args:
             fields: as `fields` returns them.
         """
-        padded = self.padded(fields, 1)
+        padded = self._padded(fields, 1)
         inside = {axis: slice(1, -1) for axis in self.axes}
 
         def moved(axis: int, to: slice):
@@ -93,24 +90,6 @@ class Grid:
 
         near = [moved(axis, to) for axis in self.axes for to in (slice(2, None), slice(None, -2))]
         return (sum(near[1:], near[0]) - len(near) * fields) / self.spacing**2
-
-    def padded(self, fields: Float[Array, " c *cells"], reach: int) -> Float[Array, " c *cells"]:
-        """With more points at each edge, those of the opposite edge.
-
-        Args:
-            fields: as `fields` returns them.
-            reach: how many more points at each edge.
-        """
-        return jnp.pad(fields, [(reach * (i in self.axes),) * 2 for i in range(fields.ndim)], mode="wrap")
-
-    def patches(self, fields: Float[Array, " c *cells"], kernel: int) -> Float[Array, " k *cells"]:
-        """At each point the values at its kernel × … × kernel neighbours, itself among them: c · kernelⁿ components.
-
-        Args:
-            fields: as `fields` returns them.
-            kernel: points along each side of the neighbourhood, an odd number.
-        """
-        return jnp.concatenate(self.moved(fields, kernel))
 
     def moved(self, fields: Float[Array, " c *cells"], kernel: int) -> list[Float[Array, " c *cells"]]:
         """The fields of each of the kernel × … × kernel neighbours, in row-major order of where these are.
@@ -121,9 +100,13 @@ class Grid:
         """
         if kernel == 1:
             return [fields]
-        padded, at = self.padded(fields, kernel // 2), product(range(kernel), repeat=len(self.shape))
+        padded, at = self._padded(fields, kernel // 2), product(range(kernel), repeat=len(self.shape))
         shifts = (tuple(slice(i, i + n) for i, n in zip(place, self.shape, strict=True)) for place in at)
         return [padded[(slice(None), *shift)] for shift in shifts]
+
+    def _padded(self, fields: Float[Array, " c *cells"], reach: int) -> Float[Array, " c *cells"]:
+        """With more points at each edge, those of the opposite edge."""
+        return jnp.pad(fields, [(reach * (i in self.axes),) * 2 for i in range(fields.ndim)], mode="wrap")
 
     def largest_step(self, diffusivity: float | Sequence[float] | np.ndarray | Array) -> float:
         """The longest step [s] for which RK4 is stable, by linear theory; infinite without diffusion.

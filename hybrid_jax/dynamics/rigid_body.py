@@ -1,6 +1,7 @@
 """f_p: the Newton–Euler equations of a multirotor, by default with unknown Ix, Iy and k (paper, Eq. 10)."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import equinox as eqx
@@ -209,36 +210,39 @@ def with_vehicle(field: RigidBody, vehicle: Vehicle) -> RigidBody:
         return jnp.log(value / middle) if name in LOGARITHMIC else (value - middle) / units[name]
 
     deviations = {name: deviation(name, value) for name, value in field.theta().items()}
-    return RigidBody(deviations, vehicle, field.terms, field.wrench)
+    return replace(field, deviations=deviations, vehicle=vehicle)
 
 
 def corrected(field: AbstractVectorField) -> AbstractVectorField:
     """The field with corrections of its rigid bodies that change nothing yet; itself if it has none, or has them."""
 
-    def larger(node):
-        if not _is_body(node) or node.deviations.keys() & CORRECTIONS:
-            return node
-        dtype = jnp.result_type(*jax.tree.leaves(node) or [float])
-        zero = {name: jnp.zeros(shape_of(node.vehicle, name), dtype) for name in CORRECTIONS}
-        return RigidBody(node.deviations | zero, node.vehicle, node.terms, node.wrench)
+    def larger(body: RigidBody) -> RigidBody:
+        if body.deviations.keys() & CORRECTIONS:
+            return body
+        dtype = jnp.result_type(*jax.tree.leaves(body) or [float])
+        zero = {name: jnp.zeros(shape_of(body.vehicle, name), dtype) for name in CORRECTIONS}
+        return replace(body, deviations=body.deviations | zero)
 
-    return jax.tree.map(larger, field, is_leaf=_is_body)
+    return _with_bodies(field, larger)
 
 
 def uncorrected(field: AbstractVectorField) -> AbstractVectorField:
     """The field without corrections of rigid bodies that are zero; outside of compiled code."""
 
-    def smaller(node):
-        if not _is_body(node) or any(np.any(node.deviations.get(name, 0)) for name in CORRECTIONS):
-            return node
-        kept = {name: value for name, value in node.deviations.items() if name not in CORRECTIONS}
-        return RigidBody(kept, node.vehicle, node.terms, node.wrench)
+    def smaller(body: RigidBody) -> RigidBody:
+        if any(np.any(body.deviations.get(name, 0)) for name in CORRECTIONS):
+            return body
+        kept = {name: value for name, value in body.deviations.items() if name not in CORRECTIONS}
+        return replace(body, deviations=kept)
 
-    return jax.tree.map(smaller, field, is_leaf=_is_body)
+    return _with_bodies(field, smaller)
 
 
-def _is_body(node) -> bool:
-    return isinstance(node, RigidBody)
+def _with_bodies(field: AbstractVectorField, change: Callable[[RigidBody], RigidBody]) -> AbstractVectorField:
+    def is_body(node) -> bool:
+        return isinstance(node, RigidBody)
+
+    return jax.tree.map(lambda node: change(node) if is_body(node) else node, field, is_leaf=is_body)
 
 
 def nominal(vehicle: Vehicle) -> dict[str, float]:

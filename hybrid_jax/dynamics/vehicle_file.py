@@ -94,14 +94,9 @@ def vehicle_model_of(tables: Mapping[str, Any], path: str | Path, variant: str |
         if not isinstance(actuator, dict):
             raise ValueError(f"{path}: actuator must be a table [actuator], got {checks.short_repr(actuator)}")
         parts["actuator"] = from_table(Actuator, actuator, f"{path}: [actuator]")
-    parts |= {"purpose": purpose_of(tables, path), "learn": tables.get("learn", LEARNED)}
+    purpose = tables.get("purpose", {})
+    if not isinstance(purpose, dict) or not all(isinstance(words, str) and words.strip() for words in purpose.values()):
+        raise ValueError(f'{path}: purpose must be {{ cable_pull = "why" }}, got {checks.short_repr(purpose)}')
+    check_learned(tuple(purpose))
+    parts |= {"purpose": tuple(purpose), "learn": tables.get("learn", LEARNED)}
     return from_table(VehicleModel, parts, str(path))
-
-
-def purpose_of(tables: Mapping[str, Any], path: str | Path) -> tuple[str, ...]:
-    """The names of terms of which a file says what they are for; ValueError if it says nothing, or of what is none."""
-    stated = tables.get("purpose", {})
-    if not isinstance(stated, dict) or not all(isinstance(words, str) and words.strip() for words in stated.values()):
-        raise ValueError(f'{path}: purpose must be {{ cable_pull = "why" }}, got {checks.short_repr(stated)}')
-    check_learned(tuple(stated))
-    return tuple(stated)

@@ -58,7 +58,7 @@ class GridNetwork(AbstractVectorField):
 
     def points(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> tuple[Array, Array]:
         """What the network reads, a column for each point of each sample: neighbours (k, n), input (m, n)."""
-        near = self.grid.patches(self.grid.fields(x), self.kernel)
+        near = jnp.concatenate(self.grid.moved(self.grid.fields(x), self.kernel))
         u = u[: self.network.weight_in.shape[1] - len(near)]
         held = jnp.broadcast_to(jnp.expand_dims(u, (*self.grid.axes,)), (len(u), *near.shape[1:]))
         return near.reshape(len(near), -1), held.reshape(len(u), near[0].size)
