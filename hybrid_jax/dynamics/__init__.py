@@ -17,13 +17,5 @@ __all__ = ["AbstractVectorField", "Blend", "Frozen", "FrozenRates", "HoldState",
 __all__ += ["Actuated", "Actuator", "Diffusion", "Grid", "actuated", "check_grid", "diffusion", "rotor_speeds"]
 __all__ += ["AbstractEstimator", "ConstantDisturbance", "disturbed", "with_disturbance"]
 __all__ += ["RigidBody", "Terms", "VehicleModel", "load_vehicle_model", "perturbed", "rigid_body", "with_vehicle"]
-__all__ += [
-    "Delay",
-    "Lag",
-    "LinearDynamics",
-    "Oscillator",
-    "RandomWalk",
-    "StateSpaceModel",
-    "WithHidden",
-    "with_hidden",
-]
+__all__ += ["Delay", "Lag", "LinearDynamics", "Oscillator", "RandomWalk", "WithHidden", "with_hidden"]
+__all__ += ["StateSpaceModel"]

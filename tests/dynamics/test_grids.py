@@ -78,7 +78,7 @@ def test_a_kernel_of_three_is_a_convolution():
     x = jax.random.normal(KEY, (GRID.size,))
     inner = network.network
     kernels = inner.weight_in.reshape(5, 3, 3, 2)
-    padded = GRID.padded(GRID.fields(x), 1)
+    padded = jnp.pad(GRID.fields(x), ((0, 0), (1, 1), (1, 1)), mode="wrap")
     hidden = jax.lax.conv_general_dilated(padded[None], kernels.transpose(0, 3, 1, 2), (1, 1), "VALID")[0]
     active = jnp.tanh(hidden + inner.norm.shift[:, None, None])
     expected = jnp.tensordot(inner.weight_out, active, 1) + inner.bias_out[:, None, None]
