@@ -1,6 +1,6 @@
 """How often intervals of θ_p contain the truth: python -m experiments.coverage --help"""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,7 @@ from rich.console import Console
 
 from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
-from experiments.paper.known_body import KnownBody, coverage, known_body_table
+from experiments.paper.known_body import coverage, known_body_table
 from experiments.paper.regret import CHANGES as CHANGES_SHOWN
 from experiments.paper.study import flown, pretrained, source_splits, target_splits, windows_of
 from experiments.reporting.claims import Claim, Part, all_of, verdict_table
@@ -70,7 +70,8 @@ class CoverageConfig(OneFlight):
     """Adapt to the same flights without noise, too."""
     changes: tuple[Change, ...] = RIGHT
     """Which changes; by default those that leave the vehicle's mass as the model has it."""
-    known: KnownBody = field(default_factory=KnownBody)
+    repeats: Count = 100
+    """Recordings of a known rigid body, each with its own fit."""
 
     def __post_init__(self):
         OneFlight.__post_init__(self)
@@ -81,10 +82,10 @@ class CoverageConfig(OneFlight):
 SHORT: dict[str, Any] = ONE_FLIGHT | {"seeds": SOURCES}
 PRESETS = {
     "paper": CoverageConfig(),
-    "quick": preset_like(CoverageConfig, replace(QUICK, **SHORT, draws=20), known=KnownBody(repeats=20)),
+    "quick": preset_like(CoverageConfig, replace(QUICK, **SHORT, draws=20), repeats=20),
     "smoke": preset_like(
         CoverageConfig, replace(SMOKE, **SHORT), sizes=(20,), changes=("parameter_shift",), clean=False,
-        known=KnownBody(repeats=4),
+        repeats=4,
     ),
 }  # fmt: skip
 
@@ -107,9 +108,9 @@ def experiment(config: CoverageConfig, console: Console) -> None:
     )
     if not hosts.is_main_process():
         return
-    known = stages.timed("known body", lambda: coverage(config.known, console))
+    known = stages.timed("known body", lambda: coverage(config.repeats, console))
     verdicts = evaluate_claims(CLAIMS, rows)
-    tables = [verdict_table(verdicts, "Hypotheses"), pooled_table(rows), known_body_table(known, config.known.level)]
+    tables = [verdict_table(verdicts, "Hypotheses"), pooled_table(rows), known_body_table(known)]
     report = Report(
         experiment=NAME,
         config=config.described(),

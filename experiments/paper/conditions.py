@@ -133,10 +133,7 @@ def subsets(config: Config) -> Int[np.ndarray, "runs pool"]:
         keys = [_key(seed, SUBSET) for seed in range(config.seeds)]
         keys = [jax.random.fold_in(key, draw) if draw else key for draw in range(config.draws) for key in keys]
         return stack([permutation(key, config.pooled()) for key in keys])
-    index = np.arange(config.pooled()).reshape(config.draws, config.flown_each(), config.windows_each())
-    # With --flights, one of each flight in turn; else one flight after the other.
-    index = index.swapaxes(1, 2) if config.flights else index
-    return np.repeat(index.reshape(config.draws, -1), config.seeds, axis=0)
+    return np.repeat(np.arange(config.pooled()).reshape(config.draws, -1), config.seeds, axis=0)
 
 
 def held_back(subset: Int[np.ndarray, "*runs n"]) -> tuple[Int[np.ndarray, "*runs m"], Int[np.ndarray, "*runs v"]]:

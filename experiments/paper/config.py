@@ -109,8 +109,6 @@ class Config(Run):
     of ten seconds for 100 trajectories; of as few flights as hold them for more."""
     draws: Count = 1
     """Draws of target trajectories for each seed; contiguous draws are of different flights, the same for all seeds."""
-    flights: Count | None = None
-    """With contiguous: take N / flights trajectories from the start of each of so many flights."""
     source_train: Count = 10_000
     """Source trajectories for pre-training."""
     validation: Count | Literal["own"] = 1000
@@ -190,11 +188,6 @@ class Config(Run):
     def _check_draws(self) -> None:
         if self.draw == "contiguous" and self.pool is not None:
             raise ValueError("--pool is for --draw random: leave it out")
-        if self.draw == "random" and self.flights is not None:
-            raise ValueError("--flights is for --draw contiguous: leave it out")
-        if self.flights is not None and max(self.sizes) > FLIGHT * self.flights:
-            most = f"{FLIGHT} of each of {self.flights} flights"
-            raise ValueError(f"--sizes must be at most {most}, got {self.sizes}")
         if self.validation == "own" and min(self.sizes) < HELD_BACK:
             raise ValueError(f"--sizes must each be at least {HELD_BACK} with --validation own, got {self.sizes}")
 
@@ -210,7 +203,7 @@ class Config(Run):
 
     def flown_each(self) -> int:
         """Flights of a contiguous draw."""
-        return self.flights or -(-max(self.sizes) // FLIGHT)
+        return -(-max(self.sizes) // FLIGHT)
 
     def windows_each(self) -> int:
         """Trajectories of each flight of a contiguous draw."""

@@ -16,18 +16,9 @@ from matplotlib.lines import Line2D
 from experiments.paper.claims import THETA_TOLERANCE
 from experiments.paper.lanes import MODELS, THETA, Cell, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.paper.tables import UNITS, value_label
+from experiments.reporting import plots
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
-from experiments.reporting.plots import (
-    DRAWABLE,
-    PAGE,
-    STYLE,
-    Line,
-    colour,
-    error_legend,
-    error_panel,
-    subplots,
-    tick_errors,
-)
+from experiments.reporting.plots import DRAWABLE, PAGE, STYLE, Line, colour, note, subplots
 from experiments.reporting.results import Column, Results, Row
 
 DASHES = {FINE_TUNED: "-", TARGET_ONLY: "--", SOURCE_ONLY: ":"}
@@ -37,16 +28,14 @@ LOWEST_RHO = -1.0
 DECADES = 6  # of error, from the smallest mean up
 LARGEST_BIAS = 100.0  # % of a parameter
 HOME, FLOOR = "hybrid before the change", "no model can do better"  # errors on source flights, and of every model
-MEANING, SOME_FAILED = "mean and std over seeds", "hollow: some seeds failed"
 
 
 class _Curve(NamedTuple):
-    """At each N: of the finite values mean, mean ± std and smallest; and how many of how many are not finite."""
+    """At each N: mean and std of the finite values, the smallest; how many of how many are not finite."""
 
     n: np.ndarray
     mean: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    std: np.ndarray
     smallest: np.ndarray
     failed: np.ndarray
     seeds: np.ndarray
@@ -58,22 +47,33 @@ _Curves = dict[tuple[str, str], _Curve]  # by model and mode
 @mpl.rc_context(STYLE)
 def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     """Figs. 3 and 5: test error, above a floor that no model can get below, and ρ against N; mean ± std over seeds."""
-    figure, ((upper, lower),) = subplots((PAGE, 3.9), 1, 2)
-    curves = _curves(rows, "test_mse")
-    _draw_errors(upper, curves, floor)
-    _draw_home(upper, rows.where(lambda row: "source_mse" in row))
-    gains = _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain)
-    _draw_gains(lower, gains)
+    figure, ((left, right),) = subplots((PAGE, 3.9), 1, 2)
+    errors, gains = _curves(rows, "test_mse"), _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain)
+    _draw_errors(left, errors, floor)
+    home = rows.where(lambda row: "source_mse" in row)
+    for model in [model for model in MODELS if model in home["model"]][:1]:
+        error = home.where(model=model).spread("source_mse").mean
+        if 1 / DRAWABLE < error < DRAWABLE:
+            left.axhline(error, color=colour(model), linestyle=(0, (6, 2, 1, 2)), linewidth=1, label=HOME)
+            left.set_ylim(bottom=min(left.get_ylim()[0], error / 2))
+    lows = [low for curve in gains.values() for low in curve.mean - curve.std if np.isfinite(low)]
+    right.axhline(0.0, color="0.4", linestyle=":")
+    right.set(ylabel="gain ρ (1 is perfect, ▽: off the scale)")
+    _draw(right, gains, max(LOWEST_RHO, min([*lows, 0.0])) - 0.1, 1.08, lost_at_top=False)
+    for axes in (left, right):
+        _name_sizes(axes, rows)
+    return _legend(figure, title, [*errors, *gains])
+
+
+def _name_sizes(axes: Axes, rows: Results) -> None:
     sizes = adapted_sizes(rows)
-    for axes in (upper, lower):
-        axes.set_xlabel("N, target trajectories trained on")
-        axes.set_xticks(sizes, [str(n) for n in sizes])
-    return _legend(figure, title, [curves, gains])
+    axes.set_xlabel("N, target trajectories trained on")
+    axes.set_xticks(sizes, [str(n) for n in sizes])
 
 
-def _legend(figure: Figure, title: str, drawn: Sequence[_Curves]) -> Figure:
-    """Colours of the models, then lines of the ways to train them; `drawn` has the curves of each panel."""
-    models, modes = (dict.fromkeys(key[i] for curves in drawn for key in curves) for i in (0, 1))
+def _legend(figure: Figure, title: str, drawn: Sequence[tuple[str, str]]) -> Figure:
+    """Colours of the models, then lines of the ways to train them."""
+    models, modes = (dict.fromkeys(key[i] for key in drawn) for i in (0, 1))
     entries: dict[str, Artist] = {
         label(model).replace("θ_p", r"$\theta_p$"): Line2D([], [], color=colour(model), linewidth=4) for model in models
     }
@@ -82,11 +82,10 @@ def _legend(figure: Figure, title: str, drawn: Sequence[_Curves]) -> Figure:
     # Lines of no model: words beside them would lie on other lines.
     others = {str(line.get_label()): line for axes in figure.axes for line in axes.get_lines()}
     entries |= {name: others[name] for name in (HOME, FLOOR) if name in others}
-    marked = [curve for curves in drawn for (_, mode), curve in curves.items() if mode != SOURCE_ONLY]
-    hollow = any(((curve.failed > 0) & (curve.failed < curve.seeds)).any() for curve in marked)
-    meaning = f"{MEANING}; {SOME_FAILED}" if hollow else MEANING
     figure.suptitle(title)
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=4, title=meaning)
+    figure.legend(
+        entries.values(), entries.keys(), loc="outside lower center", ncols=4, title="mean and std over seeds"
+    )
     return figure
 
 
@@ -94,19 +93,23 @@ def _legend(figure: Figure, title: str, drawn: Sequence[_Curves]) -> Figure:
 def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
     """Ix, Iy and k relative to the truth, none of them 0, against N; mean ± std over seeds."""
     known = rows.where(lambda row: row["theta"] is not None, mode=(FINE_TUNED, TARGET_ONLY))
-    sizes = adapted_sizes(known)
     figure, (panels,) = subplots((PAGE, 3.2), 1, len(THETA))
-    drawn = []
+    tolerance, drawn = 100 * THETA_TOLERANCE, []
     for axes, name in zip(panels, THETA, strict=True):
 
         def bias(row: Row, name: str = name) -> float:
             value = row["theta"][name]
             return math.inf if value is None else 100 * (value / truth[name] - 1)
 
-        drawn.append(_curves(known, bias))
-        _draw_biases(axes, drawn[-1])
-        axes.set(title=f"{name}, true value {truth[name]:.4g} {UNITS[name]}", xlabel="N, target trajectories")
-        axes.set_xticks(sizes, [str(n) for n in sizes])
+        curves = _curves(known, bias)
+        drawn += curves
+        axes.axhspan(-tolerance, tolerance, color="0.92", zorder=0)
+        axes.axhline(0.0, color="black", linewidth=1)
+        ends = np.concatenate([np.abs(curve.mean) + curve.std for curve in curves.values()])
+        reach = 1.15 * max(min(LARGEST_BIAS, max(ends[np.isfinite(ends)], default=0.0)), tolerance)
+        _draw(axes, curves, -reach, reach)
+        axes.set(title=f"{name}, true value {truth[name]:.4g} {UNITS[name]}")
+        _name_sizes(axes, known)
     panels[0].set_ylabel("recovered / true − 1  [%]")
     return _legend(figure, "Physical parameters after training; grey: within 5 % of the truth", drawn)
 
@@ -149,9 +152,9 @@ def _error_panels(panels: Mapping[str, Sequence[Line]], title: str, floors: Mapp
     height = 0.8 + sum(0.9 + 0.3 * count for count in counts)
     figure, column = subplots((PAGE, height), len(panels), 1, height_ratios=counts)
     for axes, (domain, lines) in zip(column.flat, panels.items(), strict=True):
-        error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
+        plots.error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
     failed = any(np.isinf(line.errors).any() for lines in panels.values() for line in lines)
-    return error_legend(figure, title, failed)
+    return plots.error_legend(figure, title, failed)
 
 
 def _curves(rows: Results, value: Column) -> _Curves:
@@ -160,84 +163,58 @@ def _curves(rows: Results, value: Column) -> _Curves:
         values = group.numbers(value)
         finite = values[np.abs(values) < DRAWABLE]
         mean, std = finite.mean() if len(finite) else math.nan, finite.std(ddof=1) if len(finite) > 1 else 0.0
-        failed, smallest = len(values) - len(finite), min(finite, default=math.nan)
-        points[model, mode].append((n, mean, mean - std, mean + std, smallest, failed, len(values)))
+        points[model, mode].append(
+            (n, mean, std, min(finite, default=math.nan), len(values) - len(finite), len(values))
+        )
     return {key: _Curve(*np.array(found, float).T) for key, found in points.items()}
 
 
 def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
     means = np.concatenate([curve.mean for curve in curves.values()])
     means = means[means > 1 / DRAWABLE]
-    lowest = min(means, default=1.0)
-    limits = lowest / 2, min(2 * max(means, default=1.0), lowest * 10.0**DECADES)
+    lowest, drawn = min(means, default=1.0), floor > 1 / DRAWABLE
     axes.set(yscale="log", ylabel="mean squared error over 1 s (log; lower is better)")
-    # One std may reach below 0, which a log axis has not; the whisker then ends at the best seed.
-    curves = {key: c._replace(low=np.where(c.low > 0, c.low, c.smallest)) for key, c in curves.items()}
     trained = {key: curve for key, curve in curves.items() if key[1] != SOURCE_ONLY}
-    _draw_curves(axes, trained, min(limits[0], floor / 2) if floor > 1 / DRAWABLE else limits[0], limits[1])
+    bottom = min(lowest, floor) / 2 if drawn else lowest / 2
+    _draw(axes, trained, bottom, min(2 * max(means, default=1.0), lowest * 10.0**DECADES))
     for (model, mode), curve in curves.items():
         if mode == SOURCE_ONLY and np.isfinite(curve.mean[0]):
-            axes.axhspan(curve.low[0], curve.high[0], color=colour(model), alpha=0.12, linewidth=0)
+            low, high = _band(axes, curve)
+            axes.axhspan(low[0], high[0], color=colour(model), alpha=0.12, linewidth=0)
             axes.axhline(curve.mean[0], color=colour(model), linestyle=":", label=label(model, mode))
-    if floor > 1 / DRAWABLE:
+    if drawn:
         axes.axhline(floor, color="0.4", linestyle="-.", label=FLOOR)
-    tick_errors(axes.yaxis, *axes.get_ylim(), room=3.5)
+    plots.tick_errors(axes.yaxis, *axes.get_ylim(), room=3.5)
 
 
-def _draw_home(axes: Axes, rows: Results) -> None:
-    """The error of the first source model on flights of the source."""
-    for model in [model for model in MODELS if model in rows["model"]][:1]:
-        home = rows.where(model=model).spread("source_mse").mean
-        if 1 / DRAWABLE < home < DRAWABLE:
-            axes.axhline(home, color=colour(model), linestyle=(0, (6, 2, 1, 2)), linewidth=1, label=HOME)
-            axes.set_ylim(bottom=min(axes.get_ylim()[0], home / 2))
+def _band(axes: Axes, curve: _Curve) -> tuple[np.ndarray, np.ndarray]:
+    """One std about the mean. It may reach below 0, which a log axis has not; it then ends at the best seed."""
+    low = curve.mean - curve.std
+    low = np.where(low > 0, low, curve.smallest) if axes.get_yscale() == "log" else low
+    return low, curve.mean + curve.std
 
 
-def _draw_gains(axes: Axes, curves: _Curves) -> None:
-    lows = np.concatenate([curve.low for curve in curves.values()] or [np.zeros(1)])
-    lowest = max(LOWEST_RHO, min(lows[np.isfinite(lows)], default=0.0))
-    axes.axhline(0.0, color="0.4", linestyle=":")
-    axes.set(ylabel="gain ρ (1 is perfect, ▽: off the scale)")
-    _draw_curves(axes, curves, min(lowest, 0.0) - 0.1, 1.08, lost_at_top=False)
-
-
-def _draw_biases(axes: Axes, curves: _Curves) -> None:
-    tolerance = 100 * THETA_TOLERANCE
-    axes.axhspan(-tolerance, tolerance, color="0.92", zorder=0, label=f"within {THETA_TOLERANCE:.0%}")
-    axes.axhline(0.0, color="black", linewidth=1, label="truth")
-    ends = np.abs(np.concatenate([end for curve in curves.values() for end in (curve.low, curve.high)]))
-    reach = min(LARGEST_BIAS, max(ends[np.isfinite(ends)], default=0.0))
-    _draw_curves(axes, curves, -1.15 * max(reach, tolerance), 1.15 * max(reach, tolerance))
-
-
-def _draw_curves(axes: Axes, curves: _Curves, bottom: float, top: float, lost_at_top: bool = True) -> None:
+def _draw(axes: Axes, curves: _Curves, bottom: float, top: float, lost_at_top: bool = True) -> None:
     """Draw within [bottom, top], the spread as a band; mark what lies outside or is not finite."""
     axes.set_ylim(bottom, top)
     for (model, mode), curve in curves.items():
-        x = curve.n
         inside = (curve.mean >= bottom) & (curve.mean <= top)
-        mean, low, high = (np.where(inside, np.clip(part, bottom, top), np.nan) for part in curve[1:4])
+        mean, low, high = (
+            np.where(inside, part.clip(bottom, top), np.nan) for part in (curve.mean, *_band(axes, curve))
+        )
         style = {"color": colour(model), "linestyle": DASHES[mode], "marker": MARKERS[mode], "markeredgewidth": 0}
-        axes.plot(x, mean, label=label(model, mode), **style)
-        axes.fill_between(x, low, high, color=colour(model), alpha=0.15, linewidth=0)
-        lost = top if lost_at_top else bottom
-        for at, *point in zip(x, *curve, strict=True):
-            _mark_failure(axes, at, point, lost, colour(model))
-
-
-def _mark_failure(axes: Axes, at: float, point: Sequence[float], lost: float, colour: str) -> None:
-    """Hollow where some seeds are not finite, an arrow with the number beyond an edge, × at `lost` where none is."""
-    _, mean, _, _, _, failed, seeds = point
-    bottom, top = axes.get_ylim()
-    words = f"{failed:.0f}/{seeds:.0f} not finite" if failed else ""
-    marker, y = ("x", lost) if math.isnan(mean) else ("o", mean)
-    if mean > top or mean < bottom:
-        marker, y = ("^", top) if mean > top else ("v", bottom)
-        words = f"{mean:.2g} {words}".strip()
-    if words:
-        axes.plot(at, y, marker, color=colour, markerfacecolor="white", markersize=6, clip_on=False, zorder=5)
-        down = y > axes.transData.inverted().transform(axes.transAxes.transform((0.0, 0.5)))[1]
-        offset, align = ((5, -5), "top") if down else ((5, 5), "bottom")
-        box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 0.5}
-        style = {"va": align, "fontsize": 6, "color": colour, "bbox": box, "zorder": 6}
-        axes.annotate(words, (at, y), offset, textcoords="offset points", **style)
+        axes.plot(curve.n, mean, label=label(model, mode), **style)
+        axes.fill_between(curve.n, low, high, color=colour(model), alpha=0.15, linewidth=0)
+        for n, at, _, _, failed, seeds in zip(*curve, strict=True):
+            words = f"{failed:.0f}/{seeds:.0f} not finite" if failed else ""
+            if math.isnan(at):  # no seed is finite
+                marker, y = "x", top if lost_at_top else bottom
+            elif bottom <= at <= top:
+                marker, y = "o", at
+            else:
+                marker, y, words = "^" if at > top else "v", top if at > top else bottom, f"{at:.2g} {words}".strip()
+            if words:
+                white = {"color": colour(model), "markerfacecolor": "white", "markersize": 6}
+                axes.plot(n, y, marker, clip_on=False, zorder=5, **white)
+                down = y == top
+                note(axes, words, (n, y), (5, -5 if down else 5), va="top" if down else "bottom", color=colour(model))

@@ -1,9 +1,6 @@
 """Laws of the covariance of θ_p, against closed forms, and of its intervals, against simulation."""
 
-from dataclasses import replace
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,8 +9,7 @@ from pendulum import Brake, log_lengths, pendulum, swings
 from pushes import Push, pushes
 from rich.console import Console
 
-from experiments.paper import known_body
-from experiments.paper.known_body import KnownBody, coverage, known_body_table
+from experiments.paper.known_body import coverage, known_body_table
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
@@ -154,7 +150,7 @@ REPEATS = 100
 
 @pytest.fixture(scope="module")
 def found():
-    return coverage(KnownBody(repeats=REPEATS), Console(quiet=True))
+    return coverage(REPEATS, Console(quiet=True))
 
 
 @pytest.fixture(scope="module")
@@ -186,34 +182,6 @@ def test_intervals_miss_the_truth_when_the_vehicle_has_drag_that_the_model_has_n
 
 @pytest.mark.slow
 def test_the_table_has_a_line_for_every_case(found, rows):
-    lines = {tuple(line[:3]): line[3] for line in known_body_table(found, 0.95).lines}
+    lines = {tuple(line[:3]): line[3] for line in known_body_table(found).lines}
     assert lines.keys() == rows.keys()  # two truths, noise on targets or on all, three parameters
     assert all(text.startswith(f"{100 * rows[case]['coverage']:.1f} ±") for case, text in lines.items())
-
-
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        ({"n_train": 3}, "--known.n-train must be more than the 3 parameters, got 3"),
-        ({"repeats": 0}, "--known.repeats must be an integer of at least 1, got 0"),
-        ({"seed": -1}, "--known.seed must be an integer of at least 0, got -1"),
-        ({"level": 95.0}, "--known.level must be between 0 and 1, got 95.0"),
-        ({"noise_on": ()}, "--known.noise-on must be targets, all or both, got nothing"),
-        (
-            {"noise": known_body.Noise(body_rates=-1.0)},
-            "--known.noise.body-rates must be a finite number of at least 0",
-        ),
-        ({"drag": float("nan")}, "--known.drag must be a finite number of at least 0, got nan"),
-    ],
-)
-def test_options_that_make_no_sense_are_refused(changed, said):
-    with pytest.raises(ValueError, match=said):
-        coverage(replace(KnownBody(), **changed), Console(quiet=True))
-
-
-@pytest.mark.parametrize(("repeats", "batch"), [(100, 1), (25, 1), (25, 4), (3, 8)])
-def test_parts_of_one_size_hold_every_repeat_in_its_order(repeats, batch):
-    parts = known_body._parts(KnownBody(repeats=repeats, batch=batch))
-    together = np.concatenate([jax.random.key_data(part) for part in parts])
-    assert {len(part) for part in parts} == {len(together) // len(parts)}
-    np.testing.assert_array_equal(together[:repeats], jax.random.key_data(jax.random.split(jax.random.key(0), repeats)))

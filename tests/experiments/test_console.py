@@ -43,7 +43,7 @@ def test_nor_in_the_tables_of_coverage(width, terminal):
     numbers = {"inside": True, "alone": 1.0, "error": -123.45, "half_width": 1234.56}
     known = {"coverage": 0.5, "standard_error": 0.05, "bias": -12.3, "half_width": 123.4, "converged": 1.0}
     case = {"case": "exact physics", "noise_on": "targets", "parameter": "Ix"}
-    tables = pooled_table(Results([tags | numbers])), known_body_table(Results([case | known]), 0.95)
+    tables = pooled_table(Results([tags | numbers])), known_body_table(Results([case | known]))
     for table in tables:
         assert_whole(table, width, terminal)
 

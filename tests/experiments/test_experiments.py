@@ -167,7 +167,7 @@ REFUSED = {
     ],
     "coverage": [
         (("--seeds", "2"), "--seeds must be at least 3, got 2"),
-        (("--known.repeats", "0"), "--known.repeats must be an integer of at least 1, got 0"),
+        (("--repeats", "0"), "--repeats must be an integer of at least 1, got 0"),
     ],
     "closed_loop": [
         (("--references", "hover", "hover"), "--references must be at least one, each different"),

@@ -185,14 +185,6 @@ def test_contiguous_draws_are_starts_of_flights_of_their_own_shared_by_all_seeds
     assert not {*flight[drawn[0, 0]]} & {*flight[drawn[1, 0]]}
 
 
-def test_the_n_windows_come_from_as_many_flights_as_asked():
-    config = replace(CONTIGUOUS, flights=5, sizes=(100,), draws=1)
-    drawn, each = subsets(config)[0, :100], config.windows_each()
-    assert each == 20
-    np.testing.assert_array_equal(np.sort(drawn), np.arange(100))
-    np.testing.assert_array_equal(flight_of(config)[drawn[:5]], np.arange(5))
-
-
 def test_other_random_draws_leave_the_first_as_it_was():
     one, two = subsets(SMALL), subsets(replace(SMALL, draws=2))
     np.testing.assert_array_equal(two[: SMALL.seeds], one)
@@ -259,8 +251,6 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
         ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
         ({"regulariser_weight": -1.0}, "--regulariser-weight must be a finite number of at least 0"),
         ({"draw": "contiguous", "pool": 2000}, "--pool is for --draw random: leave it out"),
-        ({"flights": 2}, "--flights is for --draw contiguous: leave it out"),
-        ({"draw": "contiguous", "flights": 2}, "--sizes must be at most 110 of each of 2 flights"),
         (
             {"validation": "own", "sizes": (4,), "batch_size": 4, "models": ("hybrid",)},
             "--sizes must each be at least 5",
