@@ -33,10 +33,6 @@ from hybrid_jax.trajectories import split
 from hybrid_jax.vehicle import IRIS
 
 NAME, TITLE = COMPARISON, "Adapting with 100 trajectories, tested over 0.1 s"
-GIVEN_NETWORK = (
-    "An interval of θ_p treats the network as fixed: where both were trained, only the spread over seeds shows how far "
-    "one can compensate for the other."
-)
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 
 
@@ -92,7 +88,7 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     drawn = ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
     caption = "Test errors of all seeds of every method (paper, Table 2)"
     figures = save_figures(out, {"standings": (drawn, caption)})
-    notes = [*stages.notes(), GIVEN_NETWORK]
+    notes = stages.notes()
     true, extra = {each.name: nominal(each.vehicle) for each in DOMAINS}, {"flights": flights}
     report = paper_report(NAME, config, stages.seconds, rows, true, figures, notes, floor, extra)
     write_report(out, report, Console())

@@ -23,10 +23,10 @@ ERRORS = {
 }
 
 
-def row(model, mode, n, seed, test_mse, domain="parameter_shift", theta=None, theta_interval=None, **fields):
+def row(model, mode, n, seed, test_mse, domain="parameter_shift", theta=None, **fields):
     known = {"domain": domain, "model": model, "mode": mode, "n_train": n, "seed": seed, "test_mse": test_mse}
     known |= {"draw": 0, "rho": None, "val_mse": 1e-3, "epochs": 150, "status": "ok"}
-    return known | {"theta": theta, "theta_interval": theta_interval} | fields
+    return known | {"theta": theta} | fields
 
 
 def make_rows(seeds=3, sizes=SIZES, errors=ERRORS, theta=TRUTH, domain="parameter_shift"):
@@ -63,12 +63,11 @@ def make_report(rows, experiment="param_shift", truth=TRUTH, figures=MappingProx
 
 NUMBERS = st.none() | st.floats(min_value=0) | st.sampled_from([float("nan"), float("inf")])
 THETAS = st.none() | st.fixed_dictionaries({name: st.none() | st.floats() for name in THETA})
-ENDS = st.none() | st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=2, max_size=2).map(sorted)
 
 
 @st.composite
 def odd_rows(draw):
-    mode, theta = draw(st.sampled_from(MODES)), draw(THETAS)
+    mode = draw(st.sampled_from(MODES))
     return row(
         draw(st.sampled_from(MODELS)),
         mode,
@@ -76,8 +75,7 @@ def odd_rows(draw):
         draw(st.integers(0, 2)),
         draw(NUMBERS),
         draw(st.sampled_from(DOMAINS)),
-        theta,
-        draw(st.none() | st.fixed_dictionaries(dict.fromkeys(THETA, ENDS))) if theta else None,
+        draw(THETAS),
         rho=draw(st.none() | st.floats()),
         val_mse=draw(NUMBERS),
         epochs=draw(st.integers(0, 10**6)),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 import hybrid_jax
 from experiments.reporting import names
@@ -38,12 +38,16 @@ Cell = tuple[str, str, int]  # model, mode, n_train
 
 
 class Fit(NamedTuple):
-    """Models after training, or adapted by a method that is solved instead: stacked, one for each size and seed."""
+    """Models after training, or adapted by a method that is solved instead: stacked, one for each size and seed.
+
+    Attributes:
+        val_mse: L_MSE of each on the validation windows.
+    """
 
     fields: Any
-    val_mse: Any  # L_MSE of each on the validation windows
+    val_mse: Any
     epochs: Any
-    status: Any  # see `training`
+    status: Any
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,6 @@ def lanes_of(
     fit: Fit,
     errors: np.ndarray,
     theta: Mapping[str, np.ndarray] | None = None,
-    intervals: Mapping[str, np.ndarray] | None = None,
     more: Mapping[str, np.ndarray] | None = None,
 ) -> Lanes:
     """Models tested in a domain, one for each size, draw and seed, in this order.
@@ -77,15 +80,11 @@ def lanes_of(
     Args:
         errors: L^T_MSE on the test flights.
         theta: name → the value of each, instead of that in the models.
-        intervals: name → (lanes, 2), low and high end of the 95 % interval of θ_p.
         more: further columns, the number of each.
     """
     theta, runs = theta_of(fit.fields) if theta is None else theta, len(errors) // len(sizes)
 
     def row(i: int) -> Row:
-        ends = {name: pair[i] for name, pair in (intervals or {}).items()}
-        # An interval with an end that is not finite bounds nothing.
-        bounds = {name: pair.tolist() if np.isfinite(pair).all() else None for name, pair in ends.items()}
         return {
             "domain": domain,
             "model": model,
@@ -99,7 +98,6 @@ def lanes_of(
             "epochs": int(fit.epochs[i]),
             "status": str(Status(int(fit.status[i]))),
             "theta": {name: float(value[i]) for name, value in theta.items()} or None,
-            "theta_interval": bounds or None,
             **{name: float(values[i]) for name, values in (more or {}).items()},
         }
 
@@ -110,14 +108,15 @@ def by_altitude(
     column: str, windows: Trajectories, errors: Float[np.ndarray, "lanes windows"]
 ) -> dict[str, Float[np.ndarray, " lanes"]]:
     """The mean error of each model over the windows of each band, by column; NaN for a band without windows."""
-    band = np.digitize(lowest_altitude(windows), BAND_EDGES)
+    band = bands(windows)
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = [errors[:, band == i].sum(axis=1) / np.float64(np.sum(band == i)) for i in range(len(BANDS))]
     return {f"{column}_{name}": mean for name, mean in zip(BANDS, sums, strict=True)}
 
 
-def lowest_altitude(windows: Trajectories) -> Float[np.ndarray, " windows"]:
-    return np.minimum(windows.x0[:, 2], windows.x[..., 2].min(axis=1))
+def bands(windows: Trajectories) -> Int[np.ndarray, " windows"]:
+    """The index in BANDS of the lowest altitude of each window."""
+    return np.digitize(np.minimum(windows.x0[:, 2], windows.x[..., 2].min(axis=1)), BAND_EDGES)
 
 
 def physics_in(field: Any) -> Any:
@@ -127,8 +126,7 @@ def physics_in(field: Any) -> Any:
 
 def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray]:
     """θ_p of a model, or of stacked ones; empty for one without physics."""
-    theta = getattr(physics_in(field), "theta", dict)
-    return {name: np.asarray(value) for name, value in theta().items()}
+    return {name: np.asarray(value) for name, value in getattr(physics_in(field), "theta", dict)().items()}
 
 
 def rows_of(groups: Sequence[Lanes]) -> Results:

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper.conditions import settings, subsets
+from experiments.paper.conditions import settings
 from experiments.paper.config import Config
-from experiments.paper.lanes import MODELS, Fit, Lanes, lanes_of, physics_in, source_of, theta_of
+from experiments.paper.lanes import MODELS, Fit, Lanes, lanes_of, source_of, theta_of
 from experiments.paper.study import SOLVED, solved
 from experiments.paper.study import adapted as trained
 from experiments.reporting import names
@@ -20,16 +19,12 @@ from experiments.runner.stages import Stages
 from hybrid_jax.adaptation.expert_augmentation import prediction_mse
 from hybrid_jax.dynamics.composition import Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import physics_of
-from hybrid_jax.dynamics.rigid_body import RigidBody
-from hybrid_jax.estimation import covariance_of, intervals
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.runtime import FAST_COMPILE
-from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.sweep.training import evaluate
 from hybrid_jax.trajectories import Trajectories, split
 
 PAST = 10  # intervals of a test window before the ones to predict
-WITHOUT_INTERVALS = (names.THETA_D_ONLY, names.CONSTANT_DISTURBANCE, names.LAST_LAYER, names.LINEAR_RESIDUAL)
 if TYPE_CHECKING:
     Method = str
 else:
@@ -38,13 +33,19 @@ else:
 
 @dataclass(frozen=True)
 class Case:
-    """The data and models that a method may use in one target domain."""
+    """The data and models that a method may use in one target domain.
+
+    Attributes:
+        pretrained: by model, one per seed.
+        experts: the `ExpertAugmented` of all seeds, if Expert Augmentation is compared.
+        target: splits train (the pool), validation and test_with_past.
+    """
 
     config: Config
     stages: Stages
-    pretrained: Mapping[str, Fit]  # by model, one per seed
-    experts: Fit | None  # the `ExpertAugmented` of all seeds, if Expert Augmentation is compared
-    target: Dataset  # splits train (the pool), validation and test_with_past
+    pretrained: Mapping[str, Fit]
+    experts: Fit | None
+    target: Dataset
 
     @property
     def name(self) -> str:
@@ -80,8 +81,7 @@ def adapted(case: Case, method: Method) -> Lanes:
         fit = trained(model, mode, start, config, case.stages, case.target, method)
         fit = fit._replace(fields=unfreeze(fit.fields))
     errors = case.tested(method, fit.fields)
-    known = _intervals_of(case, method, fit.fields)
-    return lanes_of(case.name, method, mode, config.sizes, config.seeds, fit, errors, intervals=known)
+    return lanes_of(case.name, method, mode, config.sizes, config.seeds, fit, errors)
 
 
 def _augmented(case: Case) -> Lanes:
@@ -105,32 +105,3 @@ def _encoded(experts, windows: Trajectories, solver):
         return prediction_mse(model, windows, PAST, solver), physics_of(typical)
 
     return jax.lax.map(one, experts)
-
-
-def _intervals_of(case: Case, method: Method, fields: Any) -> Mapping[str, np.ndarray] | None:
-    """The ends of the 95 % interval of θ_p from the windows of the adaptation, if θ_p was adapted.
-
-    The interval treats the network as fixed. It would do so with a disturbance too, so models that fitted one get none.
-    """
-    if not isinstance(physics_in(fields), RigidBody) or method in WITHOUT_INTERVALS:
-        return None
-    config, pool = case.config, case.target.splits["train"]
-
-    def of_size(index: int, size: int):
-        own = lane(fields, np.arange(index * config.runs(), (index + 1) * config.runs()))
-        return jax.device_get(_intervals((own, subsets(config)[:, :size]), pool, settings(config).solver))
-
-    parts = case.stages.timed(
-        f"intervals {method} {case.name}", lambda: [of_size(index, size) for index, size in enumerate(config.sizes)]
-    )
-    return jax.tree.map(lambda *ends: np.concatenate(ends), *parts)
-
-
-@eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
-def _intervals(lanes, pool: Trajectories, solver):
-    def one(lane):
-        field, subset = lane
-        found = intervals(field, covariance_of(field, pool[subset], solver=solver))
-        return {name: jnp.stack([interval.low, interval.high]) for name, interval in found.items()}
-
-    return jax.lax.map(one, lanes)

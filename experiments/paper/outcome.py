@@ -12,7 +12,7 @@ from experiments.paper.claims import COMPARISON, claims
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.figures import scores, theta
 from experiments.paper.flight_figures import example_flight, predictions
-from experiments.paper.lanes import BAND_EDGES, BANDS, BASELINES, by_domain, lowest_altitude, save_models
+from experiments.paper.lanes import BANDS, BASELINES, bands, by_domain, save_models
 from experiments.paper.study import Study, study
 from experiments.paper.tables import altitudes, by_size, conclusion, meaning, parameters, ranking, run_notes
 from experiments.reporting import names
@@ -81,7 +81,7 @@ def adapt_and_report(experiment: str, domain: Domain, floor: float, config: Adap
     out, truth, rows = config.out / experiment, nominal(domain.vehicle), found.rows
     save_models(out / "models", found.lanes, rows)
     figures = save_figures(out, draw(domain, config, found, truth, floor))
-    lowest = np.digitize(lowest_altitude(found.target.splits["test"]), BAND_EDGES)
+    lowest = bands(found.target.splits["test"])
     counted = ", ".join(f"{np.sum(lowest == i)} {band}" for i, band in enumerate(BANDS.values()))
     notes = [*found.notes, f"Test windows by lowest altitude: {counted}."]
     extra = {"flights": {"source": found.source.metadata, "target": found.target.metadata}}

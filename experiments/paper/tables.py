@@ -10,7 +10,6 @@ from experiments.reporting import names
 from experiments.reporting.claims import Verdict
 from experiments.reporting.names import FINE_TUNED, HYBRID, NO_PHYSICS, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.results import Results, Row
-from experiments.reporting.statistics import spread
 from experiments.reporting.tables import (
     EMPTY,
     Table,
@@ -167,36 +166,18 @@ def parameters(rows: Results, truth: Mapping[str, Any] | None) -> list[Table]:
     for place, group in _places(rows.where(lambda row: row["theta"] is not None)):
         true = truth if truth is None or set(truth) == set(THETA) else truth.get(group[0]["domain"])
         groups = {(label(m), label(mode), str(n or EMPTY)): cell for (m, mode, n), cell in cells(group).items()}
-        columns = {
-            f"{k} [{UNITS[k]}]": lambda cell, k=k, true=true: _theta_text(cell, k, None if true is None else true[k])
-            for k in THETA
-        }
-        given = any(row["theta_interval"] is not None for row in group)
-        of = (
-            f" ({over_seeds(group)}; 95 %: mean half-width of the seeds' intervals, how many are true)" if given else ""
-        )
-        table = tabulate(f"Recovered physical parameters θ_p{place}{of}", groups, columns, ("model", "mode", "N"))
+        columns = {f"{k} [{UNITS[k]}]": lambda cell, k=k: _theta_text(cell, k) for k in THETA}
+        table = tabulate(f"Recovered physical parameters θ_p{place}", groups, columns, ("model", "mode", "N"))
         known = [] if true is None else [("truth", "", "", *(f"{true[name]:.5g}" for name in THETA))]
         tables.append(table._replace(lines=[*table.lines, *known]))
     return tables
 
 
-def _theta_text(rows: Results, name: str, truth: float | None) -> str:
-    """0.0398 ± 0.0004, 95 % ± 0.0006 (7 of 10 true): the spread over seeds, then the seeds' own intervals if any."""
+def _theta_text(rows: Results, name: str) -> str:
     values = rows.spread(f"theta.{name}")
     if values.non_finite:
         return f"not finite in {values.non_finite} of {values.count} seeds"
-    text = spread_text(values, ".4g", ".2g")
-    intervals = [each[name] for each in rows["theta_interval"] if each is not None]
-    if not intervals:
-        return text
-    finite = [interval for interval in intervals if interval]
-    if not finite:
-        return f"{text}, 95 % interval not finite"
-    text += f", 95 % ± {spread([(high - low) / 2 for low, high in finite]).mean:.2g}"
-    text += f" in {len(finite)} of {len(intervals)} seeds" if len(finite) < len(intervals) else ""
-    true = None if truth is None else sum(low <= truth <= high for low, high in finite)
-    return text if true is None else f"{text} ({true} of {len(intervals)} true)"
+    return spread_text(values, ".4g", ".2g")
 
 
 def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> list[Table]:

@@ -18,7 +18,6 @@ METHODS = (
     *("hybrid", "expert_augmentation", "theta_p_only", "theta_d_only", "last_layer", "least_squares"),
     "constant_disturbance",
 )
-WITHOUT_INTERVAL = ("theta_d_only", "last_layer", "constant_disturbance")
 DOMAINS = ("parameter_shift", "external_force")
 
 
@@ -49,10 +48,6 @@ def test_the_report_keeps_its_contract(folder):
     for row in rows:
         assert set(row) == set(ROW)
         assert all(isinstance(row[key], kind) for key, kind in ROW.items()), row
-        fitted = row["mode"] == "fine_tuned" and row["model"] not in WITHOUT_INTERVAL
-        assert (row["theta_interval"] is not None) == fitted
-        for name, (low, high) in (row["theta_interval"] or {}).items():
-            assert low < row["theta"][name] < high
     assert [claim["id"] for claim in report["claims"] + report["not_judged"]] == ["C9"]
     assert (folder / "standings.png").read_bytes().startswith(b"\x89PNG")
 

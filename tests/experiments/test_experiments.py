@@ -31,7 +31,7 @@ EXPERIMENTS = ("param_shift", "external_force")
 BANDS = ("low", "middle", "high")  # of altitude
 ROW = {
     "domain": str, "model": str, "mode": str, "n_train": int, "draw": int, "seed": int, "test_mse": float, "rho": float,
-    "val_mse": float, "epochs": int, "status": str, "theta": dict | None, "theta_interval": dict | None,
+    "val_mse": float, "epochs": int, "status": str, "theta": dict | None,
 }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from experiments.paper.claims import DOMAINS_OF
 from experiments.paper.figures import HOME, scores
-from experiments.paper.lanes import THETA, by_altitude
+from experiments.paper.lanes import by_altitude
 from experiments.paper.study import placeholder
 from experiments.paper.tables import altitudes, parameters, run_notes
 from experiments.reporting.claims import OUTCOMES
@@ -32,7 +32,7 @@ def test_report_json_keeps_the_contract(tmp_path):
     assert {"experiment", "config", "environment", "rows", "claims", "not_judged"} <= set(record)
     assert set(record["environment"]) >= {"versions", "hardware", "seconds"}
     assert set(PACKAGES) < set(record["environment"]["versions"])
-    fields = "domain model mode n_train seed test_mse draw rho val_mse epochs status theta theta_interval"
+    fields = "domain model mode n_train seed test_mse draw rho val_mse epochs status theta"
     assert all(list(row) == fields.split() for row in record["rows"])
     assert any(row["test_mse"] is None and row["rho"] is None for row in record["rows"])
     assert all(set(claim) == {"id", "text", "holds", "measured"} for claim in record["claims"])
@@ -43,22 +43,13 @@ def test_report_json_keeps_the_contract(tmp_path):
     assert record["truth_theta"] == TRUTH
 
 
-def test_parameters_have_spread_and_interval_width():
-    ends = {"Ix": [0.039, 0.0402], "Iy": None, "k": None}
+def test_parameters_have_the_spread_over_seeds_and_the_truth():
     cell = make_rows().where(model="hybrid", mode="fine_tuned", n_train=100)
     thetas = [TRUTH | {"Ix": 0.0398 + offset} for offset in (-4e-4, 0.0, 4e-4)]
-    rows = [{**row, "theta": theta, "theta_interval": ends} for row, theta in zip(cell, thetas, strict=True)]
-    some = [{**rows[0], "theta_interval": dict.fromkeys(THETA)}, *rows[1:]]
-    for given_rows, shown in (
-        (rows, "0.0398 ± 0.0004, 95 % ± 0.0006 (3 of 3 true)"),
-        (some, "0.0398 ± 0.0004, 95 % ± 0.0006 in 2 of 3 seeds (2 of 3 true)"),
-    ):
-        (table,) = parameters(Results(given_rows), TRUTH)
-        assert table.lines[0][3] == shown
-        assert table.lines[0][4] == "0.02 ± 0, 95 % interval not finite"
-        assert table.lines[-1] == ("truth", "", "", "0.04", "0.02", "8.5e-06")
-        (unknown,) = parameters(Results(given_rows), None)
-        assert unknown.lines[0][3] == shown.partition(" (")[0]
+    rows = Results([{**row, "theta": theta} for row, theta in zip(cell, thetas, strict=True)])
+    (table,), (unknown,) = parameters(rows, TRUTH), parameters(rows, None)
+    assert table.lines[0][3:5] == unknown.lines[0][3:5] == ("0.0398 ± 0.0004", "0.02 ± 0")
+    assert table.lines[-1] == ("truth", "", "", "0.04", "0.02", "8.5e-06")
 
 
 def test_errors_by_altitude_are_means_over_the_windows_of_each_band():
