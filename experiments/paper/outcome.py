@@ -153,9 +153,9 @@ def draw(
         "example_flight": (example, "A flight like those of the data (paper, Fig. 7)"),
     }
     if {*config.models} - {NO_PHYSICS}:
-        figures["theta"] = (theta(found.rows, truth), "Physical parameters after training, against the truth")
+        figures["theta"] = theta(found.rows, truth), "Physical parameters after training, against the truth"
     if {*config.models} - {PHYSICS_ONLY}:
-        figures["predictions"] = (paths(title, found), "How predictions part from the truth (paper, Figs. 2, 4)")
+        figures["predictions"] = paths(title, found), "How predictions part from the truth (paper, Figs. 2, 4)"
     return figures
 
 
@@ -164,18 +164,17 @@ def paths(title: str, found: Study) -> Figure:
     tuned = [lanes for lanes in found.lanes if lanes.mode == FINE_TUNED and lanes.model != PHYSICS_ONLY]
     test = found.target.splits["test"][:DRAWN_FLIGHTS]
     sizes = {row["n_train"] for row in tuned[0].rows}
-    shown = {100, 500, 1000} & sizes or set(sorted(sizes)[:3])
+    shown = sorted({100, 500, 1000} & sizes or sizes)[:3]
     # Not `Model.predict`, which raises if a prediction diverges.
     predicting = jit_with(FASTEST_COMPILE)(predict)
     start = np.asarray(test.x0)[:, None]
-    predicted: dict[int, dict[str, np.ndarray]] = {n: {} for n in sorted(shown)}
+    predicted: dict[int, dict[str, np.ndarray]] = {n: {} for n in shown}
     for lanes in tuned:
         for i, row in enumerate(lanes.rows):
             if row["seed"] == lanes.rows[0]["seed"] and row["n_train"] in shown:
                 states = np.asarray(predicting(lane(lanes.fields, i), test.x0, test.u, test.dt, compact(None)))
                 predicted[row["n_train"]][lanes.model] = np.concatenate([start, states], axis=1)
     truth = np.concatenate([start, np.asarray(test.x)], axis=1)
-    first = next(iter(predicted[min(shown)].values()))
-    errors = np.square(first - truth).sum(-1).mean(-1)  # those of flights that diverged sort last
-    middle = int(np.argsort(errors)[len(errors) // 2])
+    errors = np.square(predicted[shown[0]][tuned[0].model] - truth).sum(-1).mean(-1)
+    middle = int(np.argsort(errors)[len(errors) // 2])  # errors of flights that diverged sort last
     return predictions(predicted, truth, middle, test.dt, f"{title}: predictions of {len(truth)} test flights")

@@ -7,7 +7,7 @@ from typing import Any
 from experiments.paper.claims import FEW
 from experiments.paper.lanes import BANDS, MODELS, THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.reporting import names
-from experiments.reporting.claims import Verdict
+from experiments.reporting.claims import Verdict, every
 from experiments.reporting.names import FINE_TUNED, HYBRID, NO_PHYSICS, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import (
@@ -73,35 +73,30 @@ def conclusion(rows: Results) -> list[str]:
     sentences = []
     for place, group in _places(rows):
         n = min(adapted_sizes(group), default=0)
-        found = {cell: own.spread("test_mse") for cell, own in cells(group).items() if cell[2] in (0, n)}
-        finite = {cell: values.mean for cell, values in found.items() if math.isfinite(values.mean)}
-        if not finite:
+        own = {cell: of_cell for cell, of_cell in ranked(group).items() if cell[2] in (0, n)}
+        best = next(iter(own))
+        if not math.isfinite(own[best].spread("test_mse").mean):
             continue
-        best = min(finite, key=finite.__getitem__)
-        sentence = (
-            f"With N = {n}{place}, {label(*best[:2])} has the smallest test error, {error_text(cells(group)[best])}"
-        )
-        source = found.get((HYBRID, SOURCE_ONLY, 0))
-        sentences.append(sentence + (f"; without adaptation it is {spread_text(source)}." if source else "."))
-        gone = {model: cells(group).get((model, FINE_TUNED, n)) for model in (HYBRID, NO_PHYSICS)}
-        words = [f"{label(model)} {100 * own.spread(gain).mean:.0f} %" for model, own in gone.items() if own]
+        sentence = f"With N = {n}{place}, {label(*best[:2])} has the smallest test error, {error_text(own[best])}"
+        source = own.get((HYBRID, SOURCE_ONLY, 0))
+        before = f"; without adaptation it is {spread_text(source.spread('test_mse'))}" if source else ""
+        gone = {model: own.get((model, FINE_TUNED, n)) for model in (HYBRID, NO_PHYSICS)}
+        words = [f"{label(model)} {100 * each.spread(gain).mean:.0f} %" for model, each in gone.items() if each]
+        sentences += [f"{sentence}{before}."]
         sentences += [f"Of the source's error, fine-tuning removes: {', '.join(words)}."] * (len(words) == 2)
     return sentences
 
 
 def meaning(verdicts: Sequence[Verdict]) -> list[str]:
     """What the verdicts on C1, C2 and C6 say to a reader, in one sentence."""
-    holds = {each.holds for each in verdicts if each.id in ("C1", "C2", "C6")}
-    if not holds:
-        return []
-    if holds == {True}:
-        return [
-            "A model with physics in it, adapted to a little flight, predicts better than before the change and better "
-            "than a network without physics: what the paper claims holds (C1, C2, C6)."
-        ]
-    if False in holds:
-        return ["What the paper claims of the fine-tuned hybrid (C1, C2, C6) does not hold in these runs."]
-    return ["These runs do not decide what the paper claims of the fine-tuned hybrid (C1, C2, C6)."]
+    sentences = {
+        True: "A model with physics in it, adapted to a little flight, predicts better than before the change and better "
+        "than a network without physics: what the paper claims holds (C1, C2, C6).",
+        False: "What the paper claims of the fine-tuned hybrid (C1, C2, C6) does not hold in these runs.",
+        None: "These runs do not decide what the paper claims of the fine-tuned hybrid (C1, C2, C6).",
+    }
+    outcomes = [each.holds for each in verdicts if each.id in ("C1", "C2", "C6")]
+    return [sentences[every(outcomes)]] if outcomes else []
 
 
 def altitudes(rows: Results) -> list[Table]:
@@ -223,15 +218,18 @@ def run_notes(rows: Results) -> list[str]:
         f"met a non-finite loss{when} and count with their best epoch before it": diverged,
         "have a test error that is not finite; it counts as infinite (∞)": rows.where(test_mse=None),
     }
-    notes = []
-    for words, found in kinds.items():
-        counted = [
+
+    def counted(found: Results) -> str:
+        return "; ".join(
             f"{label(model, mode)}, N = {n}{f', {label(domain)}' if several else ''}: {len(cell)}"
             for domain, group in by_domain(found).items()
             for (model, mode, n), cell in cells(group).items()
-        ]
-        notes.append(f"{len(found)} of {len(rows)} runs {words}" + (f" ({'; '.join(counted)})." if counted else "."))
-    return notes
+        )
+
+    return [
+        f"{len(found)} of {len(rows)} runs {words}" + (f" ({counted(found)})." if found else ".")
+        for words, found in kinds.items()
+    ]
 
 
 def _places(rows: Results) -> list[tuple[str, Results]]:
