@@ -90,8 +90,8 @@ def conclusion(rows: Results) -> list[str]:
 def meaning(verdicts: Sequence[Verdict]) -> list[str]:
     """What the verdicts on C1, C2 and C6 say to a reader, in one sentence."""
     sentences = {
-        True: "A model with physics in it, adapted to a little flight, predicts better than before the change and better "
-        "than a network without physics: what the paper claims holds (C1, C2, C6).",
+        True: "A model with physics in it, adapted to a little flight, predicts better than before the change and "
+        "better than a network without physics: what the paper claims holds (C1, C2, C6).",
         False: "What the paper claims of the fine-tuned hybrid (C1, C2, C6) does not hold in these runs.",
         None: "These runs do not decide what the paper claims of the fine-tuned hybrid (C1, C2, C6).",
     }

@@ -50,7 +50,7 @@ def run(
         if config.distributed:
             alike = config.described() | {name: source_digest(name) for name in ("hybrid_jax", "experiments")}
             try:
-                hosts.initialize(config.coordinator, config.processes, config.process_id, alike)
+                hosts.initialize(config.coordinator, config.processes, config.process_id, alike, config.timeout)
             except ValueError as error:
                 raise ValueError(f"--distributed: {error}") from error
         for number in (signal.SIGTERM, signal.SIGHUP):
@@ -68,7 +68,11 @@ def run(
                     raise ValueError(f"--out: another run is writing to {folder}; {wait}") from None
                 say = partial(console.print, highlight=False, soft_wrap=True)
                 stack.enter_context(recorded(folder, config, say))
-            experiment(config, console)
+            try:
+                experiment(config, console)
+            except hosts.PeerLost as lost:
+                on = "the same command goes on from what process 0 has saved, with any number of processes"
+                raise hosts.PeerLost(f"{lost}; {on}") from lost
 
 
 def check(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> None:

@@ -23,7 +23,7 @@ else:  # the command line offers what the registry holds
     Activation = Literal[tuple(ACTIVATIONS)]
 
 # Options that do not affect the results.
-UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id")
+UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id", "timeout")
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,8 @@ class Run:
     """With --distributed: the number of processes."""
     process_id: int | None = None
     """With --distributed: the index of this process, from 0."""
+    timeout: Positive = 120.0
+    """With --coordinator: seconds after which a process that does not come, or does not answer, is taken for lost."""
 
     def __post_init__(self):
         if not self.distributed and (self.coordinator, self.processes, self.process_id) != (None, None, None):

@@ -9,15 +9,17 @@ from typing import Any
 
 from experiments.reporting.results import leaves
 from experiments.runner.options import Run
+from hybrid_jax import kernels
 from hybrid_jax.cli.command import ChecksFailed, Explained
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_atomic
-from hybrid_jax.runtime import hardware
+from hybrid_jax.runtime import cores, hardware
 
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax")
 FILE = "run.json"
 HINT = "  --fresh starts anew and moves it aside; another --out leaves it as it is"
 FIXED = ("config", "versions", "flights")  # a run resumes only if these are equal
+MACHINE = ("machine",)  # where these are not, it says so
 
 
 def environment(stages: Mapping[str, float]) -> dict[str, Any]:
@@ -47,16 +49,21 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
     path, record = folder / FILE, describe(config)
     if config.fresh:
         _move_aside(folder, say)
-    found = read_json(path) if path.exists() else {}
-    if found.get("state") == "unfinished":
+    known = path.exists()
+    found = read_json(path) if known else {"state": None}
+    if known and not (isinstance(found, dict) and {"state", "started", *FIXED} <= found.keys()):
+        raise ValueError(f"{path}: not the record of a run; --fresh starts anew and moves it aside")
+    if found["state"] == "unfinished":
         require_same(f"{folder}: holds an unfinished run, begun {found['started']}", found, record)
-        record["started"] = found["started"]
         say(f"{folder}: goes on with the run begun {found['started']}")
+        for line in _differences(found, record, MACHINE):
+            say(f"{line.strip()}: rows differ, if little, from those of a run on one machine")
+        record |= {name: found[name] for name in ("started", *MACHINE) if name in found}
     write_atomic(path, json_text(record | {"state": "unfinished"}))
     try:
         yield
     except (ValueError, ChecksFailed):
-        if found:
+        if known:
             write_atomic(path, json_text(found))
         else:
             path.unlink()
@@ -72,19 +79,23 @@ def describe(config: Run) -> dict[str, Any]:
         "config": json_value({name: value for name, value in options.items() if name not in given}),
         "versions": versions(*PACKAGES),
         "flights": {name: _sha256(path) for name, path in given.items()},
+        "machine": {"cores": cores(), "kernels": kernels.status().partition("\n")[0]},
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
 
 def require_same(what: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
-    before, now = (dict(leaves({name: each.get(name, {}) for name in FIXED}, ".")) for each in (old, new))
-    lines = [
+    if lines := _differences(old, new, FIXED):
+        raise OtherRun("\n".join([f"{what}, that differs:", *lines, HINT]))
+
+
+def _differences(old: Mapping[str, Any], new: Mapping[str, Any], parts: tuple[str, ...]) -> list[str]:
+    before, now = (dict(leaves({name: each.get(name) or {} for name in parts}, ".")) for each in (old, new))
+    return [
         f"  {name}: {before.get(name, 'absent')} → {now.get(name, 'absent')}"
         for name in sorted(before.keys() | now.keys())
         if before.get(name) != now.get(name)
     ]
-    if lines:
-        raise OtherRun("\n".join([f"{what}, that differs:", *lines, HINT]))
 
 
 def _move_aside(folder: Path, say: Callable[[str], None]) -> None:

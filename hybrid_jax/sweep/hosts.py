@@ -1,14 +1,13 @@
-"""Several processes: initialisation, gathering results on every process, and detection of lost peers.
+"""Several processes: initialisation, and results on every process.
 
 All processes run the same program on the same data and call these functions in the same order. Only results, and what
 process 0 decides or reads, travel between them. Every function that communicates raises PeerLost when another process
-has ended.
+is lost; the same command then goes on from what process 0 has saved, with any number of processes.
 """
 
-import contextlib
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -17,11 +16,10 @@ from jax.experimental import multihost_utils
 from jax.sharding import Sharding
 from jaxtyping import PyTree
 
+from hybrid_jax.sweep.peers import PeerLost, Peers
+
 Arrays = Mapping[str, np.ndarray]
-
-
-class PeerLost(ConnectionError):
-    """Another process of this run has ended before its work was done."""
+_known: list[Peers] = []  # of this run, where the coordinator was given
 
 
 def initialize(
@@ -29,26 +27,39 @@ def initialize(
     processes: int | None = None,
     process: int | None = None,
     alike: Mapping[str, Any] | None = None,
+    timeout: float = 120.0,
 ) -> None:
     """Join a multi-process run, whose process 0 is at `coordinator`, host:port. Call it before the first array is made.
 
-    Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open MPI, Kubernetes, Cloud TPU). `alike` are
-    JSON values by name in which all processes must agree, such as options and a digest of the source.
+    Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open MPI, Kubernetes, Cloud TPU); there the
+    cluster, and not `timeout`, watches over the processes.
+
+    Args:
+        coordinator: host:port of process 0.
+        processes: how many there are.
+        process: the index of this one, from 0.
+        alike: JSON values by name in which all processes must agree, such as options and a digest of the source.
+        timeout: seconds after which a process that does not come, or does not answer, is taken for lost.
 
     Raises:
         ValueError: an argument is missing or inconsistent, or the processes differ in what must be alike.
+        PeerLost: another process did not come.
     """
     jax.config.update("jax_enable_preemption_service", False)  # the host loop handles signals
     try:
+        if coordinator and processes and process is not None and 0 <= process < processes:
+            _known[:] = [Peers(coordinator, processes, process, timeout)]
         jax.distributed.initialize(coordinator, processes, process)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
+        if isinstance(error, PeerLost):
+            raise
         raise ValueError(f"coordinator, processes, process: {error}") from error
     except RuntimeError as error:
         raise PeerLost(f"the processes did not find each other: {error}") from error
     # XLA's connections are made here; afterwards the service that arranges them is not needed.
     _require_alike({"devices": jax.local_device_count()} | dict(alike or {}))
     if jax.default_backend() == "cpu":
-        # Open connections report a lost peer. The coordination service would abort this process before it can save.
+        # The coordination service would abort this process before it can save; `Peers` reports a lost one.
         jax.distributed.shutdown()
 
 
@@ -92,8 +103,7 @@ def gather(tree: PyTree) -> PyTree:
     leaves, structure = jax.tree.flatten(tree)
     # As one array of bytes: an exchange takes milliseconds whatever its size, and JAX would truncate 64-bit numbers.
     rows = [np.ascontiguousarray(leaf).ravel().view(np.uint8) for leaf in leaves]
-    with _detect_lost_peers():
-        found = multihost_utils.process_allgather(np.concatenate(rows))
+    found = _exchange(lambda: multihost_utils.process_allgather(np.concatenate(rows)))
     parts = np.split(found, np.cumsum([len(row) for row in rows])[:-1], axis=1)
     return structure.unflatten(
         np.ascontiguousarray(part).view(leaf.dtype).reshape(-1, *leaf.shape[1:])
@@ -112,8 +122,7 @@ def from_first(make: Callable[[], tuple[Any, Arrays]]) -> tuple[Any, Arrays]:
         return make()
     message = np.frombuffer(_pack(*make()), np.uint8) if is_main_process() else np.zeros(0, np.uint8)
     message = np.resize(message, agreed(len(message)))  # of the same shape everywhere; only that of process 0 counts
-    with _detect_lost_peers():
-        return _unpack(multihost_utils.broadcast_one_to_all(message))
+    return _unpack(_exchange(lambda: multihost_utils.broadcast_one_to_all(message)))
 
 
 def _pack(about: Any, arrays: Arrays) -> bytes:
@@ -129,13 +138,9 @@ def _unpack(message: np.ndarray) -> tuple[Any, Arrays]:
         return json.loads(entries["about"].tobytes()), arrays
 
 
-@contextlib.contextmanager
-def _detect_lost_peers() -> Iterator[None]:
-    """Turn the runtime's errors about a broken connection into one line."""
+def _exchange(call: Callable[[], Any]) -> Any:
+    """The result of a call that waits for all processes."""
     try:
-        yield
+        return _known[0].waited_for(call) if _known else call()
     except (RuntimeError, ValueError) as error:  # of the launch, or of a result that never arrived
-        raise PeerLost(
-            "another process of this run has ended; the same command goes on from what process 0 has saved, with any "
-            f"number of processes ({str(error).splitlines()[0]})"
-        ) from error
+        raise PeerLost(f"another process of this run has ended ({str(error).splitlines()[0]})") from error

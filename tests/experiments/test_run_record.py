@@ -99,3 +99,26 @@ def test_bad_input_begins_no_run_and_ends_none(tmp_path, error):
     interrupt(tmp_path, SMOKE, OSError)
     interrupt(tmp_path, SMOKE, error)
     assert record(tmp_path)["state"] == "unfinished"
+
+
+@pytest.mark.parametrize("text", ["[]", "null", '{"state": "unfinished"}', "[" * 100_000, "{"])
+def test_what_is_no_record_is_refused_in_a_line_and_kept(tmp_path, text):
+    (tmp_path / FILE).write_text(text)
+    with pytest.raises(ValueError, match=rf"{FILE}: (not the record of a run; --fresh|truncated or not JSON)"):
+        finish(tmp_path, SMOKE)
+    assert (tmp_path / FILE).read_text() == text
+
+
+def test_a_run_that_goes_on_with_other_cores_or_kernels_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr("experiments.runner.run_record.cores", lambda: 2)
+    interrupt(tmp_path, SMOKE)
+    began, said = record(tmp_path)["machine"], []
+    monkeypatch.setattr("experiments.runner.run_record.cores", lambda: 1)
+    monkeypatch.setattr("hybrid_jax.kernels.status", lambda: "not used: no compiler\nmore")
+    finish(tmp_path, SMOKE, said.append)
+    about = "rows differ, if little, from those of a run on one machine"
+    assert said[1:] == [
+        f"machine.cores: 2 → 1: {about}",
+        f"machine.kernels: {began['kernels']} → not used: no compiler: {about}",
+    ]
+    assert record(tmp_path)["machine"] == began

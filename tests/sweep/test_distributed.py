@@ -29,7 +29,7 @@ import jax
 jax.config.update("jax_num_cpu_devices", 2)
 from hybrid_jax.sweep import hosts
 if len(sys.argv) > 2:
-    hosts.initialize(sys.argv[2], 2, int(sys.argv[3]))
+    hosts.initialize(sys.argv[2], 2, int(sys.argv[3]), timeout=10)
 import numpy as np
 from pendulum import DAMPING, pendulum, swings
 from rich.console import Console
@@ -160,7 +160,7 @@ def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, la
     _, said = other.communicate(timeout=60)
     assert time.monotonic() - since < FAST
     assert other.returncode == 1
-    assert said.strip().splitlines()[-1].startswith("gone: another process of this run has ended; the same command")
+    assert said.strip().splitlines()[-1] == f"gone: process {victim} has ended"
     assert len(list(folder.glob("*.begun"))) == (victim == 1)  # process 0 saves when another is lost
     for processes in later:
         left = shutil.copytree(folder, tmp_path / f"left to {processes}", dirs_exist_ok=True)
@@ -168,6 +168,27 @@ def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, la
         assert ("goes on where it was interrupted" in texts[0][1]) == (victim == 1)
         assert {said.split()[-1] for said, _ in texts} == {digest}
         assert all(said.split()[-2] == str(2 * processes) for said, _ in texts)
+
+
+def test_a_stopped_process_is_named_and_the_state_saved(whole, tmp_path):
+    _, programs = whole
+    both = pair(programs, tmp_path)
+    assert any("3 runs, epoch" in line for line in both[0].stderr)
+    both[1].send_signal(signal.SIGSTOP)
+    try:
+        _, said = both[0].communicate(timeout=120)
+    finally:
+        both[1].kill()
+    assert said.strip().splitlines()[-1] == "gone: process 1 has not answered for 10 s"
+    assert both[0].returncode == 2
+    assert len(list(tmp_path.glob("*.begun"))) == 1
+
+
+def test_a_process_whose_peer_never_comes_says_so(tmp_path):
+    options = "--distributed", "--coordinator", address(), "--processes", "2", "--process-id", "0", "--timeout", "2"
+    process = experiment(tmp_path / "out", tmp_path / "cache", *options)
+    assert process.communicate(timeout=120)[1] == "param_shift: process 1 did not come within 2 s\n"
+    assert process.returncode == 2
 
 
 @pytest.mark.parametrize(
