@@ -1,10 +1,12 @@
 """One constructed flight, exact in every record: position is chosen, all else follows from it by Newton and Euler."""
 
+import gzip
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from writers import PX4_STATES, stamped
+from writers import PX4_STATES, stamped, ulog
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.log import FlightLog
@@ -12,6 +14,20 @@ from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import IRIS
 
 DT = 0.01
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Writes bytes, text or the topics of a ULog, and returns the path."""
+
+    def write(content, name="", packed=False):
+        name = name or f"flight.{'csv' if isinstance(content, str) else 'log'}"
+        content = ulog(content) if isinstance(content, dict) else content
+        content = content.encode() if isinstance(content, str) else content
+        (tmp_path / name).write_bytes(gzip.compress(content) if packed else content)
+        return tmp_path / name
+
+    return write
 
 
 @pytest.fixture(scope="session")

@@ -117,15 +117,11 @@ def test_attenuation_at_the_cutoff(flight):
     np.testing.assert_allclose(low_pass(slow, 5.0)[0].x[middle, 12], slow.x[middle, 12], atol=1e-3)
 
 
-def test_filters_do_not_reach_across_gaps(flight):
+def test_filters_end_at_gaps_and_repeated_samples(flight):
     other = flight.x.copy()
     other[420:, 10:] += 5.0
-    a, _ = low_pass(with_gap(flight), 5.0)
-    b, _ = low_pass(with_gap(FlightLog(flight.t, other, flight.u)), 5.0)
+    a, b = (low_pass(with_gap(FlightLog(flight.t, x, flight.u)), 5.0)[0] for x in (flight.x, other))
     np.testing.assert_array_equal(a.x[:400], b.x[:400])
-
-
-def test_filters_drop_repeated_samples(flight):
     log, done = low_pass(with_repeat(flight), 20.0)
     assert [part.stop - part.start for part in segments(log)] == [700, len(flight) - 701]
     assert "1 repeated samples left out" in done
@@ -147,11 +143,6 @@ def test_motors_that_turn_before_take_off_carry_nothing(flight):
     np.testing.assert_array_equal(log.t, flight.t[200:])
     x[:, 2] = 0.0
     refusal(lambda: in_flight(FlightLog(flight.t, x, u)), "stays on the ground")
-
-
-@pytest.mark.parametrize("cutoff", [0.0, 50.1, -1.0, np.nan])
-def test_impossible_cutoffs_are_refused(flight, cutoff):
-    refusal(lambda: low_pass(flight, cutoff), "cutoff must lie between 0 and half the sampling frequency")
 
 
 @pytest.mark.parametrize("steps", [-3, 0, 4])

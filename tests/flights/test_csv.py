@@ -20,17 +20,6 @@ def rows_of(log):
     return [",".join(map(repr, row)) for row in np.column_stack([log.t, log.x, log.u]).tolist()]
 
 
-@pytest.fixture
-def written(tmp_path):
-    def write(text, name="flight.csv", packed=False):
-        path = tmp_path / name
-        content = text if isinstance(text, bytes) else text.encode()
-        path.write_bytes(gzip.compress(content) if packed else content)
-        return path
-
-    return write
-
-
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_a_log_is_read_to_the_last_digit(flight, written, packed, end):

@@ -19,15 +19,6 @@ from hybrid_jax.flights.log import COLUMNS, FlightLog
 from hybrid_jax.vehicle import IRIS
 
 
-@pytest.fixture
-def written(tmp_path):
-    def write(content, name="flight.log"):
-        (tmp_path / name).write_bytes(content)
-        return tmp_path / name
-
-    return write
-
-
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_crazyflie_log_is_the_flight_it_holds(flight, written, packed):
     content = crazyflie(flight)
@@ -207,24 +198,16 @@ def test_events_and_armings_without_frames_are_no_damage(flight, written):
 
 def test_commands_of_pwm_and_headers_of_other_types_are_read(flight, written):
     pytest.importorskip("orangebox")
-    headers = ["vbatcellvoltage:unknown", "motor_poles:12"]
+    headers = ["vbatcellvoltage:unknown", "motor_poles:12", "blackbox_high_resolution:1"]
     signals = read_recording(written(blackbox(flight[:200], headers=headers, digital=False), "flight.bbl")).signals
     last = len(signals["command"])
     np.testing.assert_allclose(signals["command"].values, flight.u[:last] / 1000, atol=6e-4)
     np.testing.assert_allclose(signals["rotor_speed"].values, flight.u[:last] * 14 / 12, atol=1)
+    np.testing.assert_allclose(signals["rates"].values, flight.x[:last, 10:] / 10, atol=1e-3)
     refusal(lambda: read_recording(written(blackbox(flight[:20], headers=["acc_1G:big"]), "a.bbl")), "header acc_1G")
 
 
-def test_a_fine_gyro_is_ten_times_finer(flight, written):
-    pytest.importorskip("orangebox")
-    usual, fine = (
-        read_recording(written(blackbox(flight[:200], headers=headers), "flight.bbl")).signals["rates"].values
-        for headers in ([], ["blackbox_high_resolution:1"])
-    )
-    np.testing.assert_allclose(fine, usual / 10)
-
-
-def test_the_compressed_state_of_a_crazyflie_is_read(flight, written):
+def test_the_compressed_state_and_the_filter_of_a_crazyflie_are_read(flight, written):
     """quatcompress.h: the place of the largest of x, y, z, w in two bits, then a sign and nine bits for each other."""
     columns = {f"stateEstimateZ.{axis}": 1000 * column for axis, column in zip("xyz", flight.x.T, strict=False)}
     columns |= {f"stateEstimateZ.v{axis}": 1000 * flight.x[:, 7 + i] for i, axis in enumerate("xyz")}
@@ -242,19 +225,14 @@ def test_the_compressed_state_of_a_crazyflie_is_read(flight, written):
     columns["stateEstimateZ.quat"] = np.array(packed)
     kinds = dict.fromkeys(columns, "h") | {"stateEstimateZ.quat": "I"}
     path = written(usd(columns, np.round(flight.t * 1e6).astype(int), kinds))
-    signals = read_recording(path).signals
-    np.testing.assert_allclose(signals["position"].values, flight.x[:, :3], atol=1e-3)
-    np.testing.assert_allclose(signals["rates"].values, flight.x[:, 10:], atol=1e-3)
-    near = np.abs((signals["attitude"].values * flight.x[:, 3:7]).sum(axis=1))
-    assert near.min() > 1 - 1e-5
-
-
-def test_the_filter_of_a_crazyflie_is_read(flight, written):
-    columns = {f"kalman.state{axis}": column for axis, column in zip("XYZ", flight.x.T, strict=False)}
-    columns |= {f"kalman.q{i}": flight.x[:, 3 + i] for i in range(4)}
-    signals = read_recording(written(usd(columns, np.round(flight.t * 1e6).astype(int)))).signals
-    np.testing.assert_allclose(signals["position"].values, flight.x[:, :3], atol=1e-6)
-    np.testing.assert_allclose(signals["attitude"].values, flight.x[:, 3:7], atol=1e-6)
+    kalman = {f"kalman.state{axis}": column for axis, column in zip("XYZ", flight.x.T, strict=False)}
+    kalman |= {f"kalman.q{i}": flight.x[:, 3 + i] for i in range(4)}
+    for found in (path, written(usd(kalman, np.round(flight.t * 1e6).astype(int)), "kalman")):
+        signals = read_recording(found).signals
+        np.testing.assert_allclose(signals["position"].values, flight.x[:, :3], atol=1e-3)
+        assert np.abs((signals["attitude"].values * flight.x[:, 3:7]).sum(axis=1)).min() > 1 - 1e-5
+        if "rates" in signals:
+            np.testing.assert_allclose(signals["rates"].values, flight.x[:, 10:], atol=1e-3)
 
 
 def test_events_of_a_crazyflie_have_their_own_times(flight, written):

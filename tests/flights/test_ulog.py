@@ -25,16 +25,6 @@ from hybrid_jax.vehicle import IRIS
 pytest.importorskip("pyulog", reason="reading ULog needs the extra `logs`")
 
 
-@pytest.fixture
-def written(tmp_path):
-    def write(topics):
-        path = tmp_path / "flight.ulg"
-        path.write_bytes(topics if isinstance(topics, bytes) else ulog(topics))
-        return path
-
-    return write
-
-
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_flight_with_esc_rpm_is_read(flight, topics, written, packed):
     t = flight.t - flight.t[0]
@@ -205,7 +195,7 @@ def test_other_files_are_refused(flight, topics, written, tmp_path):
     topics = topics | {"esc_status": escs(flight.t - flight.t[0], flight.u)}
     whole = ulog(topics)
     for content in (b"", b"t,px,py\n", whole[:7]):
-        refusal(lambda content=content: read_ulog(written(content)), "flight.ulg")
+        refusal(lambda content=content: read_ulog(written(content)), "flight.log")
     refusal(lambda: read_ulog(tmp_path / "none.ulg"), "none.ulg", "no such file")
     zero = stamped(np.arange(0.0, 5, 0.01), np.zeros((500, 4)))
     refusal(lambda: read_ulog(written(topics | {"vehicle_attitude": zero})), "vehicle_attitude", "norm")
@@ -228,4 +218,4 @@ def test_a_clock_that_jumps_is_refused_or_a_gap(flight, topics, written):
     assert "split the file" in line
     back = rates[:1000] + stamped(np.arange(0.0, 1, 0.005), np.ones((200, 3)))
     content = ulog({"vehicle_angular_velocity": back}, ordered=False)
-    refusal(lambda: read_ulog(written(content)), "flight.ulg", "vehicle_angular_velocity", "time goes back from")
+    refusal(lambda: read_ulog(written(content)), "flight.log", "vehicle_angular_velocity", "time goes back from")
