@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
 from hybrid_jax.flights.checks.cleaning import delay_motors
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, NOTHING, OK, UNKNOWN, WARNS, check_log
 from hybrid_jax.flights.checks.motor_response import orders
@@ -34,13 +33,6 @@ def noisy(log, rng):
     return FlightLog(log.t, x, log.u + rng.normal(size=log.u.shape))
 
 
-def as_ned(log):
-    """The numbers that a logger in NED and FRD would have written."""
-    world, body = WORLDS["NED"], BODIES["FRD"]
-    q = quaternion_of(rotation_of(np.eye(4)[:1]).from_matrix(world.T @ rotation_of(log.x[:, 3:7]).as_matrix() @ body))
-    return with_parts(log, log.x[:, :3] @ world, q, log.x[:, 7:10] @ world, log.x[:, 10:] @ body)
-
-
 @pytest.mark.parametrize("noise", [False, True])
 def test_a_sound_flight_passes(flight, noise):
     log = noisy(flight, np.random.default_rng(0)) if noise else flight
@@ -48,18 +40,10 @@ def test_a_sound_flight_passes(flight, noise):
         assert (check.verdict, check.suggestion) == (OK, NOTHING), check
 
 
-def gyro_in_world(log):
-    return with_parts(log, omega=rotation_of(log.x[:, 3:7]).apply(log.x[:, 10:]))
-
-
 # Beside those of benchmarks/log_mistakes, which test_log_mistakes plants.
 MISTAKES = {
     "no climb": (lambda log: with_parts(log, v=log.x[:, 7:10] * [1, 1, 0]), VELOCITY, "z alone"),
     "dead velocity": (lambda log: with_parts(log, v=log.x[:, 7:10] * [1, 1, 0]), COLUMNS, "vz never changes"),
-    "mm": (lambda log: with_parts(log, p=log.x[:, :3] * 1000), VELOCITY, "position is in mm"),
-    "inverse": (lambda log: with_parts(log, q=log.x[:, 3:7] * [1, -1, -1, -1]), RATES, "world → body"),
-    "degrees": (lambda log: with_parts(log, omega=np.rad2deg(log.x[:, 10:])), RATES, "degrees"),
-    "NED and FRD": (as_ned, THRUST, 'world = "NED" and body = "FRD"'),
     "thrust": (lambda log: with_parts(log, u=log.u * 1.8), RATIO, "thrust_coefficient by 0.30"),
     "lead": (lambda log: with_parts(log[5:], u=log.u[:-5]), LAG, "ms earlier"),
 }
@@ -68,17 +52,12 @@ MISTAKES = {
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_are_found_and_corrections_suggested(flight, mistake):
     make, name, words = MISTAKES[mistake]
-    check = table(make(noisy(flight, np.random.default_rng(1))))[name]
+    log = make(noisy(flight, np.random.default_rng(1)))
+    check = table(log)[name]
     assert check.verdict == FAILS, check
     assert words in check.suggestion, check
-
-
-@pytest.mark.parametrize("mistake", ["mm", "inverse", "degrees", "NED and FRD"])
-def test_mistakes_that_no_vehicle_shows_are_found_without_one(flight, mistake):
-    make, name, words = MISTAKES[mistake]
-    found = {check.name: check for check in check_log(make(flight))}
-    assert (found[name].verdict, words in found[name].suggestion) == (FAILS, True)
-    assert [*found, *NEED_VEHICLE] == [check.name for check in check_log(flight, IRIS)]
+    alone = [check for check in check_log(log, IRIS) if check.name not in NEED_VEHICLE]
+    assert list(map(repr, check_log(log))) == list(map(repr, alone))  # a NaN is no equal of itself
 
 
 @pytest.mark.parametrize("order", orders(4).tolist(), ids=str)
