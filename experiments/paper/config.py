@@ -225,6 +225,8 @@ class AdaptationConfig(Config):
     models: tuple[Model, ...] = MODELS
     """Which models to compare. constant_disturbance: the source's hybrid, of which θ_p and a constant disturbance are
     fitted by least squares."""
+    target_only: bool = True
+    """Train every model on the N target trajectories from a fresh start, too."""
     source_flights: Path | None = None
     """A file of `python -m experiments.make_flights --domain source` to use; by default flights are made and cached."""
     target_flights: Path | None = None
@@ -288,7 +290,7 @@ SMOKE = replace(
 )  # fmt: skip
 # Both ends of the sizes, and less source flight, learnt at rates that converge in it: under a minute on two cores.
 BOTH_ENDS = replace(
-    QUICK, sizes=(100, 1000), source_train=3000, validation=100, max_epochs=600,
+    QUICK, sizes=(100, 1000), target_only=False, source_train=3000, validation=100, max_epochs=600,
     rates=Rates(pretraining=1e-3, no_physics_target_only=1e-3, no_physics=(1e-4, 3e-4, 3e-4, 3e-4, 5e-4)),
     patience=Patience(
         hybrid_pretraining=Stopping(70, 15), no_physics_pretraining=Stopping(100, 15), no_physics=Stopping(150, 20)

@@ -85,7 +85,8 @@ def protocol(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, stages:
             train = partial(pretrained, start, vehicle, config, stages)
             learned[start] = Stage(("pre-training", start), train, (source,), ahead)
             found += [learned[start], test(start, SOURCE_ONLY, learned[start], home)]
-        for mode in (FINE_TUNED,) if model in SOLVED else (FINE_TUNED, TARGET_ONLY):
+        both = config.target_only and model not in SOLVED
+        for mode in (FINE_TUNED, TARGET_ONLY) if both else (FINE_TUNED,):
             ahead = partial(_compile_solved, model, vehicle, config) if model in SOLVED else None
             adapting = partial(_adapted, model, mode, vehicle, config, stages)
             adapt = Stage((mode, model, domain.name), adapting, (learned[start], target), ahead)

@@ -1,23 +1,47 @@
 """Options and presets."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 from experiments.runner.options import Count, Run, distinct
 
+
+class Case(NamedTuple):
+    """A line of the table of forecasts.
+
+    Attributes:
+        kernel: of the residual; 0: none.
+        physics: "diffusion", "complete" or "none".
+        seeds: at most so many of --seeds.
+    """
+
+    name: str
+    kernel: int = 1
+    physics: str = "diffusion"
+    penalty: str | None = None
+    weight: float = 0.0
+    noise: float = 0.0
+    seeds: int = 1
+
+
+POINTWISE, LOCAL = "pointwise", "convolution, neighbours penalised"
+CASES = (
+    Case(POINTWISE, seeds=3),
+    Case("pointwise, noise 0.001", noise=1e-3),
+    Case("pointwise, noise 0.01", noise=1e-2),
+    Case("convolution", 3),
+    Case("convolution, least action", 3, penalty="residual_norm", weight=1e-5),
+    Case("convolution, correlation (paper)", 3, penalty="trajectory_correlation", weight=1e-3),
+    Case(LOCAL, 3, penalty="neighbour_weights", weight=1.0, seeds=3),
+    Case("no physics, convolution", 3, physics="none"),
+    Case("physics alone: diffusion", 0),
+    Case("physics alone: complete", 0, physics="complete"),
+)
 Part = Literal["forecast", "shifted", "gray_scott"]
-CaseName = Literal[
-    "pointwise",
-    "pointwise, noise 0.001",
-    "pointwise, noise 0.01",
-    "convolution",
-    "convolution, least action",
-    "convolution, correlation (paper)",
-    "convolution, neighbours penalised",
-    "no physics, convolution",
-    "physics alone: diffusion",
-    "physics alone: complete",
-]
+if TYPE_CHECKING:
+    CaseName = str
+else:
+    CaseName = Literal[tuple(case.name for case in CASES)]
 Shift = Literal["parameter_shift", "new_term"]
 
 
@@ -29,7 +53,7 @@ class Config(Run):
     """Trials: initial weights and training trajectories. Forecasts take three at most: the tables say how many."""
     parts: tuple[Part, ...] = get_args(Part)
     """forecast: as APHYNITY. shifted: adapt to changed equations. gray_scott: as Neural Context Flows."""
-    cases: tuple[CaseName, ...] = get_args(CaseName)
+    cases: tuple[CaseName, ...] = tuple(case.name for case in CASES)
     """Lines of the table of forecasts."""
     shifts: tuple[Shift, ...] = get_args(Shift)
     """parameter_shift: a × 2, b ÷ 2, k × 2. new_term: u_t has a term that the source never had."""

@@ -5,12 +5,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.reaction_diffusion import shifted
-from experiments.reaction_diffusion.forecast import LOCAL, POINTWISE
+from experiments.reaction_diffusion.config import LOCAL, POINTWISE
 from experiments.reaction_diffusion.gray_scott import SOLVED
 from experiments.reaction_diffusion.report import SHIFT_WORDS, WAYS, _way
 from experiments.reaction_diffusion.shifted import AUTO
 from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, SOURCE_ONLY, TARGET_ONLY
-from experiments.reporting.plots import COLUMN, PAGE, STYLE, colour, legend_below, subplots, tick_errors
+from experiments.reporting.plots import PAGE, STYLE, colour, legend_below, subplots, tick_errors
 from experiments.reporting.results import Results
 from hybrid_jax.io.archive import Arrays
 
@@ -26,8 +26,6 @@ def draw(rows: Results, shown: Shown, patterns: Shown, dt: float) -> dict[str, t
     if known:
         caption = f"u of a test trajectory of FitzHugh–Nagumo: truth, forecast of {known[0]}, and the error"
         found["fields"] = fields(shown, known[0], (0, 4, 9, 24), dt), caption
-    if len(shown) > 2:
-        found["spectra"] = spectra(shown), "Spectrum of u at 2.5 s: truth, and the error of each model's forecast"
     own = rows.where(part=shifted.PART)
     if len(own):
         found["scores"] = scores(own), "Error of forecasts after a change, against the number of target trajectories"
@@ -40,7 +38,7 @@ def draw(rows: Results, shown: Shown, patterns: Shown, dt: float) -> dict[str, t
 @mpl.rc_context(STYLE)
 def fields(shown: Shown, name: str, at: tuple[int, ...], dt: float, component: int = 0) -> Figure:
     """Truth, forecast and error of one component at some steps."""
-    truth, forecast = (_component(part, component)[0] for part in (shown["truth"], _forecast(shown, name)))
+    truth, forecast = (_component(shown[each], component) for each in ("truth", name))
     error = forecast - truth
     figure, axes = subplots((PAGE * 0.8, PAGE * 0.8 * 3 / len(at) * 0.98), 3, len(at))
     low, high, most = truth.min(), truth.max(), np.abs(error[list(at)]).max() or 1.0
@@ -55,21 +53,6 @@ def fields(shown: Shown, name: str, at: tuple[int, ...], dt: float, component: i
         row[0].set_ylabel(label)
         figure.colorbar(image, ax=list(row), shrink=0.9, aspect=12)
     return figure
-
-
-@mpl.rc_context(STYLE)
-def spectra(shown: Shown) -> Figure:
-    """Power of u by wavenumber at the end, of the truth and of the error of each forecast."""
-    truth = _component(shown["truth"], 0)[:, -1]
-    figure, ((axes,),) = subplots((COLUMN * 1.5, COLUMN * 1.1), 1, 1)
-    wavenumbers, power = _spectrum(truth)
-    axes.loglog(wavenumbers, power, "k", label="truth")
-    for i, name in enumerate(name for name in shown if name not in ("start", "truth")):
-        error = _component(_forecast(shown, name), 0)[:, -1] - truth
-        if np.isfinite(error).all():
-            axes.loglog(*_spectrum(error), color=f"C{i}", linestyle=("-", "--")[i > 5], linewidth=1, label=name)
-    axes.set(xlabel="wavenumber [waves per side]", ylabel="mean power of u (truth) and of the error")
-    return legend_below(figure, columns=2)
 
 
 @mpl.rc_context(STYLE)
@@ -100,21 +83,7 @@ def scores(rows: Results) -> Figure:
     return legend_below(figure, meaning="line: median over seeds; dot: a seed; lower is better", columns=3)
 
 
-def _forecast(shown: Shown, name: str) -> np.ndarray:
-    return shown[name]
-
-
 def _component(states: np.ndarray, component: int) -> np.ndarray:
-    """One of two components of states (n, t, d), as squares (n, t, side, side)."""
+    """One of two components of the states (t, d) of the first trajectory, as squares (t, side, side)."""
     side = round((states.shape[-1] / 2) ** 0.5)
-    return states.reshape(*states.shape[:-1], 2, side, side)[..., component, :, :]
-
-
-def _spectrum(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean power by rounded wavenumber, from 1 up."""
-    side = squares.shape[-1]
-    power = np.mean(np.abs(np.fft.fft2(squares) / side**2) ** 2, axis=0)
-    each = np.fft.fftfreq(side, 1 / side)
-    shell = np.rint(np.hypot(each[:, None], each)).astype(int)
-    wavenumbers = np.arange(1, side // 2)
-    return wavenumbers, np.array([max(power[shell == k].mean(), 1e-30) for k in wavenumbers])
+    return states[0].reshape(-1, 2, side, side)[:, component]

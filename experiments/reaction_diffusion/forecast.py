@@ -1,6 +1,5 @@
 """The first study: learn FitzHugh–Nagumo of which physics knows that there is diffusion, as APHYNITY does."""
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -8,7 +7,7 @@ import jax
 import numpy as np
 
 import hybrid_jax as hj
-from experiments.reaction_diffusion.config import Config
+from experiments.reaction_diffusion.config import CASES, Case, Config
 from experiments.reaction_diffusion.models import error, pieces, predicted, weights
 from experiments.reaction_diffusion.systems import COARSE, STEPS, A, B, fitzhugh_nagumo, plane, reacting
 from experiments.reporting.results import Row
@@ -28,37 +27,6 @@ def scaling(kernel: int) -> ChannelScaling:
     """Of what a network reads: the same for all seeds, so that one program serves them. States lie in −0.7 … 1."""
     read = 2 * kernel**2
     return ChannelScaling((0.25,) * read, (0.35,) * read)
-
-
-@dataclass(frozen=True)
-class Case:
-    """A line of the table: a model, what it is penalised by, and what it learns from."""
-
-    name: str
-    kernel: int = 1  # of the residual; 0: none
-    physics: str = "diffusion"  # "diffusion", "complete" or "none"
-    penalty: str | None = None
-    weight: float = 0.0
-    trajectories: int = 1
-    noise: float = 0.0
-    seeds: int = 1  # at most so many of --seeds
-
-
-POINTWISE, CONVOLUTION = "pointwise", "convolution"
-LOCAL = "convolution, neighbours penalised"
-NOISY = {noise: f"pointwise, noise {noise:g}" for noise in (1e-3, 1e-2)}
-CASES = (
-    Case(POINTWISE, seeds=3),
-    Case(NOISY[1e-3], noise=1e-3),
-    Case(NOISY[1e-2], noise=1e-2),
-    Case(CONVOLUTION, 3),
-    Case("convolution, least action", 3, penalty="residual_norm", weight=1e-5),
-    Case("convolution, correlation (paper)", 3, penalty="trajectory_correlation", weight=1e-3),
-    Case(LOCAL, 3, penalty="neighbour_weights", weight=1.0, seeds=3),
-    Case("no physics, convolution", 3, physics="none"),
-    Case("physics alone: diffusion", 0),
-    Case("physics alone: complete", 0, physics="complete"),
-)
 
 
 def untrained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
@@ -81,7 +49,7 @@ def trained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
     steps the best goes on.
     """
     truth = fitzhugh_nagumo(plane(config.points))
-    data = reacting(truth, case.trajectories, (TRAIN, seed), case.noise)
+    data = reacting(truth, 1, (TRAIN, seed), case.noise)
     starts = [untrained(case, config, seed + ANOTHER * i) for i in range(config.starts)]
     hj.check_grid(plane(config.points), data, diffusivity=GUESS, substeps=COARSE.substeps, name="training data")
     if not case.kernel:
@@ -106,7 +74,7 @@ def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]
     def work(case: Case, seed: int) -> Found:
         model = trained(case, config, seed)
         row = {"part": PART, "case": case.name, "seed": seed, "draw": 0, "mse": error(model, test, COARSE)}
-        row |= _found(model) | {"trajectories": case.trajectories, "noise": case.noise}
+        row |= _found(model) | {"trajectories": 1, "noise": case.noise}
         return [row], {"weights": weights(model), "forecast": np.asarray(predicted(model, drawn, COARSE))}
 
     found = kept(PART, {f"{case.name}, seed {seed}": partial(work, case, seed) for case, seed in runs})

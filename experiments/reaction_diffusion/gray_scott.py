@@ -41,8 +41,8 @@ def trained(start: Any, data: hj.Trajectories, steps: int, held: bool) -> Found:
 
 def source_model(config: Config, kept: Kept) -> Any:
     """A hybrid trained on one trajectory in each of the four environments, with F and k of each."""
-    parts = [patterns(gray_scott(TRAINED_IN, reacts=True), e, 1, (TRAIN, e)) for e in range(len(TRAINED_IN))]
-    physics = gray_scott([GUESS] * len(TRAINED_IN), reacts=False)
+    parts = [patterns(gray_scott(TRAINED_IN, True, config.points), e, 1, (TRAIN, e)) for e in range(len(TRAINED_IN))]
+    physics = gray_scott([GUESS] * len(TRAINED_IN), False, config.points)
     data = joined([pieces(part, EVERY) for part in parts])
     hj.check_grid(physics.grid, data, diffusivity=(D_U, D_V), substeps=SCOTT_COARSE.substeps)
     size = {"outputs": 1, "hidden": min(UNITS, config.hidden)}
@@ -62,12 +62,10 @@ def study(config: Config, kept: Kept) -> tuple[list[Row], Arrays]:
     source = source_model(config, kept)
 
     def adapt(index: int, environment: tuple[float, float]) -> Found:
-        truth = gray_scott([environment], reacts=True)
-        seen, test = (
-            patterns(truth, 0, 1, (ADAPT, index)),
-            patterns(truth, 0, -(-config.test // SHARE), (TEST, index)),
-        )
-        middle = hj.Hybrid(gray_scott([GUESS], reacts=False), source.residual)
+        truth = gray_scott([environment], True, config.points)
+        seen = patterns(truth, 0, 1, (ADAPT, index))
+        test = patterns(truth, 0, -(-config.test // SHARE), (TEST, index))
+        middle = hj.Hybrid(gray_scott([GUESS], False, config.points), source.residual)
         fitted: Any = hj.fit_least_squares(middle, pieces(seen, 3, 3), solver=SCOTT_COARSE).field
         feed, kill = (float(value[0]) for value in fitted.physics.theta().values())
         row = {"part": PART, "environment": index, "seed": 0, "draw": 0, "F": environment[0], "k": environment[1]}

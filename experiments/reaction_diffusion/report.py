@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from experiments.paper.claims import CLAIMS, CLEARLY, Evidence, ratio
 from experiments.paper.lanes import cells
 from experiments.reaction_diffusion import forecast, gray_scott, shifted
-from experiments.reaction_diffusion.forecast import LOCAL, POINTWISE
+from experiments.reaction_diffusion.config import LOCAL, POINTWISE
 from experiments.reaction_diffusion.shifted import AUTO
 from experiments.reporting.claims import Claim, Part, Undecided, all_of
 from experiments.reporting.names import (

@@ -22,7 +22,7 @@ DT, STEPS = 0.1, 25
 FINE = hj.RK4(substeps=20)  # of the generator; halving its step changes states by 1e-7
 COARSE = hj.RK4(substeps=2)  # of models: an error of 1e-10 in the mean square, where published models reach 1e-5
 D_U, D_V = 0.2097, 0.105
-SCOTT_DT, SCOTT_STEPS, SCOTT_POINTS = 40.0, 9, 32
+SCOTT_DT, SCOTT_STEPS = 40.0, 9
 SCOTT_FINE, SCOTT_COARSE = hj.RK4(substeps=80), hj.RK4(substeps=40)
 
 
@@ -130,17 +130,16 @@ class Conversion(hj.AbstractVectorField):
         return self.both(as_field(self.rate).parameter_columns(x, u))
 
 
-def gray_scott(environments, reacts: bool) -> GrayScott:
+def gray_scott(environments, reacts: bool, points: int = 32) -> GrayScott:
     """Of (F, k) of each environment."""
-    grid = hj.Grid((SCOTT_POINTS, SCOTT_POINTS), 1.0, 2)
-    return GrayScott(jnp.log(jnp.asarray(environments)), reacts, grid)
+    return GrayScott(jnp.log(jnp.asarray(environments)), reacts, hj.Grid((points, points), 1.0, 2))
 
 
 def patterns(field: GrayScott, environment: int, count: int, seed: tuple[int, ...]) -> hj.Trajectories:
     """`count` trajectories of an environment from t = 0 to 360 s, sampled every 40 s."""
-    rng, points = np.random.default_rng(seed), SCOTT_POINTS
+    rng, points = np.random.default_rng(seed), field.grid.shape[0]
     x0 = np.tile(np.array([0.95, 0.05], np.float32)[:, None, None], (count, 1, points, points))
-    side = points // 10
+    side = max(points // 10, 1)
     for fields in x0:
         for row, column in rng.integers(0, points - side, (3, 2)):
             fields[:, row : row + side, column : column + side] = np.array([0, 1], np.float32)[:, None, None]

@@ -8,7 +8,7 @@ import pytest
 from smoke import experiments, refused, unbegun
 
 import hybrid_jax as hj
-from experiments.reaction_diffusion.forecast import CASES, POINTWISE
+from experiments.reaction_diffusion.config import CASES, POINTWISE
 from experiments.reaction_diffusion.models import pieces
 from experiments.reaction_diffusion.report import claims, tables
 from experiments.reaction_diffusion.systems import (
@@ -110,7 +110,7 @@ def test_the_smallest_preset_reports(tmp_path):
     assert run.returncode == 0, run.stderr
     report = json.loads((tmp_path / "out/reaction_diffusion/report.json").read_text())
     assert {each["part"] for each in report["rows"]} == {"forecast", "shifted", "gray_scott"}
-    assert set(report["figures"]) == {"fields.png", "spectra.png", "scores.png", "gray_scott.png"}
+    assert set(report["figures"]) == {"fields.png", "scores.png", "gray_scott.png"}
 
 
 @pytest.mark.parametrize(
