@@ -28,7 +28,7 @@ SWITCH = "HYBRID_JAX_NATIVE"
 SOURCES = Path(__file__).parent / "cpp"
 HANDLERS = "forward", "backward"
 # Errors and exceptions of the square root are not asked for: without them several are taken at once.
-OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
+OPTIONS = ["-std=c++17", "-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
 LONGEST = 300  # s to compile
 
 Results = jax.ShapeDtypeStruct | Sequence[jax.ShapeDtypeStruct]

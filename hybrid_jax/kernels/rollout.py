@@ -90,7 +90,8 @@ def _called(kernel_and_dt: tuple[Kernel, float], kept: int, *arrays: Array) -> l
 
 def _forward(kernel_and_dt: tuple[Kernel, float], *arrays: Array):
     (d, _, _, units), (x0, u) = kernel_and_dt[0].sizes, arrays[-2:]
-    kept = len(u) * 4 * (_whole(x0.shape[1]) * d + _whole(units)) + VECTOR  # see cpp/rollout.h
+    each = _whole(x0.shape[1]) * (d + units + 1) + _whole(units)  # see cpp/rollout.h
+    kept = len(u) * 4 * each + VECTOR
     states, saved = _called(kernel_and_dt, kept, *arrays)
     return states, (*arrays, saved)
 

@@ -17,8 +17,9 @@
 namespace {
 
 constexpr int STAGES = 4;
+constexpr int UNITS = 8;  // of the layer at a time
 constexpr int64_t SLOTS = 16;  // of factors, which wait for their products
-constexpr int64_t U = H | 1;  // vectors from one n to the next: an even number may put all into the same lines of the cache
+constexpr int64_t U = H ? H | 1 : 0;  // vectors from one n to the next: an even number may put all into the same lines of the cache
 
 // What each stage's slope counts for in the step, and how far along it the next point lies.
 struct Stages {
@@ -48,7 +49,7 @@ struct Windows {
   }
 };
 
-// A lane: b windows of `steps` intervals, and what is kept of each evaluation for the way back, x and q, or nothing.
+// A lane: b windows of `steps` intervals, and what is kept of each evaluation for the way back, or nothing: x, h and q.
 struct Lane {
   int64_t steps, b;
   float dt, epsilon;
@@ -59,19 +60,20 @@ struct Lane {
 
   int64_t blocks() const { return (b + V - 1) / V; }
   int64_t group() const { return H ? blocks() : 1; }  // vectors of windows
-  Vec* point(int64_t first, int64_t t, int stage) const {
-    return kept + ((first * steps + t) * STAGES + stage) * (group() * D + (H + V - 1) / V);
-  }
-  float* q(Vec* point) const { return reinterpret_cast<float*>(point + group() * D); }
+  int64_t size() const { return group() * (D + U) + (H + V - 1) / V; }  // of what is kept of an evaluation
+  Vec* point(int64_t first, int64_t t, int stage) const { return kept + ((first * steps + t) * STAGES + stage) * size(); }
+  Vec* h(Vec* point) const { return point + group() * D; }
+  float* q(Vec* point) const { return reinterpret_cast<float*>(h(point) + group() * U); }
 };
 
-// The layer that couples all windows of a lane: z less its mean, h and n, and the derivatives.
+// The layer that couples all windows of a lane: z less its mean, n of a block of windows, and the derivatives.
 struct Coupling {
   const Lane& lane;
   const int64_t blocks = lane.group();
-  Vec *z = lane.room(blocks * Z), *h = lane.room(blocks * U), *n = lane.room(blocks * U), *dn = lane.room(blocks * U);
+  Vec *z = lane.room(blocks * Z), *dz = lane.room(blocks * Z), *n = lane.room(U), *dn = lane.room(blocks * U);
+  float* scale = reinterpret_cast<float*>(lane.room(U));
 
-  void centre() const {
+  void centre(Vec* z) const {
     const int64_t last = lane.b - (blocks - 1) * V;
     for (int r = 0; r < Z; ++r) {
       Vec all{}, &end = z[(blocks - 1) * Z + r];
@@ -82,66 +84,68 @@ struct Coupling {
       end = first(end, last);
     }
   }
-  void evaluate(const Vec* x, const Vec* u, float* q, bool again) const {
-    const int64_t blocks = this->blocks;
-    Vec *const h = this->h, *const n = this->n;
-    const float *gain = lane.w + GAIN, *shift = lane.w + SHIFT;
+  // z, and unless these are known h and q, some units at a time, so that these stay in the first cache.
+  void evaluate(const Vec* x, const Vec* u, Vec* h, float* q, bool known) const {
     for (int64_t j = 0; j < blocks; ++j) read(lane.w, x + j * D, u + j * M, z + j * Z);
-    centre();
-    for (int64_t j = 0; j < blocks; ++j) dense<H, Z>(lane.w + WEIGHT, Z, 1, z + j * Z, h + j * U);
-    in_tiles<H, 8>([&](auto rows, int i) __attribute__((always_inline)) {
+    centre(z);
+    in_tiles<H, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
-      Vec squares[R] = {}, scale[R], move[R];
-      for (int64_t j = 0; j < blocks && !again; ++j)
+      Vec squares[R] = {};
+      for (int64_t j = 0; j < blocks && !known; ++j) {
+        dense<R, Z>(lane.w + WEIGHT + i * Z, Z, 1, z + j * Z, h + j * U + i);
         UNROLL for (int r = 0; r < R; ++r) squares[r] += h[j * U + i + r] * h[j * U + i + r];
-      for (int r = 0; r < R; ++r) {
-        if (!again) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(lane.b) + lane.epsilon);
-        scale[r] = wide(q[i + r] * gain[i + r]), move[r] = wide(shift[i + r]);
       }
-      for (int64_t j = 0; j < blocks; ++j)
-        UNROLL for (int r = 0; r < R; ++r) n[j * U + i + r] = scale[r] * h[j * U + i + r] + move[r];
+      for (int r = 0; r < R && !known; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(lane.b) + lane.epsilon);
     });
+    for (int i = 0; i < H; ++i) scale[i] = lane.w[GAIN + i] * q[i];
   }
-  // From dn to the derivative with respect to z, which takes its place; adds those with respect to weights.
-  void back(const float* q, Vec* sums) const {
-    const int64_t blocks = this->blocks;
-    Vec *const h = this->h, *const dn = this->dn;
-    in_tiles<H, 8>([&](auto rows, int i) __attribute__((always_inline)) {
+  void normalise(const Vec* h) const {
+    for (int i = 0; i < H; ++i) n[i] = scale[i] * h[i] + lane.w[SHIFT + i];
+  }
+  // From dn to the derivative with respect to z; adds those with respect to weights.
+  void back(const Vec* h, const float* q, Vec* sums) const {
+    std::fill_n(dz, blocks * Z, Vec{});
+    in_tiles<H, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
-      Vec by_scale[R] = {}, by_shift[R] = {}, scale[R], through_q[R];
+      Vec by_scale[R] = {}, by_shift[R] = {}, through_q[R];
       for (int64_t j = 0; j < blocks; ++j)
         UNROLL for (int r = 0; r < R; ++r) {
           const Vec d = dn[j * U + i + r];
           by_scale[r] += d * h[j * U + i + r], by_shift[r] += d;
         }
       for (int r = 0; r < R; ++r) {
-        const float root = q[i + r], factor = lane.w[GAIN + i + r] * root;
+        const float root = q[i + r];
         sums[GAIN + i + r] += root * by_scale[r], sums[SHIFT + i + r] += by_shift[r];
-        scale[r] = wide(factor), through_q[r] = wide(-factor * root * root * sum(by_scale[r]) / float(lane.b));
+        through_q[r] = wide(-scale[i + r] * root * root * sum(by_scale[r]) / float(lane.b));
       }
-      for (int64_t j = 0; j < blocks; ++j)
-        UNROLL for (int r = 0; r < R; ++r) dn[j * U + i + r] = scale[r] * dn[j * U + i + r] + through_q[r] * h[j * U + i + r];
+      for (int64_t j = 0; j < blocks; ++j) {
+        Vec* d = dn + j * U + i;
+        UNROLL for (int r = 0; r < R; ++r) d[r] = scale[i + r] * d[r] + through_q[r] * h[j * U + i + r];
+        dense<Z, R, true>(lane.w + WEIGHT + i * Z, 1, Z, d, dz + j * Z);
+      }
+      add_products<R, Z>(sums + WEIGHT + i * Z, dn + i, U, z, Z, blocks);
     });
-    add_products<H, Z>(sums + WEIGHT, dn, U, z, Z, blocks);
-    for (int64_t j = 0; j < blocks; ++j) dense<Z, H>(lane.w + WEIGHT, 1, Z, dn + j * U, z + j * Z);
-    centre();
+    centre(dz);
   }
 };
 
 void forward_lane(const Lane& lane) {
   const int64_t group = lane.group(), n = group * D;
   const Stages stages(lane.dt);
-  Vec *x = lane.room(n), *slopes = lane.room(n), *total = lane.room(n), *u = lane.room(group * M), *passing = lane.room(n + H);
+  Vec *x = lane.room(n), *slopes = lane.room(n), *total = lane.room(n), *u = lane.room(group * M), *passing = lane.room(lane.size());
   const Coupling coupling{lane};
   for (int64_t first = 0; first < lane.blocks(); first += group) {
     for (int64_t j = 0; j < group; ++j) lane.x0.gather(0, (first + j) * V, false, x + j * D);
     for (int64_t t = 0; t < lane.steps; ++t) {
       for (int64_t j = 0; j < group; ++j) lane.u.gather(t, (first + j) * V, false, u + j * M);
       for (int stage = 0; stage < STAGES; ++stage) {
-        Vec* point = lane.kept ? lane.point(first, t, stage) : passing;
+        Vec *point = lane.kept ? lane.point(first, t, stage) : passing, *h = lane.h(point);
         for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + stages.ahead[stage - 1] * slopes[i] : x[i];
-        if (H) coupling.evaluate(point, u, lane.q(point), false);
-        for (int64_t j = 0; j < group; ++j) slope(lane.w, point + j * D, u + j * M, coupling.n + j * U, slopes + j * D);
+        if (H) coupling.evaluate(point, u, h, lane.q(point), false);
+        for (int64_t j = 0; j < group; ++j) {
+          coupling.normalise(h + j * U);
+          slope(lane.w, point + j * D, u + j * M, coupling.n, slopes + j * D);
+        }
         for (int64_t i = 0; i < n; ++i) total[i] = (stage ? total[i] : x[i]) + stages.share[stage] * slopes[i];
       }
       std::swap(x, total);
@@ -169,14 +173,17 @@ struct Weights {
 void evaluate_back(const Coupling& c, const float* back, Vec* point, const Vec* u, const Vec* d_slope, Weights& weights,
                    Vec* d_point, Vec* d_u) {
   HELD Vec dx[D + 1], du[M + 1];
-  if (H) c.evaluate(point, u, c.lane.q(point), true);
+  Vec* h = c.lane.h(point);
+  float* q = c.lane.q(point);
+  if (H) c.evaluate(point, u, h, q, true);
   for (int64_t j = 0; j < c.blocks; ++j) {
-    slope_back(back, point + j * D, u + j * M, c.n + j * U, d_slope + j * D, d_point + j * D, du, c.dn + j * U, {weights.sums}, weights.next());
+    c.normalise(h + j * U);
+    slope_back(back, point + j * D, u + j * M, c.n, d_slope + j * D, d_point + j * D, du, c.dn + j * U, {weights.sums}, weights.next());
     for (int i = 0; i < M; ++i) d_u[j * M + i] += du[i];
   }
-  if (H) c.back(c.lane.q(point), weights.sums);
+  if (H) c.back(h, q, weights.sums);
   for (int64_t j = 0; j < c.blocks && H; ++j) {
-    read_back(back, point + j * D, u + j * M, c.z + j * Z, dx, du, {weights.sums});
+    read_back(back, point + j * D, u + j * M, c.dz + j * Z, dx, du, {weights.sums});
     for (int i = 0; i < D; ++i) d_point[j * D + i] += dx[i];
     for (int i = 0; i < M; ++i) d_u[j * M + i] += du[i];
   }

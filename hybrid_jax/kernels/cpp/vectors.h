@@ -58,12 +58,13 @@ INLINE void in_tiles(Do of) {
     for (; i < M; i += R - 1) of(std::integral_constant<int, R - 1>{}, i);
 }
 
-// out = W v of M rows and K columns, with W[i, k] at w[i row + k step].
-template <int M, int K, class W, class X>
+// out = W v, or with ADD out + W v, of M rows and K columns, with W[i, k] at w[i row + k step].
+template <int M, int K, bool ADD = false, class W, class X>
 INLINE void dense(const W* w, int64_t row, int64_t step, const X* v, Vec* out) {
   in_tiles<M, DENSE>([&](auto rows, int i) __attribute__((always_inline)) {
     constexpr int R = decltype(rows)::value;
     Vec sum[R] = {};
+    if constexpr (ADD) UNROLL for (int r = 0; r < R; ++r) sum[r] = out[i + r];
     const W* at = w + i * row;
     _Pragma("GCC unroll 4") for (int k = 0; k < K; ++k, at += step)
       UNROLL for (int r = 0; r < R; ++r) sum[r] += at[r * row] * v[k];
