@@ -3,8 +3,9 @@
 In a compiled or mapped program an array is traced: it has no numbers yet, and they are not checked.
 """
 
+import errno
 import math
-import os
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,6 +20,7 @@ from hybrid_jax.state import QUATERNION
 Numbers = jax.Array | np.ndarray
 T = TypeVar("T")
 
+LONGEST = 300  # characters of what an error says of a file
 UNIT = 1e-2  # |q| may be off 1 by this: rounding and noise are far below, and it is 2 % of the thrust
 MOST = np.iinfo(np.int32).max  # what a count may be in a compiled program
 SMALLEST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)  # of positive numbers
@@ -159,11 +161,9 @@ def key(name: str, value: Any) -> None:
 
 def writable_folder(name: str, folder: Path) -> None:
     """Create a folder and check that it can be written, before work begins."""
-    probe = folder / f".writable.{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise ValueError(f"{name} {folder}: cannot be written: {error.strerror}") from error
 
@@ -174,5 +174,13 @@ def short_repr(value: Any) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of what an error says, or the name of its kind."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
+    """The first line of what an error says, without the middle of a very long one, or the name of its kind."""
+    line = (str(getattr(error, "strerror", None) or error).strip() or type(error).__name__).splitlines()[0]
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} … {line[-LONGEST // 2 :]}"
+
+
+def content_of(path: str | Path) -> bytes:
+    """The bytes of a regular file; OSError for others, as a pipe or a device may never end."""
+    if Path(path).exists() and not Path(path).is_file():
+        raise OSError(errno.EINVAL, "is no regular file")
+    return Path(path).read_bytes()

@@ -128,7 +128,7 @@ def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
 def read_tables(path: str | Path) -> dict[str, Any]:
     """The tables of a TOML file, with or without a byte order mark; ValueError if it is not readable."""
     try:
-        return tomllib.loads(Path(path).read_bytes().decode("utf-8-sig"))
+        return tomllib.loads(checks.content_of(path).decode("utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not a readable TOML file: {checks.first_line(error)}") from error
 

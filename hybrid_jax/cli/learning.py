@@ -15,7 +15,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
-from hybrid_jax.flights.checks.cleaning import choose_time_constant, lag_motors
+from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import make_residual
@@ -98,14 +98,20 @@ def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:
 def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
     """The lag with which physics that is fitted to all but the last flight predicts that flight best."""
 
-    def error(logs: list[FlightLog]) -> float:
-        train = _windows(logs[:-1], OF_LAG)
+    def error(lag: float) -> float:
+        flights = lagged(logs, lag)
+        train = _windows(flights[:-1], OF_LAG)
         settings = Settings(objective=scaled_loss(model.physics(), train))
         field = METHODS[PHYSICS].solve(model.physics(), train, train, settings).field
-        ends = [errors.rmse_by_flight(each, logs[-1:], STEPS)[:, -1] for each in (field, FrozenRates(model.physics()))]
+        ends = [
+            errors.rmse_by_flight(each, flights[-1:], STEPS)[:, -1] for each in (field, FrozenRates(model.physics()))
+        ]
         return float(np.log(ends[0] / ends[1]).mean())
 
-    return choose_time_constant(logs, error)[0]
+    found = {lag: off for lag in TIME_CONSTANTS if np.isfinite(off := error(lag))}
+    if not found:
+        raise ValueError("no time constant of the rotors has a finite error, so none can be chosen")
+    return min(found, key=lambda lag: found[lag])
 
 
 def _windows(logs: Sequence[FlightLog], count: int) -> Trajectories:

@@ -11,7 +11,6 @@ Its steps can be taken one by one. Split by flight before cutting, since windows
 from hybrid_jax.flights.checks.cleaning import (
     Cleaning,
     align_motors,
-    choose_time_constant,
     clean,
     delay_motors,
     in_flight,
@@ -41,7 +40,6 @@ __all__ = [
     "align_motors",
     "check_log",
     "check_recording",
-    "choose_time_constant",
     "clean",
     "cut_windows",
     "delay_motors",

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from hybrid_jax.flights.formats.raw import GZIP, readable
 from hybrid_jax.flights.formats.rosbag import read_rosbag
 from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.log import FlightLog, unevenness
-from hybrid_jax.flights.recording import ROTOR_UNITS, Recording
+from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, axes_of
 from hybrid_jax.vehicle import Vehicle
 
 CSV, ULOG, CRAZYFLIE, ROSBAG, BLACKBOX = "CSV", "PX4 ULog", "Crazyflie µSD", "rosbag", "Betaflight blackbox"
@@ -126,13 +126,9 @@ def report(found: Sequence[tuple[str, Check]], failed: Failed) -> None:
 
 
 def read_folder(
-    folder: str | Path,
-    *,
-    columns: ColumnMap | str | Path | None = None,
-    topics: Mapping[str, str] | None = None,
-    motor_order: Sequence[int] = (),
+    folder: str | Path, columns: ColumnMap | str | Path | None = None, **reading: Any
 ) -> tuple[list[Recording], dict[Path, str]]:
-    """Read all logs of a folder, in the order of their names; also its other files, each with why it is left.
+    """`read_recording` of all logs of a folder, by their names; also its other files, and why they are left.
 
     Raises:
         ValueError: the folder holds no logs, or the file, row, field and what to do, in one line.
@@ -142,12 +138,8 @@ def read_folder(
         others = "; ".join(f"{path.name}: {why}" for path, why in [*left.items()][:5])
         found = f"; it holds {others}" if left else ""
         raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
-    columns = _column_map(columns)
-    return [read_recording(path, columns, topics, motor_order) for path in paths], left
-
-
-def _column_map(columns: ColumnMap | str | Path | None) -> ColumnMap | None:
-    return load_column_map(columns) if isinstance(columns, str | Path) else columns
+    columns = load_column_map(columns) if isinstance(columns, str | Path) else columns
+    return [read_recording(path, columns, **reading) for path in paths], left
 
 
 def format_of(path: str | Path) -> tuple[str, str]:
@@ -217,7 +209,7 @@ def read_recording(
     if not Path(path).exists():
         raise ValueError(f"{path}: no such file")
     if kind == CSV:
-        found = read_mapped(path, _column_map(columns))
+        found = read_mapped(path, load_column_map(columns) if isinstance(columns, str | Path) else columns)
     elif kind == ROSBAG and Path(path).is_file() and _head(path, unpack=False).startswith(GZIP):
         raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
     elif kind == ROSBAG:
@@ -236,20 +228,12 @@ def reordered(recording: Recording, motor_order: Sequence[int]) -> Recording:
     Raises:
         ValueError: a motor is named twice, or the log has no such motor.
     """
-    signals = dict(recording.signals)
+    signals, order = dict(recording.signals), [*motor_order]
     for name in ROTOR_UNITS.keys() & signals.keys():
         signal = signals[name]
-        order = require_order(recording.name, motor_order, len(signal.axes))
-        axes = tuple(map(str, range(len(order))))
-        signals[name] = replace(signal, values=np.asarray(signal.values)[:, order], axes=axes)
+        if len({*order}) < len(order) or not {*order} <= {*range(len(signal.axes))}:
+            known = ", ".join(signal.axes)
+            raise ValueError(f"{recording.name}: motor_order must be of {known}, each at most once, got {order}")
+        values = np.asarray(signal.values)[:, order]
+        signals[name] = replace(signal, values=values, axes=axes_of(name, len(order)))
     return replace(recording, signals=signals)
-
-
-def require_order(name, motor_order: Sequence[int], motors: int) -> list[int]:
-    """The order, if it names each of so many motors at most once; else ValueError."""
-    order = [*motor_order]
-    if len({*order}) < len(order) or not {*order} <= {*range(motors)}:
-        raise ValueError(
-            f"{name}: motor_order must be of {', '.join(map(str, range(motors)))}, each at most once, got {order}"
-        )
-    return order

@@ -4,21 +4,34 @@ import itertools
 import json
 import math
 import os
+import secrets
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hybrid_jax.checks import content_of, first_line
+
 
 def write_atomic(path: str | Path, content: str | bytes) -> None:
-    """Write a temporary file beside `path`, text as UTF-8, then rename it; OSError leaves an earlier file as it was."""
+    """Write a new file beside `path`, text as UTF-8, then rename it; OSError leaves an earlier file as it was.
+
+    Nobody can foresee the new file's name, and what should be there all the same, such as a link, is not written to.
+    Those that a killed process left an hour ago are deleted.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = path.with_name(f".{secrets.token_hex(8)}.part")
     try:
-        with temporary.open("wb") as file:
+        for left in path.parent.glob(f".{16 * '[0-9a-f]'}.part"):
+            with suppress(OSError):
+                if left.lstat().st_mtime < time.time() - 3600:
+                    left.unlink()
+        with temporary.open("xb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())  # otherwise a power cut could leave an empty file
@@ -66,8 +79,8 @@ def read_json(path: str | Path) -> Any:
         raise ValueError(f"{constant} is not JSON")
 
     try:
-        return json.loads(Path(path).read_bytes(), parse_constant=refuse)
+        return json.loads(content_of(path), parse_constant=refuse)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: truncated or not JSON: {error}") from error
+        raise ValueError(f"{path}: truncated or not JSON: {first_line(error)}") from error

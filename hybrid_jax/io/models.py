@@ -87,6 +87,8 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
     save_archive(path, FORMAT, {"field": structure.tree, "about": dict(about)}, arrays)
     if structure.problem is not None:
         warnings.warn(f"{path}: this model can only be loaded with like=: {structure.problem}", stacklevel=2)
+    if spoiled := _not_finite(field):
+        warnings.warn(f"{path}: this model cannot be loaded: {spoiled}", stacklevel=2)
 
 
 def load(path: str | Path, like: eqx.Module | None = None) -> Model:
@@ -98,8 +100,8 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
             functions that the file cannot name, such as local classes and lambdas.
 
     Raises:
-        ValueError: the file is missing, damaged or not a model; it refers to a class or function that is not known; or
-            it does not fit `like`.
+        ValueError: the file is missing, damaged or not a model; it refers to a class or function that is not known; an
+            array is not finite, or not of the type and shape that its class states; or it does not fit `like`.
     """
     metadata, arrays = load_archive(path, FORMAT)
     try:
@@ -107,11 +109,22 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
         field = decode(tree, arrays) if like is None else _filled(like, tree, arrays)
         if not isinstance(field, eqx.Module):
             raise TypeError(f"its field is a {type(field).__name__}")
+        if spoiled := _not_finite(field):
+            raise ValueError(spoiled)
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{path}: not a complete model: {checks.first_line(error)}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {checks.first_line(error)}") from error
     return Model(cast(AbstractVectorField, field), about)
+
+
+def _not_finite(field: eqx.Module) -> str:
+    """Which array of a field holds numbers that are not finite, as of a fit that diverged; empty if none does."""
+    for keys, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(field, eqx.is_inexact_array)):
+        if bad := int((~np.isfinite(leaf)).sum()):
+            path = jax.tree_util.keystr(keys, simple=True, separator="/")
+            return f"array field/{path} must be finite, {bad} of its {leaf.size} numbers are not"
+    return ""
 
 
 def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:

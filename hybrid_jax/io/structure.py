@@ -9,7 +9,7 @@ import dataclasses
 import inspect
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import is_dataclass
 from functools import partial
 from types import ModuleType
@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import AbstractArray, jaxtyped
 
 from hybrid_jax import dynamics, networks  # noqa: F401  a file may name their classes
 from hybrid_jax.checks import short_repr
@@ -221,11 +222,27 @@ def _rebuild(name: str, parts: dict[str, Any]) -> Any:
         raise ValueError(f"class {name} has fields {wanted}, but the file has {given}")
     for key, value in values.items():
         object.__setattr__(made, key, value)
+    if cls.__module__.startswith("hybrid_jax."):
+        _require_shapes(name, known, values)
     for base in reversed(cls.__mro__):  # a damaged or forged file must give no vehicle of negative mass
         for check in ("__post_init__", "__check_init__"):
             if base.__module__.startswith("hybrid_jax.") and check in vars(base):
                 vars(base)[check](made)
     return made
+
+
+def _require_shapes(name: str, known: Iterable[dataclasses.Field], values: Mapping[str, Any]) -> None:
+    """Refuse what is no array as its class states it; all may have further axes in front, as of models side by side."""
+    stated = {f.name: f.type for f in known if isinstance(f.type, type) and issubclass(f.type, AbstractArray)}
+    with jaxtyped("context"):
+        for key, kind in stated.items():
+            if set("*+") & {*kind.dim_str}:  # of any shape, or of sizes that another class states
+                continue
+            value = values[key]
+            if not isinstance(value, kind.dtype[kind.array_type, f"*others {kind.dim_str}"]):
+                found = f"{value.dtype}{list(value.shape)}" if eqx.is_array(value) else short_repr(value)
+                sizes = ", ".join(kind.dim_str.split())
+                raise ValueError(f"{name}: {key} must be {kind.dtype.__name__}[{sizes}] as the others, got {found}")
 
 
 def _name_of(value: Any) -> str | None:

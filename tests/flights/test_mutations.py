@@ -1,25 +1,43 @@
-"""Damaged files of every format are read or refused in one line, in seconds and little memory."""
+"""Damaged and forged files of every kind are read or refused in one line, in seconds and little memory."""
 
 import gzip
+import json
 import os
 import resource
+import subprocess
 import time
 
+import jax
 import numpy as np
 import pytest
-from surface import outcome
+from surface import is_finite, outcome, refusal
 from writers import bag, blackbox, crazyflie, escs, ulog
 
+import hybrid_jax as hj
+from experiments.real_flight.simulated import vehicle_toml
+from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import COLUMNS
+from hybrid_jax.io.archive import load_archive, save_archive
+from hybrid_jax.io.datasets import FORMAT as DATASET
+from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
+from hybrid_jax.io.files import json_text, read_json, write_atomic
+from hybrid_jax.io.models import FORMAT as MODEL
 from hybrid_jax.vehicle import IRIS
 
-NAMES = ("flight.csv", "flight.ulg", "flight.bbl", "log00", "log00.gz", "flight.bag", "flight.db3", "flight.mcap")
+LOGS = ("flight.csv", "flight.ulg", "flight.bbl", "log00", "log00.gz", "flight.bag", "flight.db3", "flight.mcap")
+LOADERS = {"model.npz": hj.load, "set.npz": load_dataset, "vehicle.toml": load_vehicle_model, "report.json": read_json}
 LIBRARY = {"flight.ulg": "pyulog", "flight.bbl": "orangebox", "flight.bag": "rosbags"}
 SECONDS, MEMORY = 10.0, 1 << 20  # of one file, s; kB
+COUNTS = pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(int(os.environ.get("SEED", "0")))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +52,14 @@ def wholes(flight, topics, tmp_path_factory):
     for plugin, suffix in (("ROS1", "bag"), ("SQLITE3", "db3"), ("MCAP", "mcap")):
         path = bag(folder / suffix, few, plugin)
         made[f"flight.{suffix}"] = next(iter(path.glob(f"*.{suffix}") if path.is_dir() else [path])).read_bytes()
-    return made
+    hj.save(
+        folder / "model.npz", hj.Hybrid(hj.rigid_body(IRIS), hj.residual_network(13, 4, jax.random.key(0), hidden=4))
+    )
+    windows = hj.Trajectories(few.x[:1], few.u[None, :5], few.x[None, 1:6], 0.01)
+    save_dataset(folder / "set.npz", Dataset({"train": windows}, {"config": {"vehicle": "iris"}}))
+    write_atomic(folder / "report.json", json_text({"rows": [{"test_mse": 0.5, "seed": i} for i in range(9)]}))
+    write_atomic(folder / "vehicle.toml", vehicle_toml(IRIS))
+    return made | {name: (folder / name).read_bytes() for name in LOADERS}
 
 
 def mutated(content, rng):
@@ -56,6 +81,9 @@ def mutated(content, rng):
 
 def went_through(path):
     """Reads, checks and converts, and looks at what each says."""
+    if path.name in LOADERS:
+        outcome(LOADERS[path.name], path, naming=str(path))
+        return
     recording = outcome(
         read_recording, path, topics={} if path.name.endswith(".ulg") else {"motors": "/rotors:data:rpm"}
     )
@@ -67,13 +95,12 @@ def went_through(path):
             check_log(log, IRIS)
 
 
-@pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", NAMES)
-def test_a_mutated_file_ends_in_a_log_or_a_line(tmp_path, wholes, capfd, name, count):
+@COUNTS
+@pytest.mark.parametrize("name", [*LOGS, *LOADERS])
+def test_a_mutated_file_is_read_or_ends_in_a_line(tmp_path, wholes, capfd, rng, name, count):
     """Without another exception, a hang, much memory, or a word on standard output."""
     pytest.importorskip(LIBRARY.get(name, "numpy"))
-    seed = int(os.environ.get("SEED", "0"))
-    rng, slowest, path = np.random.default_rng(seed), 0.0, tmp_path / name
+    slowest, path = 0.0, tmp_path / name
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for _ in range(count):
         path.write_bytes(mutated(wholes[name], rng))
@@ -83,3 +110,83 @@ def test_a_mutated_file_ends_in_a_log_or_a_line(tmp_path, wholes, capfd, name, c
     assert slowest < SECONDS
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MEMORY
     assert capfd.readouterr().out == ""
+
+
+NAMES = (
+    "os:system",
+    "subprocess:Popen",
+    "builtins:eval",
+    "os",
+    "../../x",
+    "@Options",
+    "x" * 200_000,
+    "hybrid_jax:Hybrid",
+)
+NAMES += ("hybrid_jax.dynamics.composition:Blend", "hybrid_jax.vehicle:Vehicle", "equinox.nn._linear:Linear")
+DEEP = json.loads("[" * 300 + "]" * 300)
+VALUES = (
+    DEEP,
+    None,
+    True,
+    -1,
+    0.0,
+    1e300,
+    10**30,
+    "",
+    [],
+    {},
+    {"array": "gone"},
+    {"named": "os.system"},
+    {"float": "nan"},
+)
+
+
+def places(node):
+    """Every container in a tree of JSON, with each of its keys."""
+    for key, part in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+        yield node, key
+        yield from places(part)
+
+
+def forged(metadata, arrays, rng):
+    """Content that no `save` wrote, under a checksum that is right."""
+    tree, arrays = json.loads(json.dumps(metadata)), {name: array.copy() for name, array in arrays.items()}
+    for _ in range(rng.integers(1, 4)):
+        found, name = [*places(tree)] or [(tree, "new")], str(rng.choice([*arrays]))
+        node, key = found[int(rng.integers(len(found)))]
+        match int(rng.integers(6)):
+            case 0:
+                node[key] = VALUES[int(rng.integers(len(VALUES)))]
+            case 1:
+                node["class" if "class" in node else key] = str(rng.choice(NAMES))
+            case 2:
+                node.pop(key) if key in node or isinstance(node, list) else None
+            case 3:
+                arrays[name] = np.full_like(arrays[name], rng.choice([np.nan, np.inf, 1e30, -1.0, 0.0]))
+            case 4:
+                arrays[name] = rng.normal(size=rng.integers(0, 4, size=rng.integers(0, 4)))
+            case 5:
+                arrays[name] = arrays[name].astype(str(rng.choice(["i4", "?", "f2", "f8"])))
+    return tree, arrays
+
+
+@COUNTS
+@pytest.mark.parametrize("name", ["model.npz", "set.npz"])
+def test_a_forged_archive_is_refused_or_holds_finite_numbers(tmp_path, wholes, monkeypatch, rng, name, count):
+    for module, function in ((os, "system"), (subprocess, "Popen")):
+        monkeypatch.setattr(module, function, pytest.fail)
+    path = tmp_path / name
+    path.write_bytes(wholes[name])
+    form = {"model.npz": MODEL, "set.npz": DATASET}[name]
+    whole = load_archive(path, form)
+    for _ in range(count):
+        tree, arrays = forged(*whole, rng)
+        outcome(save_archive, path, form, tree, arrays)
+        found = outcome(LOADERS[name], path, naming=str(path))
+        assert found is None or is_finite(found.field if name == "model.npz" else dict(found.splits))
+
+
+def test_what_is_said_of_a_file_is_short(tmp_path):
+    for number, tree in enumerate(({"class": "x" * 200_000, "fields": {}}, {"named": "y" * 200_000})):
+        save_archive(tmp_path / f"{number}.npz", MODEL, {"field": tree, "about": {}}, {})
+        assert len(refusal(lambda number=number: hj.load(tmp_path / f"{number}.npz"))) < 500

@@ -2,11 +2,9 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from surface import refusal
 
-from hybrid_jax.flights.checks.cleaning import choose_time_constant, lag_motors
 from hybrid_jax.flights.windows import flight_of, folds, hold_out, manoeuvre_of
 
 NAMES = [f"/logs/{kind}_run{i}.csv.gz" for kind in ("chirp", "square", "random") for i in (1, 2, 3)]
@@ -60,16 +58,3 @@ def test_impossible_splits_are_refused(logs):
     refusal(lambda: hold_out(logs, ["melon"], manoeuvre_of), "'melon'", "chirp")
     refusal(lambda: hold_out(logs[:1], ["chirp_run1"]), "0 flights for training")
     refusal(lambda: folds(logs, 4, manoeuvre_of), "3 different names")
-
-
-def test_chosen_time_constant_has_the_smallest_error(flight):
-    lagging, _ = lag_motors(flight, 0.03)
-
-    def error(logs):
-        return float(np.mean((logs[0].u - lagging.u) ** 2))
-
-    best, errors = choose_time_constant([flight], error, [0.0, 0.01, 0.03, 0.1])
-    assert best == 0.03
-    assert errors[2] == 0 < min(errors[0], errors[3])
-    with pytest.raises(ValueError, match="no candidate"):
-        choose_time_constant([flight], lambda logs: np.nan, [0.01])

@@ -1,6 +1,6 @@
 """Changes to a log; each returns the new log and one line that describes the change."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -220,22 +220,3 @@ def align_motors(log: FlightLog, vehicle: Vehicle | None) -> tuple[FlightLog, st
     if found is None or sum(found.correlations[:2]) < 0.2:
         raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be estimated")
     return delay_motors(log, found.lag)
-
-
-def choose_time_constant(
-    logs: Sequence[FlightLog], error: Callable[[list[FlightLog]], float], candidates: Sequence[float] = TIME_CONSTANTS
-) -> tuple[float, list[float]]:
-    """Choose the time constant [s] for `lag_motors` with the smallest error; also return the error of each candidate.
-
-    Args:
-        logs: flights with even samples.
-        error: prediction error of a model fitted to logs to which a candidate was applied.
-        candidates: time constants that are tried [s].
-
-    Raises:
-        ValueError: no error is finite, or as `lag_motors`.
-    """
-    errors = [float(error([lag_motors(log, candidate)[0] for log in logs])) for candidate in candidates]
-    if not np.isfinite(errors).any():
-        raise ValueError("error is finite for no candidate, so no time constant can be chosen")
-    return candidates[int(np.nanargmin(np.where(np.isfinite(errors), errors, np.nan)))], errors

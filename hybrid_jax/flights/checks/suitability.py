@@ -3,8 +3,7 @@
 They judge signals as they were recorded, before anything is interpolated. `consistency` then compares the signals.
 """
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -33,13 +32,17 @@ def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: fl
         vehicle: the vehicle that the log is to be of; without it, its rotors and largest speed are not compared.
         dt: interval [s] that the flight is to have; without it, the rates of the signals are not judged.
     """
+    damage, missing = recording.facts.get("damage", ""), missing_states(recording)
+    motors = motors_of(recording) if recording.signals.keys() & ROTOR_UNITS.keys() else None
+    mend = f'{damage}; copy it again, or use what is whole: failed="warn"' if damage else ""
+    lacks = f"no {', no '.join(missing)}: {what_to_log(recording)}" if missing else ""
     return [
-        _whole(recording),
+        judged("whole file", bool(damage), "", 0.0, mend),
         _airframe(recording),
-        _flown(recording, vehicle),
-        _quantities(recording),
+        _flown(recording, motors, vehicle),
+        judged("quantities", len(missing), "missing", 0.0, lacks),
         _rotors(recording, vehicle),
-        _rates(recording, dt or np.inf),
+        _rates(recording, motors, dt or np.inf),
         _clock(recording),
         _limits(recording, vehicle),
     ]
@@ -50,74 +53,49 @@ def failures(checks: Sequence[Check], name: str) -> list[str]:
     return [f"{name}: {check.name}: {check.suggestion}" for check in checks if check.verdict == FAILS]
 
 
-def _whole(recording: Recording) -> Check:
-    damage = recording.facts.get("damage", "")
-    advice = f'{damage}; copy it again, or use what is whole: failed="warn"' if damage else ""
-    return judged("whole file", bool(damage), "", 0.0, advice)
-
-
 def _airframe(recording: Recording) -> Check:
-    kind = recording.facts.get("vehicle", "unknown")
+    kind, number = recording.facts.get("vehicle", "unknown"), recording.facts.get("airframe")
     if kind in ("unknown", "generic"):
         return Check("airframe", np.nan, "", 0.0, UNKNOWN, "the log does not say what flew")
-    number = recording.facts.get("airframe")
     advice = f"{kind}{f' (SYS_AUTOSTART {number})' if number else ''}, no multirotor: leave the file out"
     return judged("airframe", 0.0, "", 0.0, "" if kind.startswith("multirotor") else advice)
-
-
-def _quantities(recording: Recording) -> Check:
-    missing = missing_states(recording)
-    advice = f"no {', no '.join(missing)}: {what_to_log(recording)}"
-    return judged("quantities", len(missing), "missing", 0.0, advice if missing else "")
 
 
 def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
     found, kind = recording.rotors, recording.facts.get("vehicle", "")
     stated = [int(word) for word in kind.split() if word.isdigit()]
-    expected = len(vehicle.rotor_positions) if vehicle is not None else stated[0] if stated else found
+    expected = vehicle.rotors if vehicle is not None else stated[0] if stated else found
     if not found:
         return Check("number of motors", 0.0, "motors", expected, UNKNOWN, "no motors")
-    who = "the vehicle file has" if vehicle is not None else "the airframe has"
     mend = "log all motors"
     if found > expected or found > MOST_ROTORS:
         signals = [recording.signals[name] for name in ROTOR_UNITS if name in recording.signals]
         moving = tuple(i for i in range(found) if any(np.ptp(signal.values[:, i]) > 0 for signal in signals))
         named = moving if vehicle is None and not stated else moving[:expected]
         mend = f"name those of the rotors, which change: motor_order={named}"
-    advice = f"{found} motors are logged, {who} {expected}: {mend}, or correct the vehicle file"
+    who = "the airframe" if vehicle is None else "the vehicle file"
+    advice = f"{found} motors are logged, {who} has {expected}: {mend}, or correct the vehicle file"
     fits = found == expected and found <= MOST_ROTORS
     return judged("number of motors", found, "motors", expected, "" if fits else advice)
 
 
-def _motors(recording: Recording) -> Signal | None:
-    return motors_of(recording) if recording.signals.keys() & ROTOR_UNITS.keys() else None
-
-
-def _rates(recording: Recording, dt: float) -> Check:
+def _rates(recording: Recording, motors: Signal | None, dt: float) -> Check:
     intervals = {name: recording.signals[name].interval for name in USED if name in recording.signals}
-    if (motors := _motors(recording)) is not None:
-        intervals["motors"] = motors.interval
+    intervals |= {} if motors is None else {"motors": motors.interval}
     slow = {name: interval for name, interval in intervals.items() if interval > SLOWER * dt * (1 + 1e-6)}
     worst = max(intervals.values(), default=np.nan)
-    listed = ", ".join(f"{name} {_hertz(each)}" for name, each in slow.items())
+    listed = ", ".join(f"{name} {1 / each:.3g} Hz" for name, each in slow.items())
     coarser = f"dt={float(f'{max(slow.values(), default=0.0):.2g}'):g}"
-    kind = recording.facts.get("format", "")
-    faster = "log faster" if kind == "CSV" else what_to_log(recording)
-    advice = f"slower than {_hertz(dt)}: {listed}; {faster}; or take {coarser}"
+    faster = "log faster" if recording.facts.get("format", "") == "CSV" else what_to_log(recording)
+    advice = f"slower than {1 / dt:.3g} Hz: {listed}; {faster}; or take {coarser}"
     return judged("slowest signal", worst, "s", SLOWER * dt, advice if slow else "")
 
 
-def _hertz(interval: float) -> str:
-    return f"{1 / interval:.3g} Hz"
-
-
 def _clock(recording: Recording) -> Check:
-    longest = (0.0, 0.0, "")
-    for signal in recording.signals.values():
-        longest = max([longest, *((end - start, start, signal.source) for start, end in signal.gaps())])
     if apart := without_common_time(recording):
         return judged("longest gap", recording.duration, "s", JUMP * recording.duration, apart)
-    length, start, source = longest
+    gaps = [(end - start, start, each.source) for each in recording.signals.values() for start, end in each.gaps()]
+    length, start, source = max(gaps, default=(0.0, 0.0, ""))
     advice = f"{source} stops at {start:.4g} s for {length:.4g} s, most of the log: split the file there"
     most = JUMP * recording.duration
     return judged("longest gap", length, "s", most, advice if length > most else "")
@@ -125,7 +103,10 @@ def _clock(recording: Recording) -> Check:
 
 def _limits(recording: Recording, vehicle: Vehicle | None) -> Check:
     """No command is below 0 or above 1, and no speed above that of the vehicle file."""
-    for name, most in _largest(recording, vehicle):
+    fastest = np.inf if vehicle is None else vehicle.max_rotor_speed
+    for name, most in (("command", 1.0), ("rotor_speed", fastest)):
+        if name not in recording.signals:
+            continue
         signal = recording.signals[name]
         beyond = (signal.values > (1 + BEYOND) * most) | (signal.values < -BEYOND * min(most, 1.0))
         share = float(beyond.any(axis=1).mean())
@@ -141,15 +122,7 @@ def _limits(recording: Recording, vehicle: Vehicle | None) -> Check:
     return judged("motors within limits", 0.0, "share of samples", 0.0, "")
 
 
-def _largest(recording: Recording, vehicle: Vehicle | None) -> Iterator[tuple[str, float]]:
-    if "command" in recording.signals:
-        yield "command", 1.0
-    if "rotor_speed" in recording.signals:
-        yield "rotor_speed", np.inf if vehicle is None else vehicle.max_rotor_speed
-
-
-def _flown(recording: Recording, vehicle: Vehicle | None) -> Check:
-    motors: Any = _motors(recording)
+def _flown(recording: Recording, motors: Signal | None, vehicle: Vehicle | None) -> Check:
     name = "motors turn"
     if motors is None or not len(motors):
         return Check(name, np.nan, "", 0.0, UNKNOWN, "no motors")
