@@ -170,7 +170,7 @@ def on_grid(
     if steps < 1:
         raise ValueError(f"{record.name}: {', '.join((*inputs, *outputs))} share less than dt={dt:.3g} s")
     edges = begin + dt * np.arange(steps + 1)
-    areas = [_area(record.signals[name], edges, between) for name in inputs]
+    areas = [integral(record.signals[name], edges, between) for name in inputs]
     u = np.diff(np.concatenate(areas, axis=1), axis=0) / dt if inputs else np.zeros((steps, 0))
     y, index, share = {}, {}, {}
     for name in outputs:
@@ -196,8 +196,14 @@ def _span(record: Record, inputs, outputs, between: Between) -> tuple[float, flo
     return (max(begin, first), min(end, last)) if outputs else (begin, end)
 
 
-def _area(signal: Signal, t: Float[np.ndarray, " n"], between: Between) -> Float[np.ndarray, "n k"]:
-    """The integral of a signal up to each time."""
+def integral(signal: Signal, t: Float[np.ndarray, " n"], between: Between) -> Float[np.ndarray, "n k"]:
+    """The integral of a signal up to each time.
+
+    Args:
+        signal: what is integrated; beyond its ends its first and last samples go on.
+        t: the times [s].
+        between: what it is between its samples, see `on_grid`.
+    """
     edges, values = signal.t, signal.values
     step = np.diff(edges)[:, None]
     parts = {"held": values[:-1], "averaged": values[1:], "linear": (values[1:] + values[:-1]) / 2}[between] * step

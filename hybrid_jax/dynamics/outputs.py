@@ -64,15 +64,35 @@ class StateSpaceModel(eqx.Module):
         """What a state is to the field; of states of which it says nothing, each is a quantity of its own."""
         return state_space(self.field, self.size)
 
-    def measure(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> dict[str, Float[Array, " k"]]:
-        """What is measured in a state, by name.
+    def begin(self, x0: Float[Array, " d"], u: Float[Array, "t m"], dt: float):
+        """The state in which a piece of a record begins, and the inputs of its intervals.
 
         Args:
+            x0: the state that is sought (d,).
+            u: the inputs (t, m).
+            dt: length of an interval [s].
+        """
+        return x0, u
+
+    def output(self, name: str, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " k"]:
+        """What is measured in a state.
+
+        Args:
+            name: of the output.
             x: the state (d,).
             u: the input (m,).
         """
-        found = {name: jnp.atleast_1d(jnp.asarray(output(x, u))) for name, output in self.outputs.items()}
-        for name, y in found.items():
-            if y.ndim != 1:
-                raise ValueError(f"outputs: {name} must return a scalar or one axis, got shape {y.shape}")
-        return found
+        y = jnp.atleast_1d(jnp.asarray(self.outputs[name](x, u)))
+        if y.ndim != 1:
+            raise ValueError(f"outputs: {name} must return a scalar or one axis, got shape {y.shape}")
+        return y
+
+    def error(self, name: str, predicted: Float[Array, " k"], y: Float[Array, " k"]) -> Float[Array, " e"]:
+        """What was predicted less what was measured.
+
+        Args:
+            name: of the output.
+            predicted: as of `output` (k,).
+            y: as it was measured (k,).
+        """
+        return predicted - y

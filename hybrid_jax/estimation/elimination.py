@@ -18,33 +18,9 @@ from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, inv
 from hybrid_jax.matrices import solve
 from hybrid_jax.status import Status
 
-FLAT = 1e-12  # of a gradient's norm
-
-
-class Equations(NamedTuple):
-    """Normal equations of n pieces in θ and then in what each has of its own, of q numbers together.
-
-    Attributes:
-        gram: JᵀJ.
-        score: Jᵀr.
-        cost: of the errors r, by default rᵀr.
-    """
-
-    gram: Float[Array, "*n q q"]
-    score: Float[Array, "*n q"]
-    cost: Float[Array, "*n"]
-
-    @staticmethod
-    def of_errors(jacobian: Float[Array, "s q"], r: Float[Array, " s"], robust: float = np.inf) -> "Equations":
-        """Of one piece; an error of more than `robust` counts linearly, not as a square (Huber 1964)."""
-        size = jnp.maximum(jnp.abs(r), FLAT)
-        weighted = jacobian * jnp.minimum(1.0, robust / size)[:, None]
-        cost = r**2 if np.isinf(robust) else jnp.where(size <= robust, r**2, 2 * robust * size - robust**2)
-        return Equations(weighted.T @ jacobian, weighted.T @ r, jnp.sum(cost))
-
 
 class Reduced(NamedTuple):
-    """What is left for θ (p), and what a step of θ means for the rest: it moves by −(offset + slope Δθ)."""
+    """What is left for θ, and what a step of it means for the rest: that moves by −(offset + slope Δθ)."""
 
     equations: NormalEquations
     offset: Float[Array, "n s"]
@@ -52,21 +28,21 @@ class Reduced(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=1)
-def reduced(equations: Equations, p: int, damping: Float[Array, ""] | float = 0.0) -> Reduced:
+def reduced(equations: NormalEquations, p: int, damping: Float[Array, ""] | float = 0.0) -> Reduced:
     """Eliminate what pieces have of their own; `damping` is relative to the diagonal of its normal equations."""
-    gram, score, cost = equations
+    gram, score, square = equations
     size = jnp.sqrt(jnp.diagonal(gram[:, p:, p:], axis1=1, axis2=2))
     unit = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 0)[..., None]
     held = gram[:, p:, p:] * unit * unit.swapaxes(1, 2) + jax.vmap(jnp.diag)(jnp.where(size > 0, damping, 1.0))
     right = jnp.concatenate([score[:, p:, None], gram[:, p:, :p]], axis=2)
     found = unit * jax.vmap(solve)(held, unit * right)
     across = jnp.einsum("nps,nsq->npq", gram[:, :p, p:], found)
-    left = NormalEquations(gram[:, :p, :p] - across[..., 1:], score[:, :p] - across[..., 0], cost)
+    left = NormalEquations(gram[:, :p, :p] - across[..., 1:], score[:, :p] - across[..., 0], square)
     return Reduced(left, found[..., 0], found[..., 1:])
 
 
 @partial(jax.jit, static_argnums=1)
-def move(equations: Equations, p: int, damping: Float[Array, ""], free: Bool[Array, " p"], least: float):
+def move(equations: NormalEquations, p: int, damping: Float[Array, ""], free: Bool[Array, " p"], least: float):
     """A step of θ, those of the rest (n, s), and by how much they should lower the cost."""
     (gram, score, _), offset, slope = reduced(equations, p, damping)
     gram, score = jnp.sum(gram, axis=0), jnp.sum(score, axis=0)
@@ -93,13 +69,13 @@ class End(NamedTuple):
 
     theta: Float[Array, " p"]
     own: Float[Array, "n s"]
-    equations: Equations
+    equations: NormalEquations
     steps: int
     status: Status
 
 
 def descend(
-    equations: Callable[[Any, Any], Equations],
+    equations: Callable[[Any, Any], NormalEquations],
     theta: Float[Array, " p"],
     own: Float[Array, "n s"],
     *,
@@ -123,21 +99,21 @@ def descend(
 
     def evaluate(point, _):
         found = equations(*point)
-        return jnp.sum(found.cost), (point, found)
+        return jnp.sum(found.square), (point, found)
 
     def aim(best, damping):
         (theta, own), found = best
         step, change, expected = move(found, len(theta), damping, moves, least)
         return (theta + step, own + change), expected, 0.0
 
-    point, nothing = (theta, own), Equations(*3 * (jnp.zeros(()),))
+    point, nothing = (theta, own), NormalEquations(*3 * (jnp.zeros(()),))
     end = minimise(evaluate, aim, begin(point, (point, nothing)), max_steps, tolerance, in_python)
     (theta, own), found = end.best
     return End(theta, own, found, int(end.steps), Status(int(end.status)))
 
 
 def covariance(
-    equations: Equations, p: int, meat: Float[np.ndarray, "n q q"] | None = None
+    equations: NormalEquations, p: int, meat: Float[np.ndarray, "n q q"] | None = None
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "n s"]]:
     """The covariance of θ, and the variances of what pieces have of their own; infinite where no error tells them.
 

@@ -17,12 +17,15 @@ from hybrid_jax.trajectories import Trajectories
 
 ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
+FLAT = 1e-12  # least size of an error
 CHUNK = 250  # windows in memory at a time
 RANK = 10  # times p and the rounding of one number: a smaller eigenvalue, of parameters of equal effect, is zero
 
 
 class NormalEquations(NamedTuple):
-    """The contribution of each window to the normal equations of θ_p, with J the Jacobian of its errors r.
+    """The contribution of each of n pieces to the normal equations of q numbers, with J the Jacobian of its errors r.
+
+    Pieces are windows or records; the numbers are θ_p, or all that is learned and then what each piece has of its own.
 
     Attributes:
         gram: JᵀJ.
@@ -30,9 +33,17 @@ class NormalEquations(NamedTuple):
         square: rᵀr.
     """
 
-    gram: Float[Array, "n p p"]
-    score: Float[Array, "n p"]
-    square: Float[Array, " n"]
+    gram: Float[Array, "*n q q"]
+    score: Float[Array, "*n q"]
+    square: Float[Array, "*n"]
+
+    @staticmethod
+    def of_errors(jacobian: Float[Array, "s q"], r: Float[Array, " s"], robust: float = np.inf) -> "NormalEquations":
+        """Of one piece; an error of more than `robust` counts linearly, not as a square (Huber 1964)."""
+        size = jnp.maximum(jnp.abs(r), FLAT)
+        weighted = jacobian * jnp.minimum(1.0, robust / size)[:, None]
+        square = r**2 if np.isinf(robust) else jnp.where(size <= robust, r**2, 2 * robust * size - robust**2)
+        return NormalEquations(weighted.T @ jacobian, weighted.T @ r, jnp.sum(square))
 
 
 # A program of its own: selecting a disturbance and the covariance share it.

@@ -24,7 +24,7 @@ from hybrid_jax.estimation import elimination, record_search, shooting, uncertai
 from hybrid_jax.estimation.elimination import End, descend, reduced
 from hybrid_jax.estimation.least_squares import FINE, Solver, in_double, ravel_parameters, solver_errors, warn_of_steps
 from hybrid_jax.estimation.normal_equations import inverse
-from hybrid_jax.estimation.record_search import TINY
+from hybrid_jax.estimation.record_search import TINY, size_of
 from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.integrate import RK4
@@ -140,7 +140,8 @@ def fit_records(
         near = record_search.deviations_of(model, prior or {})
         segments = shooting.cut(gridded, steps)
         nodes = len(gridded), 1 if segment is None else segments.valid.shape[1], 1
-        search = record_search.Search(problem, jnp.tile(jnp.array(model.start), nodes), near, theta, segments)
+        centres, spread = jnp.tile(jnp.array(model.start), nodes), np.array(model.spread)[None]
+        search = record_search.Search(problem, centres, near, theta, segments, spread)
         (search, theta, own), total = record_search.approached(search, segment), 0
         if any(model.process):
             noise = np.array(model.process) * np.sqrt(steps * dt)
@@ -153,8 +154,7 @@ def fit_records(
             theta, own, total = end.theta, end.own, total + end.steps
             errors = search.errors(theta, own)
             if i < rounds - 1:
-                sizes = {name: jnp.asarray(_size(each, robust)) for name, each in errors.items()}
-                search = search._replace(problem=Problem(model, sizes, robust, dt, problem.solver, substeps))
+                search = search.weighted(errors, robust)
         found = _result(search, end._replace(steps=total), gridded, errors, robust, level)
     warn_of_steps(found.discretisation, f"a smaller dt, or substeps={2 * substeps}")
     return found
@@ -193,7 +193,7 @@ def simulate(
         problem = Problem(model, {}, np.inf, dt, RK4() if solver is None else solver, substeps)
         segments = shooting.cut(gridded, len(gridded[0].u))
         x0 = jnp.asarray(model.start if start is None else start, float)[None]
-        y, states = shooting.simulated(problem, model, x0, segments)
+        y, _, states = shooting.simulated(problem, model, x0, segments)
         found = {name: np.asarray(each)[0, 0][segments.there[name][0, 0]] for name, each in y.items()}
         return found, np.asarray(states[0, 0])
 
@@ -232,12 +232,6 @@ def predict(
     return simulate(model, Record(future.name, joined), known.ends[0], **options)[0]
 
 
-def _size(errors: Float[np.ndarray, "n k"], robust: float) -> Float[np.ndarray, " k"]:
-    """The usual size of errors: their RMS, or 1.48 times the median of their sizes, which outliers do not change."""
-    found = np.sqrt(np.mean(errors**2, axis=0)) if np.isinf(robust) else 1.4826 * np.median(np.abs(errors), axis=0)
-    return np.maximum(found, TINY)
-
-
 def _result(search: record_search.Search, end: End, gridded, errors, robust: float, level: float) -> RecordFit:
     model, start = search.model(end.theta), np.asarray(search.nodes(end.own)[0])[:, 0]
     covariance, variances = _covariance(search, end)
@@ -248,11 +242,11 @@ def _result(search: record_search.Search, end: End, gridded, errors, robust: flo
         rows = picked.argmax(axis=1)
         found = uncertainty.intervals(model.field, jnp.asarray(covariance[np.ix_(rows, rows)]), level)
         found = jax.tree.map(np.asarray, found)
-    limits = {name: robust * _size(each, robust) for name, each in errors.items()}
+    limits = {name: robust * size_of(each, robust) for name, each in errors.items()}
     aside = {name: int((np.abs(each) > limits[name]).any(axis=1).sum()) for name, each in errors.items()}
     rms = {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in errors.items()}
     model = dataclasses.replace(model, start=start[0])
-    ends = np.asarray(search.predicted(end.theta, end.own)[1])[:, -1, -1]
+    ends = np.asarray(search.predicted(end.theta, end.own).states)[:, -1, -1]
     times = np.array([(each.start, each.start + len(each.u) * search.problem.dt) for each in gridded])
     moved = _discretisation(search, end, errors)
     return RecordFit(model, start, deviation, ends, times, found, rms, aside, covariance, end.steps, end.status, moved)
@@ -264,9 +258,9 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
         return 0.0
     problem, segments = search.problem, search.segments
     halved = search._replace(problem=dataclasses.replace(problem, substeps=2 * problem.substeps))
-    now, fine = (each.predicted(end.theta, end.own)[0] for each in (search, halved))
+    now, fine = (each.predicted(end.theta, end.own).y for each in (search, halved))
     size = {name: FINE * np.std(segments.y[name][segments.there[name]], axis=0) for name in now}
-    size = {name: jnp.asarray(each + _size(errors[name], np.inf)) for name, each in size.items()}
+    size = {name: jnp.asarray(each + size_of(errors[name])) for name, each in size.items()}
     # Samples that are off by as much leave the errors that half the step does, without another program.
     moved = segments._replace(y={name: each - (fine[name] - now[name]) for name, each in segments.y.items()})
     search = search._replace(problem=dataclasses.replace(problem, scale=size))

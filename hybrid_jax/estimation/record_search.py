@@ -1,5 +1,6 @@
 """The search for the parameters and the states at the nodes of records, see `record_fit`."""
 
+import dataclasses
 from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
@@ -11,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import ravel_learned, trainable
-from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import shooting
-from hybrid_jax.estimation.elimination import Equations, descend
-from hybrid_jax.estimation.shooting import Local, Problem, Segments
+from hybrid_jax.estimation.elimination import descend
+from hybrid_jax.estimation.normal_equations import NormalEquations
+from hybrid_jax.estimation.shooting import Local, Model, Predicted, Problem, Segments
 from hybrid_jax.records import Gridded
 from hybrid_jax.state_space import StateSpace
 
@@ -25,7 +26,7 @@ TINY, SMALL = 1e-12, 1e-3
 
 
 class Sums(NamedTuple):
-    """`Equations` to which errors are added."""
+    """`NormalEquations` to which errors are added."""
 
     gram: Float[np.ndarray, "r q q"]
     score: Float[np.ndarray, "r q"]
@@ -34,7 +35,7 @@ class Sums(NamedTuple):
     def add(self, rows, jacobian, errors, deviations) -> None:
         """More errors, of known standard deviations; an infinite one counts nothing."""
         weight = 1 / np.maximum(deviations, TINY)
-        jacobian, errors = jacobian * weight[:, None], errors * weight
+        jacobian, errors = jacobian * weight[..., None], errors * weight
         self.gram[:, rows[:, None], rows] += jacobian.swapaxes(1, 2) @ jacobian
         self.score[:, rows] += np.einsum("rkq,rk->rq", jacobian, errors)
         self.cost[:] += np.square(errors).sum(axis=1)
@@ -51,6 +52,7 @@ class Search(NamedTuple):
         deviations: of θ from its start that are expected (p); infinite where nothing is.
         theta: its start (p).
         segments: the records cut; one node each, or one for a record in a simulation.
+        spread: the standard deviations of the start of each record from its centre that are expected.
         off: what the end of a segment may be off the next node (e); None in a simulation.
     """
 
@@ -59,6 +61,7 @@ class Search(NamedTuple):
     deviations: Float[np.ndarray, " p"]
     theta: Float[np.ndarray, " p"]
     segments: Segments
+    spread: Float[Array | np.ndarray, "#r e"]
     off: Float[np.ndarray, " e"] | None = None
 
     @property
@@ -66,7 +69,7 @@ class Search(NamedTuple):
         """No change of any node."""
         return jnp.zeros((len(self.centres), self.centres.shape[1] * self.problem.model.space.tangent_size))
 
-    def model(self, theta) -> StateSpaceModel:
+    def model(self, theta) -> Model:
         return ravel_learned(self.problem.model)[1](jnp.asarray(theta))
 
     def nodes(self, own: Float[Array, "r q"]) -> tuple[Float[Array, "r s d"], Float[Array, "r s d e"]]:
@@ -75,18 +78,18 @@ class Search(NamedTuple):
 
     def local(self, theta, own) -> Local:
         nodes, charts = self.nodes(own)
-        if self.off is None:
+        if self.off is None and nodes.shape[1] < self.segments.valid.shape[1]:
             return shooting.simulation(self.problem, theta, nodes[:, 0], charts[:, 0], self.segments)
         return shooting.shooting(self.problem, theta, nodes, charts, self.segments)
 
-    def equations(self, theta, own) -> Equations:
+    def equations(self, theta, own) -> NormalEquations:
         """The normal equations of each record in θ and its nodes, with what is expected of θ and of the starts."""
         local, (nodes, charts), model = self.local(theta, own), self.nodes(own), self.problem.model
         found, p, e = jax.tree.map(np.asarray, local.equations), len(self.theta), model.space.tangent_size
         (r, s, _), zero = nodes.shape, self.still.shape[1] + p
-        total = Sums(np.zeros((r, zero, zero)), np.zeros((r, zero)), found.cost.sum(axis=1))
+        total = Sums(np.zeros((r, zero, zero)), np.zeros((r, zero)), found.square.sum(axis=1))
         rows = [np.r_[:p, p + j * e : p + (j + 1) * e] for j in range(s)]
-        for j in range(found.cost.shape[1]):
+        for j in range(found.square.shape[1]):
             at = rows[min(j, s - 1)]
             total.gram[:, at[:, None], at] += found.gram[:, j]
             total.score[:, at] += found.score[:, j]
@@ -96,14 +99,14 @@ class Search(NamedTuple):
             for j in range(s - 1):
                 total.add(np.r_[rows[j], rows[j + 1][p:]], slopes[:, j], missing[:, j], self.off)
         one = np.broadcast_to(np.eye(e), (r, e, e))
-        total.add(rows[0][p:], one, np.asarray(own)[:, :e], np.array(model.spread))
+        total.add(rows[0][p:], one, np.asarray(own)[:, :e], np.asarray(self.spread))
         known = np.zeros((r, p, p))
         known[0] = np.eye(p)  # what is expected of θ stands with the first record
         total.add(np.arange(p), known, known @ (np.asarray(theta) - self.theta), self.deviations)
-        return Equations(*map(jnp.asarray, total))
+        return NormalEquations(*map(jnp.asarray, total))
 
-    def predicted(self, theta, own):
-        """The outputs and states of a simulation of each record, or of each segment from its node."""
+    def predicted(self, theta, own) -> Predicted:
+        """What a simulation of each record gives, or of each segment from its node."""
         model, nodes = self.model(theta), self.nodes(own)[0]
         if self.off is None:
             return shooting.simulated(self.problem, model, nodes[:, 0], self.segments)
@@ -113,12 +116,28 @@ class Search(NamedTuple):
 
     def errors(self, theta, own) -> dict[str, Float[np.ndarray, "n k"]]:
         """ŷ − y of all samples."""
-        y, segments = self.predicted(theta, own)[0], self.segments
-        return {name: (np.asarray(y[name]) - segments.y[name])[segments.there[name]] for name in y}
+        found = self.predicted(theta, own).errors
+        return {name: np.asarray(each)[self.segments.there[name]] for name, each in found.items()}
+
+    def weighted(self, errors: dict[str, Float[np.ndarray, "n k"]], robust: float = np.inf) -> "Search":
+        """The search with outputs weighted by their errors, those of more than `robust` times the usual less."""
+        sizes = {name: jnp.asarray(size_of(each, robust)) for name, each in errors.items()}
+        return self._replace(problem=dataclasses.replace(self.problem, scale=sizes, robust=robust))
+
+    def part(self, kept) -> "Search":
+        """Some of the records."""
+        segments = jax.tree.map(lambda leaf: leaf[kept], self.segments)
+        return self._replace(centres=self.centres[kept], segments=segments, spread=self.spread[kept])
+
+
+def size_of(errors: Float[np.ndarray, "n k"], robust: float = np.inf) -> Float[np.ndarray, " k"]:
+    """The usual size of errors: their RMS, or 1.48 times the median of their sizes, which outliers do not change."""
+    found = np.sqrt(np.mean(errors**2, axis=0)) if np.isinf(robust) else 1.4826 * np.median(np.abs(errors), axis=0)
+    return np.maximum(found, TINY)
 
 
 @eqx.filter_jit
-def _nodes(model: StateSpaceModel, centres, changes):
+def _nodes(model: Model, centres, changes):
     space = model.space
 
     def one(centre, change):
@@ -128,7 +147,7 @@ def _nodes(model: StateSpaceModel, centres, changes):
 
 
 @eqx.filter_jit
-def _missing(model: StateSpaceModel, ends, slopes, nodes, charts):
+def _missing(model: Model, ends, slopes, nodes, charts):
     """What leads from each next node to the end of a segment, and its derivative along (θ, node, next node)."""
 
     def one(end, slope, node, chart):
@@ -138,7 +157,7 @@ def _missing(model: StateSpaceModel, ends, slopes, nodes, charts):
     return jax.vmap(jax.vmap(one))(ends, slopes, nodes, charts)
 
 
-def deviations_of(model: StateSpaceModel, prior: Mapping[str, float]) -> Float[np.ndarray, " p"]:
+def deviations_of(model: Model, prior: Mapping[str, float]) -> Float[np.ndarray, " p"]:
     """What is expected of each learned number; ValueError for a path that there is none of."""
     learned = eqx.filter(model, trainable(model))
     leaves = jax.tree_util.tree_leaves_with_path(learned)
@@ -182,7 +201,7 @@ def sizes_of(search: Search, theta, own) -> Float[np.ndarray, " e"]:
     """The size of each state: as it moves in a simulation, where that is finite."""
     model = search.problem.model
     start, spread = np.array(model.start), np.array(model.spread)
-    states = search._replace(off=None).predicted(theta, own)[1]
+    states = search._replace(off=None).predicted(theta, own).states
     moved = np.abs(np.asarray(_changes(model.space, states.reshape(1, -1, len(start)), start))).max(axis=(0, 1))
     far = np.maximum(np.abs(start), 1.0) if len(spread) == len(start) else np.ones(len(spread))
     guess = np.where(np.isfinite(spread) & (spread > 0), spread, far)

@@ -8,7 +8,7 @@ which something acts at random (full-information estimation; Rao, Rawlings and M
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,31 +16,36 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import ravel_learned
-from hybrid_jax.dynamics.outputs import StateSpaceModel
-from hybrid_jax.estimation.elimination import Equations
+from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.integrate import Solver, integrate
 from hybrid_jax.records import Gridded
+
+CHUNK = 64  # records at a time
+Model = Any  # a `StateSpaceModel`, or what has its methods
 
 
 class Segments(NamedTuple):
     """r records of s segments of t intervals, filled up where a record is shorter.
 
     Attributes:
-        u: mean of the inputs over each interval.
+        u: mean of the inputs over each interval, after those of intervals before a segment that its model asks for.
         valid: which intervals are within the record.
         y: the samples of each output, 0 where there is none.
         there: which samples there are.
         index: the interval of the segment in which each sample lies.
-        share: how far into it, from 0 to 1.
+        share: how far into it, from 0 to 1; None where all lie at the ends of intervals.
+        whitening: of all errors of a segment, by default none.
     """
 
-    u: Float[Array | np.ndarray, "*r s t m"]
+    u: Float[Array | np.ndarray, "*r s a+t m"]
     valid: Bool[Array | np.ndarray, "*r s t"]
     y: dict[str, Float[Array | np.ndarray, "*r s n k"]]
     there: dict[str, Bool[Array | np.ndarray, "*r s n"]]
     index: dict[str, Int[Array | np.ndarray, "*r s n"]]
-    share: dict[str, Float[Array | np.ndarray, "*r s n"]]
+    share: dict[str, Float[Array | np.ndarray, "*r s n"]] | None
+    whitening: Float[Array | np.ndarray, "*r s e e"] | None = None
 
 
 def cut(records: list[Gridded], steps: int) -> Segments:
@@ -77,7 +82,8 @@ def _cut(record: Gridded, steps: int, most: int) -> Segments:
             array = np.zeros((*shape, *part.shape[1:]), part.dtype)
             array[segment, place] = part
             found[name].append(array)
-    return Segments(u, valid, *({name: each[i] for name, each in found.items()} for i in range(4)))
+    y, there, index, share = ({name: each[i] for name, each in found.items()} for i in range(4))
+    return Segments(u, valid, y, there, index, share)
 
 
 class Problem(eqx.Module):
@@ -92,7 +98,7 @@ class Problem(eqx.Module):
         substeps: steps of the solver in each interval.
     """
 
-    model: StateSpaceModel
+    model: Model
     scale: dict[str, Float[Array, " k"]]
     robust: float = eqx.field(static=True)
     dt: float = eqx.field(static=True)
@@ -100,48 +106,59 @@ class Problem(eqx.Module):
     substeps: int = eqx.field(static=True)
 
 
-def states_of(problem: Problem, model: StateSpaceModel, x0: Float[Array, " d"], segment: Segments):
-    """The states at the edges of a segment's intervals (t + 1, d); they stay where the record has ended."""
-    x = integrate(model.field, x0, jnp.asarray(segment.u), problem.dt, problem.solver, problem.substeps)
-    states = jnp.concatenate([x0[None], x])
+def states_of(problem: Problem, model: Model, x0: Float[Array, " d"], segment: Segments):
+    """The states at the edges of a segment's intervals (t + 1, d), which stay where the record ended; and inputs."""
+    x0, u = model.begin(x0, jnp.asarray(segment.u), problem.dt)
+    states = jnp.concatenate([x0[None], integrate(model.field, x0, u, problem.dt, problem.solver, problem.substeps)])
     last = jnp.sum(segment.valid)
-    return jnp.where((jnp.arange(len(states)) <= last)[:, None], states, states[last])
+    return jnp.where((jnp.arange(len(states)) <= last)[:, None], states, states[last]), u
 
 
-def outputs_of(model: StateSpaceModel, states, segment: Segments, dt: float) -> dict[str, Float[Array, "n k"]]:
+def outputs_of(model: Model, states, u, segment: Segments, dt: float) -> dict[str, Float[Array, "n k"]]:
     """The outputs at the times of their samples, from states between which a cubic goes through."""
-    u = jnp.asarray(segment.u)
+    if (shares := segment.share) is None:
+        return {name: jax.vmap(partial(model.output, name))(states[i + 1], u[i]) for name, i in segment.index.items()}
     slopes = jax.vmap(model.field)(states[:-1], u) * dt
     ends = jax.vmap(model.field)(states[1:], u) * dt  # the input jumps at an edge
 
-    def one(name, i, share):
+    def one(name, i, s):
         a, b, c, d = states[i], states[i + 1], slopes[i], ends[i]
-        s = share
         x = a * (1 + 2 * s) * (1 - s) ** 2 + b * s**2 * (3 - 2 * s) + c * s * (1 - s) ** 2 + d * s**2 * (s - 1)
-        return jnp.atleast_1d(jnp.asarray(model.outputs[name](x, u[i])))
+        return model.output(name, x, u[i])
 
-    found = {}
-    for name in segment.index:
-        at = jnp.asarray(segment.index[name]), jnp.asarray(segment.share[name])
-        found[name] = jax.vmap(partial(one, name))(*at)
-    return found
+    return {name: jax.vmap(partial(one, name))(i, jnp.asarray(shares[name])) for name, i in segment.index.items()}
 
 
-def errors_of(problem: Problem, model: StateSpaceModel, x0, segment: Segments):
-    """(ŷ − y) / scale of a segment, zero where nothing was measured, all in one vector; and the state at its end."""
-    states = states_of(problem, model, x0, segment)
-    predicted = outputs_of(model, states, segment, problem.dt)
-    rows = [
-        jnp.where(segment.there[name][:, None], (y - segment.y[name]) / problem.scale[name], 0.0).ravel()
-        for name, y in predicted.items()
-    ]
-    return jnp.concatenate(rows), states[-1]
+def errors_of(problem: Problem, model: Model, x0, segment: Segments):
+    """Errors of a segment over their scale, zero where nothing was measured, in a vector; and the state at its end."""
+    found = predicted(problem, model, x0, segment)
+    rows = jnp.concatenate([(error / problem.scale[name]).ravel() for name, error in found.errors.items()])
+    return rows if segment.whitening is None else segment.whitening @ rows, found.states[-1]
+
+
+class Predicted(NamedTuple):
+    """What a model says of a segment: outputs, what they are off, and the states at the edges of intervals."""
+
+    y: dict[str, Float[Array, "*s n k"]]
+    errors: dict[str, Float[Array, "*s n e"]]
+    states: Float[Array, "*s t d"]
+
+
+def predicted(problem: Problem, model: Model, x0, segment: Segments) -> Predicted:
+    """The prediction of a segment; errors are zero where nothing was measured."""
+    segment = segment._replace(index=jax.tree.map(jnp.asarray, segment.index))
+    states, u = states_of(problem, model, x0, segment)
+    y, errors = outputs_of(model, states, u, segment, problem.dt), {}
+    for name, each in y.items():
+        error = jax.vmap(partial(model.error, name))(each, jnp.asarray(segment.y[name]))
+        errors[name] = jnp.where(segment.there[name][:, None], error, 0.0)
+    return Predicted(y, errors, states)
 
 
 class Local(NamedTuple):
     """The normal equations of segments in (θ, what their start depends on), and how the end depends on both."""
 
-    equations: Equations
+    equations: NormalEquations
     slope: Float[Array, "*s d q"]
     end: Float[Array, "*s d"]
 
@@ -156,14 +173,16 @@ def local(problem: Problem, theta, x0, through: Float[Array, "d q"], segment: Se
 
     (jacobian, slope), (r, end) = jax.jacfwd(errors, has_aux=True)(jnp.concatenate([theta, x0]))
     both = jnp.concatenate([jnp.eye(p, through.shape[1]), through])
-    return Local(Equations.of_errors(jacobian @ both, r, problem.robust), slope @ both, end)
+    return Local(NormalEquations.of_errors(jacobian @ both, r, problem.robust), slope @ both, end)
 
 
 @eqx.filter_jit
 def shooting(problem: Problem, theta, nodes: Float[Array, "r s d"], charts: Float[Array, "r s d e"], segments) -> Local:
     """The normal equations of every segment in (θ, change of its own initial state)."""
     slopes = jnp.concatenate([jnp.zeros((*nodes.shape, len(theta))), charts], axis=-1)
-    return jax.vmap(jax.vmap(partial(local, problem, theta)))(nodes, slopes, segments)
+    return in_chunks(
+        lambda each: jax.vmap(jax.vmap(partial(local, problem, theta)))(*each), (nodes, slopes, segments), CHUNK
+    )
 
 
 @eqx.filter_jit
@@ -182,11 +201,28 @@ def simulation(problem: Problem, theta, starts: Float[Array, "r d"], charts: Flo
 
 
 @eqx.filter_jit
-def simulated(problem: Problem, model: StateSpaceModel, starts, segments: Segments):
-    """The predicted outputs of every segment, and the state at its start, in one simulation of each record."""
+def simulated(problem: Problem, model: Model, starts, segments: Segments) -> Predicted:
+    """The prediction of every segment, in one simulation of each record."""
 
     def step(x, segment):
-        states = states_of(problem, model, x, segment)
-        return states[-1], (outputs_of(model, states, segment, problem.dt), states)
+        found = predicted(problem, model, x, segment)
+        return found.states[-1], found
 
     return jax.vmap(lambda x0, own: jax.lax.scan(step, x0, own)[1])(starts, segments)
+
+
+@eqx.filter_jit
+def effects(problem: Problem, model: Model, starts: Float[Array, "r d"], segments: Segments, changes):
+    """The errors of records of one segment, and their derivative along changes of their inputs (r, k, a + t, m)."""
+
+    def one(each):
+        x0, segment, ways = each
+
+        def errors(size):
+            found = errors_of(problem, model, x0, segment._replace(u=segment.u + jnp.tensordot(size, ways, 1)))[0]
+            return found, found
+
+        along, r = jax.jacfwd(errors, has_aux=True)(jnp.zeros(len(ways)))
+        return r, along
+
+    return in_chunks(jax.vmap(one), (starts, jax.tree.map(lambda leaf: leaf[:, 0], segments), changes), CHUNK)

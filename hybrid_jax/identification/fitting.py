@@ -11,36 +11,32 @@ Bayes by expectation maximisation; Dempster, Laird and Rubin 1977).
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.actuators import Actuated
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.elimination import descend, reduced
-from hybrid_jax.estimation.least_squares import in_double, ravel_parameters
+from hybrid_jax.estimation.least_squares import in_double
 from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, inverses, masked
+from hybrid_jax.estimation.record_search import Search
+from hybrid_jax.estimation.shooting import Problem, effects
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification import slow_commands
-from hybrid_jax.identification.prediction_error import (
-    TANGENT,
-    Problem,
-    all_errors,
-    normal_equations,
-    rms,
-    slopes_between,
-)
+from hybrid_jax.identification.multirotor import TANGENT, Multirotor
 from hybrid_jax.identification.recordings import Layout, Windows, cut
+from hybrid_jax.integrate import RK4
 from hybrid_jax.runtime import entry
+from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.status import Status
 
 ROUNDS = 3  # of weights
@@ -118,46 +114,63 @@ def identify(
         ValueError: of a recording that lacks something, or too few windows: name and what was expected.
     """
     layout = Layout() if layout is None else layout
-    physics = physics_of(field)
-    told = "command" if isinstance(physics, Actuated) else "rotor_speed"
     checks.count("rounds", rounds)
-    if isinstance(physics, Actuated) and physics.reads_voltage:
-        _require_voltage(recordings)
-    windows, inputs, columns = cut(recordings, layout, told, measured, CANDIDATES * layout.most)
-    moves, measurable = _free(field, free), _measurable(field, recordings)
-    if (n := min(len(windows.start), layout.most)) <= moves.sum():
-        raise ValueError(f"{recordings[0].name}: {n} windows for {moves.sum()} parameters; record more")
     with jax.enable_x64(True):
-        field = in_double(field)
-        theta, unravel = ravel_parameters(field)
-        spread = jnp.concatenate([windows.spread, np.tile(layout.disturbance, (len(windows.start), 1))], axis=1)
-        problem = Problem(windows, inputs, columns, {name: _first_scale(windows, name) for name in columns}, spread)
-        if len(windows.start) > layout.most:
-            problem = _telling(field, problem, layout, theta, moves & measurable)
-        windows, spread = problem.windows, problem.spread
-        changes, status, errors = jnp.zeros_like(spread), Status.RUNNING, {}
+        search, windows, root = _search(field, recordings, layout, measured, CANDIDATES * layout.most)
+        moves, measurable = _moving(field, free, recordings)
+        if (n := min(len(windows.centres), layout.most)) <= moves.sum():
+            raise ValueError(f"{recordings[0].name}: {n} windows for {moves.sum()} parameters; record more")
+        theta, own, p = jnp.asarray(search.theta), search.still, len(search.theta)
+        if len(own) > layout.most:
+            kept = _telling(search.equations(theta, own), p, layout.most, moves & measurable)
+            search, windows, own = search.part(kept), jax.tree.map(lambda part: part[kept], windows), own[kept]
         for _ in range(rounds):
-            linearised = partial(normal_equations, field, problem, layout)
             options = {"free": moves & measurable, "least": NO_EFFECT, "max_steps": max_steps, "tolerance": TOLERANCE}
-            theta, changes, equations, _, status = descend(linearised, theta, changes, **options)
-            errors = {name: np.asarray(size) for name, size in rms(field, theta, changes, problem, layout).items()}
-            variance = jnp.diagonal(inverses(equations.gram[:, len(theta) :, len(theta) :]).matrix, axis1=1, axis2=2)
-            size = jnp.sqrt(jnp.mean((changes**2 + variance)[:, TANGENT:], axis=0))
-            spread = spread.at[:, TANGENT:].set(jnp.where(spread[:, TANGENT:] > 0, size, 0.0))
-            scale = {name: jnp.maximum(errors[name], 1e-9) for name in columns}
-            problem = problem._replace(scale=scale, spread=spread)
+            theta, own, equations, _, status = descend(search.equations, theta, own, **options)
+            search = search.weighted(search.errors(theta, own))
+            variance = jnp.diagonal(inverses(equations.gram[:, p:, p:]).matrix, axis1=1, axis2=2)
+            size = jnp.sqrt(jnp.mean((own**2 + variance)[:, TANGENT:], axis=0))
+            spread = jnp.asarray(search.spread)
+            search = search._replace(spread=spread.at[:, TANGENT:].set(jnp.where(spread[:, TANGENT:] > 0, size, 0.0)))
             if windows.between.shape[1]:
-                problem = _weighted(field, theta, changes, problem, layout)
-        equations = reduced(normal_equations(field, problem, layout, theta, changes), len(theta)).equations
-        cluster = max(1, min(round(CLUSTER / (layout.dt * layout.steps)), len(windows.start) // FEWEST_CLUSTERS))
+                search = _whitened(search, theta, own, windows.between, root)
+        equations = reduced(search.equations(theta, own), p).equations
+        cluster = max(1, min(round(CLUSTER / (layout.dt * layout.steps)), len(own) // FEWEST_CLUSTERS))
         covariance = _covariance(equations, cluster, moves, known, measurable)
-        degrees = max(1, -(-len(windows.start) // cluster) - 1)
-        found = unravel(theta)
-        intervals = uncertainty.intervals(found, covariance, level, degrees)
-        shares = _explained(field, theta, changes, problem, layout) if "rates" in columns else np.ones(3)
-        intervals = {name: _widened(name, interval, shares) for name, interval in intervals.items()}
-    span = layout.dt * layout.steps * len(windows.start)
-    return Identified(found, intervals, errors, len(windows.start), span, status, np.asarray(covariance), shares)
+        found, last = search.model(theta).field.field, search.errors(theta, own)
+        shares = _explained(search, theta, own)
+        intervals = uncertainty.intervals(found, covariance, level, max(1, -(-len(own) // cluster) - 1))
+    errors = {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in last.items()}
+    intervals = {name: _widened(name, interval, shares) for name, interval in intervals.items()}
+    span = layout.dt * layout.steps * len(own)
+    return Identified(found, intervals, errors, len(own), span, status, np.asarray(covariance), shares)
+
+
+def _search(
+    field, recordings: Sequence[Recording], layout: Layout, measured: Sequence[str], most: int
+) -> tuple[Search, Windows, Float[np.ndarray, "m k"]]:
+    """The windows of recordings, in double precision, and what is compared in them."""
+    physics = physics_of(field)
+    commanded = isinstance(physics, Actuated)
+    if volts := commanded and physics.reads_voltage:
+        for recording in recordings:
+            if "voltage" not in recording.signals:
+                mend = "leave nominal_voltage and voltage_exponent out of [actuator], or leave this log out"
+                raise ValueError(f"{recording.name}: has no battery voltage, which the actuator depends on; {mend}")
+    told = "command" if commanded else "rotor_speed"
+    windows, axes, root = cut(recordings, layout, told, measured, most, volts)
+    model = in_double(Multirotor.of(physics, axes, layout.ahead))
+    scale = {}
+    for name, there in windows.segments.there.items():  # the spread of each channel in time
+        spread = np.nanstd(np.where(there[..., None], windows.segments.y[name], np.nan), axis=(0, 1, 2))
+        scale[name] = jnp.full(3, 0.1) if name == "attitude" else jnp.asarray(np.maximum(spread, 1e-9))
+    problem = Problem(model, scale, np.inf, layout.dt, RK4(), 1)
+    theta = np.asarray(ravel_learned(model)[0])
+    rotors = np.zeros((len(windows.centres), model.rotor_states))
+    centres = np.concatenate([windows.centres[:, :STATE_SIZE], rotors, windows.centres[:, STATE_SIZE:]], axis=1)
+    unknown = np.full(len(theta), np.inf)
+    search = Search(problem, jnp.asarray(centres)[:, None], unknown, theta, windows.segments, windows.spread)
+    return search, windows, root
 
 
 def identify_in_turn(
@@ -176,7 +189,7 @@ def identify_in_turn(
         layout: how they are cut into windows of torques, by default `Layout()`.
     """
     layout = Layout() if layout is None else layout
-    theta = {*dict(_numbers(field))}
+    theta = {*dict(_names(field))}
     force, torque = tuple(theta & OF_FORCE), tuple(theta - OF_FORCE)
     signals = [each.signals.keys() for each in recordings]
     if not force or not torque or not all({"specific_force", "rates"} <= each for each in signals):
@@ -208,51 +221,56 @@ def prediction_errors(
         measured: quantities that are compared, by default all that every recording has.
     """
     layout = Layout() if layout is None else layout
-    told = "command" if isinstance(physics_of(field), Actuated) else "rotor_speed"
-    windows, inputs, columns = cut(recordings, layout, told, measured, layout.most)
     with jax.enable_x64(True):
-        field = in_double(field)
-        problem = Problem(windows, inputs, columns, {name: jnp.ones(1) for name in columns}, jnp.zeros(()))
-        zero = jnp.zeros((len(windows.start), TANGENT + 6))
-        found = all_errors(field, ravel_parameters(field)[0], zero, problem, layout)
-    return {name: np.where(windows.there[name][..., None], np.asarray(part), np.nan) for name, part in found.items()}
+        search, *_ = _search(field, recordings, layout, measured, layout.most)
+        found = search.predicted(search.theta, search.still).errors
+    there = search.segments.there
+    return {name: np.where(there[name][:, 0, :, None], -part[:, 0], np.nan) for name, part in found.items()}
 
 
-def _telling(field, problem: Problem, layout: Layout, theta, moves) -> Problem:
-    """The problem with fewer windows: half of them tell most of the parameters, the others are spread evenly.
+def _telling(equations: NormalEquations, p: int, most: int, moves) -> Int[np.ndarray, " most"]:
+    """Which windows are fitted: half of them tell most of the parameters, the others are spread evenly.
 
     Most is told by those of greatest leverage tr G⁻¹ Gᵢ, where Gᵢ is what a window tells at the start of the search,
     and G what all of them do. So a few seconds that alone tell a parameter are among them. What was measured has no
     part in it. The other half stands for the whole, which a model that is wrong somewhere should fit on average.
     """
-    equations = normal_equations(field, problem, layout, theta, jnp.zeros_like(problem.spread))
-    gram = masked(reduced(equations, len(theta)).equations, moves).gram
+    gram = masked(reduced(equations, p).equations, moves).gram
     leverage = jnp.einsum("pq,nqp->n", inverse(jnp.sum(gram, axis=0)).matrix, gram)
-    order, most = np.argsort(-np.asarray(leverage), kind="stable"), layout.most // 2
-    others = np.sort(order[most:])
-    even = others[np.linspace(0, len(others) - 1, layout.most - most).round().astype(int)]
-    kept = np.sort(np.concatenate([order[:most], even]))
-    return problem._replace(windows=jax.tree.map(lambda part: part[kept], problem.windows), spread=problem.spread[kept])
+    order = np.argsort(-np.asarray(leverage), kind="stable")
+    others = np.sort(order[most // 2 :])
+    even = others[np.linspace(0, len(others) - 1, most - most // 2).round().astype(int)]
+    return np.sort(np.concatenate([order[: most // 2], even]))
 
 
-def _weighted(field, theta, changes, problem: Problem, layout: Layout) -> Problem:
-    """The problem with errors weighted by what commands may have done between their samples."""
-    at = field, theta, changes, problem, layout
-    scale, whitening = slow_commands.whitened(
-        all_errors(*at), slopes_between(*at), problem.windows.there, problem.scale
-    )
-    return problem._replace(scale={name: jnp.asarray(each) for name, each in scale.items()}, whitening=whitening)
+def _whitened(search: Search, theta, own, between, root) -> Search:
+    """The search with errors weighted by what commands may have done between their samples."""
+    segments, (scale, dt) = search.segments._replace(whitening=None), (search.problem.scale, search.problem.dt)
+    ways = slow_commands.bridges(between, dt * np.arange(segments.u.shape[2] + 1), root)
+    r, along = effects(search.problem, search.model(theta), search.nodes(own)[0][:, 0], segments, ways)
+    names, steps = sorted(scale), segments.valid.shape[2]
+    parts = np.split(np.arange(r.shape[1]), np.cumsum([steps * len(scale[name]) for name in names])[:-1])
+    there, channel, first = np.zeros(r.shape, bool), np.zeros(r.shape[1], int), 0
+    for name, part in zip(names, parts, strict=True):
+        k = len(scale[name])
+        there[:, part] = np.repeat(segments.there[name][:, 0], k, axis=1)
+        channel[part], first = first + np.tile(np.arange(k), steps), first + k
+    noise, whitening = slow_commands.whitened(np.asarray(r), np.asarray(along), there, channel)
+    scale = {name: scale[name] * noise[np.unique(channel[part])] for name, part in zip(names, parts, strict=True)}
+    problem = replace(search.problem, scale=scale)
+    return search._replace(problem=problem, segments=segments._replace(whitening=whitening[:, None]))
 
 
-def _explained(field, theta, changes, problem: Problem, layout: Layout) -> np.ndarray:
-    """R² of each body rate over a window, of what is neither its start nor a constant acceleration."""
-    there = problem.windows.there["rates"][..., None]
-    error = np.asarray(all_errors(field, theta, changes, problem, layout)["rates"])
-    basis, _ = np.linalg.qr(np.arange(layout.steps)[:, None] ** np.arange(2.0))
-    both = error, np.where(there, problem.windows.y["rates"], 0.0)
+def _explained(search: Search, theta, own) -> np.ndarray:
+    """R² of each body rate over a window, of what is neither its start nor a constant acceleration; else 1."""
+    if "rates" not in search.segments.y:
+        return np.ones(3)
+    error, y = np.asarray(search.predicted(theta, own).errors["rates"])[:, 0], search.segments.y["rates"][:, 0]
+    basis, _ = np.linalg.qr(np.arange(error.shape[1])[:, None] ** np.arange(2.0))
+    both = error, np.where(search.segments.there["rates"][:, 0, :, None], y, 0.0)
     parts = [((part - basis @ (basis.T @ part)) ** 2).sum(axis=(0, 1)) for part in both]
     shares = np.ones(3)
-    shares[list(problem.columns["rates"])] = 1 - parts[0] / np.maximum(parts[1], 1e-300)
+    shares[list(search.problem.model.axes["rates"])] = 1 - parts[0] / np.maximum(parts[1], 1e-300)
     return np.clip(shares, 0.0, 1.0)
 
 
@@ -267,42 +285,26 @@ def _widened(name: str, interval: Interval, shares) -> Interval:
     return Interval(value, low * share, np.divide(high, share, out=np.full((), np.inf), where=share > 0))
 
 
-def _first_scale(windows: Windows, name: str) -> Array:
-    """The spread of each channel in time, before anything is fitted."""
-    if name == "attitude":
-        return jnp.full(3, 0.1)
-    spread = np.nanstd(np.where(windows.there[name][..., None], windows.y[name], np.nan), axis=(0, 1))
-    return jnp.asarray(np.maximum(spread, 1e-9))
-
-
-def _numbers(field) -> list[tuple[str, int]]:
-    """The parameter that each number of θ belongs to, and its place in that."""
+def _names(field) -> list[tuple[str, str]]:
+    """Of each number of θ, the parameter that it belongs to, and its own name."""
     physics = physics_of(field)
     leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(physics, trainable(physics)))[0]
-    return [(jax.tree_util.keystr(path[-1:], simple=True), i) for path, leaf in leaves for i in range(leaf.size)]
+    named = [(jax.tree_util.keystr(path[-1:], simple=True), leaf.size) for path, leaf in leaves]
+    return [(name, f"{name}[{i}]") for name, size in named for i in range(size)]
 
 
-def _require_voltage(recordings: Sequence[Recording]) -> None:
-    for recording in recordings:
-        if "voltage" not in recording.signals:
-            mend = "leave nominal_voltage and voltage_exponent out of [actuator], or leave this log out"
-            raise ValueError(f"{recording.name}: has no battery voltage, which the actuator depends on; {mend}")
+def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
+    """Which numbers of θ are fitted, and which are not of a velocity that no recording measures.
 
-
-def _free(field, names: Sequence[str] | None) -> np.ndarray:
-    """Which numbers of θ belong to the named parameters; ValueError for a name that the field does not learn."""
-    own = _numbers(field)
-    for name in names or ():
+    Windows would tell those by chance.
+    """
+    own = _names(field)
+    for name in free or ():
         if name.partition("[")[0] not in dict(own):
             raise ValueError(f"free must be of {', '.join(dict(own))}, got {name!r}")
-    return np.array([names is None or not {name, f"{name}[{i}]"}.isdisjoint(names) for name, i in own], bool)
-
-
-def _measurable(field, recordings: Sequence[Recording]) -> np.ndarray:
-    """Which numbers of θ are not of a velocity that no recording measures: the windows would tell them by chance."""
-    measured = {"velocity", "body_velocity", "position"}
-    known = all(measured & each.signals.keys() for each in recordings)
-    return np.array([known or name not in OF_VELOCITY for name, _ in _numbers(field)], bool)
+    known = all({"velocity", "body_velocity", "position"} & each.signals.keys() for each in recordings)
+    moves = [free is None or not {*names}.isdisjoint(free) for names in own]
+    return np.array(moves, bool), np.array([known or name not in OF_VELOCITY for name, _ in own], bool)
 
 
 def _covariance(equations: NormalEquations, cluster: int, moves, known, measurable) -> Array:

@@ -11,11 +11,9 @@ covariance, B Bᵀ with B = ∂ŷ/∂ξ, by which the errors of a window are wei
 unknowns, like an initial state, the ξ would favour vehicles that turn at smaller ξ: inertias come out too small.
 """
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Bool, Float, Int
 
-from hybrid_jax.dynamics.actuators import Numbers
 from hybrid_jax.flights.recording import Signal
 
 SLOW = 0.03  # s between samples, from which on commands are unknown in between
@@ -33,24 +31,6 @@ def count(signal: Signal, length: float) -> int:
     return int(np.ceil((length + REACH) / signal.interval)) + 1 if is_slow(signal) else 0
 
 
-def lines(signal: Signal, dt: float) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s m"]]:
-    """Times and values of commands that are held; slow ones as the means over steps of dt [s] of lines between them."""
-    values = np.asarray(signal.values)
-    if not is_slow(signal):
-        return signal.t, values
-    t = np.arange(signal.t[0], signal.t[-1], dt)
-    return t, np.stack([np.interp(t + dt / 2, signal.t, column) for column in values.T], axis=1)
-
-
-def spans(signal: Signal, end: Float[np.ndarray, " n"], most: int) -> Float[np.ndarray, "n most 2"]:
-    """Begin and end [s] of the last intervals between samples before each time; of no length where there are none."""
-    if not is_slow(signal):
-        return np.repeat(end[:, None, None], most, axis=1) + np.zeros(2)
-    last = np.searchsorted(signal.t, end)[:, None] - np.arange(most)
-    at = np.clip(last[..., None] - [1, 0], 0, len(signal) - 1)
-    return signal.t[at]
-
-
 def root(signals: list[Signal]) -> Float[np.ndarray, "m m"]:
     """L of the slow signals [1/√s]; 0 if there are none."""
     m = signals[0].values.shape[1]
@@ -63,33 +43,31 @@ def root(signals: list[Signal]) -> Float[np.ndarray, "m m"]:
     return vector * np.sqrt(np.maximum(value, 0.0))
 
 
-def whitened(errors: dict, slopes: dict, there: dict, scale: dict):
+def whitened(
+    r: Float[np.ndarray, "n r"],
+    effects: Float[np.ndarray, "n r u"],
+    there: Bool[np.ndarray, "n r"],
+    channel: Int[np.ndarray, " r"],
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, "n r r"]]:
     """The noise of each channel beside what the bridges do, and the whitening W of each window: Wᵀ W = (1 + B Bᵀ)⁻¹.
 
-    Errors and B are in units of the noise there. The noise is found by expectation maximisation (Dempster, Laird and
-    Rubin 1977) from the first guess `scale`.
+    Errors and B are in units of the noise there. It is found by expectation maximisation (Dempster, Laird and Rubin
+    1977).
 
     Args:
-        errors: of n windows, (n, t, k) by quantity.
-        slopes: ∂ŷ/∂ξ of them, (n, t, k, ξ).
-        there: whether something was measured, (n, t).
+        r: the errors of n windows.
+        effects: ∂r/∂ξ.
+        there: which were measured.
+        channel: to which channel of a sensor each belongs.
     """
-    sizes = [part.shape[2] for part in errors.values()]
-    first = np.cumsum([0, *sizes])
-    r = np.concatenate([np.asarray(part).reshape(len(part), -1) for part in errors.values()], axis=1)
-    b = np.concatenate([np.asarray(part).reshape(len(r), -1, part.shape[-1]) for part in slopes.values()], axis=1)
-    seen = np.concatenate([np.repeat(there[name], k, axis=1) for name, k in zip(errors, sizes, strict=True)], axis=1)
-    steps = r.shape[1] // first[-1]
-    channel = np.concatenate([np.tile(at + np.arange(k), steps) for at, k in zip(first[:-1], sizes, strict=True)])
-    noise = np.concatenate([np.broadcast_to(scale[name], k) for name, k in zip(errors, sizes, strict=True)])
-    precision = _precision(b, noise[channel])
+    noise = np.ones(channel.max() + 1)
+    precision, counts = _precision(effects, noise[channel]), np.bincount(channel, there.sum(axis=0))
     for _ in range(ITERATIONS):
         unit = noise[channel]
         left = (precision @ (r / unit)[..., None])[..., 0] ** 2 + 1 - np.diagonal(precision, axis1=1, axis2=2)
-        counts = np.bincount(channel, seen.sum(axis=0))
-        noise = np.sqrt(np.bincount(channel, (left * unit**2 * seen).sum(axis=0)) / counts)
-        precision = _precision(b, noise[channel])
-    return dict(zip(errors, np.split(noise, first[1:-1]), strict=True)), np.linalg.cholesky(precision).swapaxes(1, 2)
+        noise = np.sqrt(np.bincount(channel, (left * unit**2 * there).sum(axis=0)) / counts)
+        precision = _precision(effects, noise[channel])
+    return noise, np.linalg.cholesky(precision).swapaxes(1, 2)
 
 
 def _precision(b: Float[np.ndarray, "n r u"], unit: Float[np.ndarray, " r"]) -> Float[np.ndarray, "n r r"]:
@@ -97,17 +75,21 @@ def _precision(b: Float[np.ndarray, "n r u"], unit: Float[np.ndarray, " r"]) -> 
     return np.linalg.inv(np.eye(len(unit)) + scaled @ scaled.swapaxes(1, 2))
 
 
-def means(
-    unknown: Float[Numbers, " i*j*m"],
-    spans: Float[Numbers, "i 2"],
-    root: Float[Numbers, "m m"],
-    edges: Float[Numbers, " k"],
-    delay: Array | float = 0.0,
-) -> Float[Array, "k-1 m"]:
-    """The bridges' means over each interval between `edges` [s], with commands that act `delay` [s] later."""
-    begin, length = spans[:, :1], spans[:, 1:] - spans[:, :1]
-    s = jnp.clip((edges - delay - begin) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
-    waves = jnp.pi * jnp.arange(1, MODES + 1)
-    area = np.sqrt(2) * length[..., None] ** 1.5 * (1 - jnp.cos(waves * s[..., None])) / waves**2
-    each = unknown.reshape(len(spans), MODES, len(root)) @ root.T
-    return jnp.diff(jnp.einsum("ikj,ijm->km", area, each), axis=0) / jnp.diff(edges)[:, None]
+def spans(signal: Signal, begin: Float[np.ndarray, " n"], end: Float[np.ndarray, " n"], most: int):
+    """The last intervals between samples before each end, from its begin on [s] (n, most, 2); of a fast signal none."""
+    if not is_slow(signal):
+        return np.zeros((len(end), most, 2))
+    last = np.searchsorted(signal.t, end)[:, None] - np.arange(most)
+    return signal.t[np.clip(last[..., None] - [1, 0], 0, len(signal) - 1)] - begin[:, None, None]
+
+
+def bridges(
+    spans: Float[np.ndarray, "n i 2"], edges: Float[np.ndarray, " k"], root: Float[np.ndarray, "m w"]
+) -> Float[np.ndarray, "n j k-1 m"]:
+    """The mean over each interval between `edges` [s] of every term of the bridges over spans."""
+    begin, length = spans[..., :1], np.diff(spans)
+    s = np.clip((edges - begin) / np.where(length > 0, length, 1.0), 0.0, 1.0)
+    waves = np.pi * np.arange(1, MODES + 1)
+    area = np.sqrt(2) * length[..., None] ** 1.5 * (1 - np.cos(waves * s[..., None])) / waves**2
+    means = np.diff(area, axis=2) / np.diff(edges)[:, None]
+    return np.einsum("nikj,mw->nijwkm", means, root).reshape(len(spans), -1, len(edges) - 1, len(root))

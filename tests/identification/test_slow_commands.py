@@ -7,6 +7,7 @@ from test_identification import LAYOUT, TRUTH, holds, only, recorded, start
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import identify
+from hybrid_jax.records import integral
 
 STEP = 0.1
 MIX = np.array([[1.0, 0.0], [0.8, 0.3]])
@@ -23,45 +24,43 @@ def test_a_random_walk_is_a_line_and_a_bridge_between_its_samples():
     _, values, sampled = walk()
     root = slow_commands.root([sampled])
     np.testing.assert_allclose(root @ root.T, MIX @ MIX.T, rtol=0.05, atol=0.02)
-    at, line = slow_commands.lines(sampled, 0.01)
+    line = integral(sampled, 0.01 * np.arange(len(values) - 10), "linear")
     middle = slice(4, None, 10)  # the mean from 0.04 to 0.05 s after a sample
     true = (values[4:-1:10] + values[5::10]) / 2
-    strayed = (true[: len(line[middle])] - line[middle][: len(true)])[:-1]  # from the line
-    edges = 0.04 + 0.01 * np.arange(2)
-    basis = np.eye(2 * slow_commands.MODES)
-    each = np.array([slow_commands.means(one, np.array([[0.0, STEP]]), root, edges)[0] for one in basis])
+    line = np.diff(line, axis=0)[middle] / 0.01
+    strayed = true[: len(line)] - line
+    edges = STEP + 0.04 + 0.01 * np.arange(2)
+    each = slow_commands.bridges(np.array([[[STEP, 2 * STEP]]]), edges, root)[0, :, 0]
     found = each.T @ each
     assert (np.diag(found) < np.diag(strayed.T @ strayed) / len(strayed)).all()
     np.testing.assert_allclose(found, strayed.T @ strayed / len(strayed), rtol=0.25)
-    assert at[4] == pytest.approx(0.04)
 
 
-def test_a_bridge_is_nothing_outside_its_interval_and_comes_later_by_a_delay():
-    span, root, one = np.array([[1.0, 1.1]]), np.eye(1), np.array([0.7, -0.4])
-    edges = np.linspace(0.8, 1.3, 6)
-    found = np.asarray(slow_commands.means(one, span, root, edges))[:, 0]
-    np.testing.assert_allclose(found[[0, 1, 3, 4]], 0, atol=1e-6)
-    assert abs(found[2]) > 0.01
-    late = np.asarray(slow_commands.means(one, span, root, edges, 0.1))[:, 0]
-    np.testing.assert_allclose(late[1:], found[:-1], atol=1e-6)
+def test_a_bridge_is_nothing_outside_its_interval():
+    sampled = Signal(np.array([0.9, 1.0, 1.1, 1.2]), np.zeros((4, 1)), ("0",), "walk")
+    edges = np.linspace(0.8, 1.18, 20)
+    spans = slow_commands.spans(sampled, edges[:1], edges[-1:], 2)
+    found = slow_commands.bridges(spans, edges - edges[0], np.eye(1))[0].reshape(2, 2, -1)
+    assert np.abs(found[0, :, 15:]).max() > 0.01
+    np.testing.assert_allclose(found[0, :, :14], 0, atol=1e-12)
+    np.testing.assert_allclose(found[1, :, 15:], 0, atol=1e-12)
 
 
 def test_fast_commands_are_held_and_know_no_bridge():
     fast = Signal(0.01 * np.arange(50), np.random.default_rng(0).normal(size=(50, 4)), tuple("0123"), "fast")
     assert slow_commands.count(fast, 0.5) == 0
-    assert slow_commands.lines(fast, 0.005)[1] is fast.values
     assert not slow_commands.root([fast]).any()
 
 
 def test_noise_is_told_from_what_bridges_do():
     rng, n, t = np.random.default_rng(1), 300, 20
-    slopes = {"rates": rng.normal(size=(n, t, 2, 3)) * np.array([[0.5], [2.0]])}
+    slopes = rng.normal(size=(n, t, 2, 3)) * np.array([[0.5], [2.0]])
     noise = np.array([0.1, 0.4])
-    strayed = np.einsum("ntku,nu->ntk", slopes["rates"], rng.normal(size=(n, 3)))
-    errors = {"rates": strayed + noise * rng.normal(size=(n, t, 2))}
-    scale, whitening = slow_commands.whitened(errors, slopes, {"rates": np.ones((n, t), bool)}, {"rates": np.ones(2)})
-    np.testing.assert_allclose(scale["rates"], noise, rtol=0.03)
-    white = whitening @ (errors["rates"] / noise).reshape(n, -1, 1)
+    errors = np.einsum("ntku,nu->ntk", slopes, rng.normal(size=(n, 3))) + noise * rng.normal(size=(n, t, 2))
+    r, b = errors.reshape(n, -1), slopes.reshape(n, -1, 3)
+    found, whitening = slow_commands.whitened(r, b, np.ones((n, 2 * t), bool), np.tile([0, 1], t))
+    np.testing.assert_allclose(found, noise, rtol=0.03)
+    white = whitening @ (errors / noise).reshape(n, -1, 1)
     np.testing.assert_allclose((white**2).mean(), 1, rtol=0.05)
 
 

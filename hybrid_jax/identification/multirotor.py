@@ -1,0 +1,84 @@
+"""A multirotor and its sensors as a model of records, see `estimation.record_fit`."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from hybrid_jax.dynamics.actuators import Actuated, held_means
+from hybrid_jax.dynamics.hidden import RandomWalk, with_hidden
+from hybrid_jax.dynamics.measurement import difference, measure
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.state import STATE_SIZE, VELOCITY
+from hybrid_jax.state_space import Quantity
+
+PUSHED = tuple(range(VELOCITY.start, STATE_SIZE))  # the states that a constant disturbance acts on
+TANGENT = RIGID_BODY_SPACE.tangent_size
+
+
+@dataclass(frozen=True)
+class Settled(Quantity):
+    """Numbers that follow from the inputs before a window, so that a search does not change them."""
+
+    @property
+    def tangent_size(self) -> int:
+        return 0
+
+    def retract(self, x, change):
+        return x
+
+    def difference(self, y, x):
+        return y[:0]
+
+
+class Multirotor(eqx.Module):
+    """A body, its rotors' speeds where they lag, and a constant disturbance of v̇ and ω̇; methods of `StateSpaceModel`.
+
+    Attributes:
+        field: with the disturbance as a hidden part.
+        axes: of each quantity that is compared, which of its axes were measured.
+        ahead: intervals of inputs before a window, from which rotor speeds follow.
+    """
+
+    field: Any
+    axes: dict[str, tuple[int, ...]] = eqx.field(static=True)
+    ahead: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, body, axes: dict[str, tuple[int, ...]], ahead: int) -> "Multirotor":
+        return cls(with_hidden(body, RandomWalk(PUSHED)), axes, ahead)
+
+    @property
+    def rotor_states(self) -> int:
+        """How many states of rotors follow those of the body."""
+        body = self.field.field
+        return body.rotor_states if isinstance(body, Actuated) else 0
+
+    @property
+    def space(self):
+        rotors = (Settled("rotor speeds", n),) if (n := self.rotor_states) else ()
+        own = *RIGID_BODY_SPACE.quantities, *rotors, Quantity("disturbance", len(PUSHED))
+        return replace(RIGID_BODY_SPACE, quantities=own)
+
+    def begin(self, x0, u, dt):
+        body = self.field.field
+        if isinstance(body, Actuated):
+            if "delay" in body.deviations or body.actuator.delay:
+                edges = dt * np.arange(len(u) + 1)
+                u = held_means(jnp.asarray(edges[:-1]), u, edges, body.delay)
+            if n := self.rotor_states:
+                speeds = body.settled(u[: max(self.ahead, 1)], dt)
+                x0 = x0.at[STATE_SIZE : STATE_SIZE + n].set(speeds)
+        return x0, u[self.ahead :]
+
+    def output(self, name, x, u):
+        if name == "rotor_speed":
+            found = self.field.field.speeds(x[: len(x) - len(PUSHED)], u)
+        else:
+            found = measure(name, self.field, x, u)
+        return found[np.array(self.axes[name])]
+
+    def error(self, name, predicted, y):
+        return -difference(name, y, predicted)
