@@ -1,16 +1,13 @@
 """Many windows a few at a time, so that memory does not grow with their number."""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-Stacked = TypeVar("Stacked")
-Found = TypeVar("Found")
 
-
-def in_chunks(function: Callable[[Stacked], Found], values: Stacked, size: int) -> Found:
+def in_chunks(function: Callable[[Any], Any], values: Any, size: int) -> Any:
     """`function` of stacked values, of at most `size` at a time, in chunks of equal length.
 
     The last value is repeated to fill the last chunk: a shorter one, as that of `jax.lax.map`, would be compiled as a

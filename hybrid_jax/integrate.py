@@ -1,8 +1,4 @@
-"""Trajectories of a vector field under inputs held over each interval, by any one-step solver of diffrax for ODEs.
-
-Each interval is a solver step of its own, with its input as `args`: in a single solve that looks up its input by time,
-a stage at the end of a step would read the next input.
-"""
+"""Trajectories of a vector field under inputs held over each interval, by any one-step solver of diffrax for ODEs."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,12 +14,13 @@ import optimistix
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, as_field
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, state_space
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.runtime import entry
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
+LONG = 1000  # intervals in which solvers change the norm of a quaternion by more than rounding
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
 _infer = eqx.filter_jit(lambda field, x, u: as_field(field).infer_batch(x, u))
@@ -65,7 +62,13 @@ class RK4(diffrax.AbstractSolver):
         middle, t1 = t0 + half, t0 + length
         if self.scanned:
             times, steps = jnp.array([t0, middle, middle, t1]), jnp.array([0, half, half, 2 * half], y0.dtype)
-            k1, k2, k3, k4 = _slopes(terms, y0, args, times, steps)
+
+            def stage(before, node):  # the slope after a step along the slope before
+                slope = terms.vf(node[0], y0 + node[1] * before, args)
+                return slope, slope
+
+            # The first step is 0, so that any slope will do.
+            k1, k2, k3, k4 = jax.lax.scan(stage, y0, (times, steps))[1]
         else:
             k1 = terms.vf(t0, y0, args)
             k2 = terms.vf(middle, y0 + half * k1, args)
@@ -77,16 +80,6 @@ class RK4(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def _slopes(terms, y0, args, times, steps):
-    """The slope at each stage, which is a step along the slope before."""
-
-    def stage(before, node):
-        slope = terms.vf(node[0], y0 + node[1] * before, args)
-        return slope, slope
-
-    return jax.lax.scan(stage, y0, (times, steps))[1]  # the first step is 0, so that any slope will do
-
-
 def compact(solver: Solver | None) -> Solver:
     """The solver, by default RK4, for a program that runs seldom: with its stages in a loop it compiles sooner."""
     if solver is None or isinstance(solver, RK4):
@@ -95,9 +88,19 @@ def compact(solver: Solver | None) -> Solver:
 
 
 def integrate(
-    derivative: Derivative, x0: Float[Array, " d *b"], u: Float[Array, "t m *b"], dt: float, solver: Solver, substeps=1
+    derivative: Derivative,
+    x0: Float[Array, " d *b"],
+    u: Float[Array, "t m *b"],
+    dt: float,
+    solver: Solver,
+    substeps=1,
+    project: Callable[[Array], Array] = lambda x: x,
 ) -> Float[Array, "t d *b"]:
-    """The states at the end of each of t intervals of length dt [s], solver steps of dt / substeps."""
+    """The states at the end of each of t intervals of length dt [s], solver steps of dt / substeps.
+
+    Each interval is a solver step of its own, with its input as `args`: in a single solve that looks up its input by
+    time, a stage at the end of a step would read the next input. `project` moves the state after an interval.
+    """
     solver = _prepared(solver, jnp.result_type(x0))
     term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
     begin, end = 0.0, dt / substeps
@@ -114,7 +117,7 @@ def integrate(
 
         # Training takes one step: that program has no loop in it. Many, written out, would take minutes to compile.
         (x, _), _ = step(started, None) if substeps == 1 else jax.lax.scan(step, started, length=substeps)
-        return x, x
+        return (x := project(x)), x
 
     return jax.lax.scan(interval, x0, u)[1]
 
@@ -170,7 +173,8 @@ def rollout(
 ) -> Float[Array, "t d"]:
     """The trajectory of a field in inference mode: x[i] is the state (i + 1) dt after x0, u[i] the input until then.
 
-    A trajectory that diverges continues as infinity or NaN, here as in compiled code; `Model.predict` raises.
+    Of more than a thousand intervals, after each an attitude is made a unit quaternion again, if the field's state
+    space has one. A trajectory that diverges continues as infinity or NaN; `Model.predict` raises.
 
     Args:
         field: ẋ = f(x, u), a vector field or any function of a state (d,) and an input (m,).
@@ -189,7 +193,15 @@ def rollout(
 
 @eqx.filter_jit
 def _integrate(field, x0, u, solver, dt, substeps):
-    return integrate(field, x0, u, dt, solver, substeps)
+    return integrate(field, x0, u, dt, solver, substeps, projection(field, len(x0), len(u)))
+
+
+def projection(field, d: int, intervals: int) -> Callable[[Array], Array]:
+    """What is done to a state after an interval of so many: projected on its manifold if these are `LONG`, or nothing.
+
+    Over the windows of training the norm of a quaternion is a state like others, which a residual may move.
+    """
+    return state_space(field, d).projected if intervals > LONG else lambda x: x
 
 
 @entry
@@ -216,9 +228,10 @@ def rollout_batch(
 @eqx.filter_jit
 def _integrate_batch(field, x0, u, solver, dt, substeps):
     if isinstance(solver, diffrax.AbstractImplicitSolver) or not as_field(field).features_first:
-        return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
+        return jax.vmap(lambda start, held: _integrate(field, start, held, solver, dt, substeps))(x0, u)
+    project = jax.vmap(projection(field, x0.shape[1], u.shape[1]), -1, -1)
     columns, held = jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1)
-    states = integrate(lambda x, held: _infer(field, x, held), columns, held, dt, solver, substeps)
+    states = integrate(lambda x, held: _infer(field, x, held), columns, held, dt, solver, substeps, project)
     return jnp.moveaxis(states, -1, 0)
 
 

@@ -1,7 +1,5 @@
 """L_MSE of predicted windows (paper, Sec. 3.3)."""
 
-from collections.abc import Callable
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -72,10 +70,3 @@ def window_mse(
         return mse(predicted[:, every - 1 :: every], jnp.asarray(windows.x)[:, every - 1 :: every])
 
     return in_chunks(errors, windows, chunk)
-
-
-def mean_over(
-    windows: Trajectories, errors: Callable[[Trajectories], Float[Array, " n"]], chunk: int = CHUNK
-) -> Float[Array, ""]:
-    """The mean over windows of `errors`, which is evaluated on `chunk` windows at a time."""
-    return jnp.mean(in_chunks(errors, windows, chunk))

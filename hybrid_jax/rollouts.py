@@ -1,7 +1,4 @@
-"""Trajectories of many windows at once: of a minibatch in training mode, and predicted in inference mode.
-
-By the kernels of `hybrid_jax.kernels` where they serve, else by JAX.
-"""
+"""Trajectories of many windows at once, by the kernels of `hybrid_jax.kernels` where they serve, else by JAX."""
 
 import diffrax
 import equinox as eqx
@@ -11,7 +8,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import kernels
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.batching import batch_norms, over_samples, training_mode
-from hybrid_jax.integrate import RK4, Solver, integrate, rollout_batch
+from hybrid_jax.integrate import LONG, RK4, Solver, integrate, rollout_batch
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
 _train = eqx.filter_jit(lambda field, x, u: as_field(field).train_batch(x, u))
@@ -48,5 +45,6 @@ def predict(
     solver: Solver | None = None,
 ) -> Float[Array, "n t d"]:
     """What `rollout_batch` returns, to rounding; it raises the same."""
-    states = kernels.predicted(field, x0, u, dt, RK4() if solver is None else solver)
+    by_kernels = np.ndim(u) == 3 and np.shape(u)[1] <= LONG  # they do not project, see `integrate.projection`
+    states = kernels.predicted(field, x0, u, dt, RK4() if solver is None else solver) if by_kernels else None
     return rollout_batch(field, x0, u, dt, solver) if states is None else states

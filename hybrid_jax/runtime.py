@@ -139,26 +139,19 @@ def cores() -> int:
 
 def hardware() -> dict[str, Any]:
     """Processor, cores, memory [GiB] and JAX devices, as JSON values."""
+    lines = CPUS.read_text().splitlines() if CPUS.exists() else []  # Linux alone has them
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    try:
+        memory = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (AttributeError, ValueError, OSError):  # not POSIX
+        memory = None
     return {
-        "cpu": _processor(),
+        "cpu": names[0] if names else platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
-        "memory_gib": _memory(),
+        "memory_gib": memory,
         "jax_backend": jax.default_backend(),
         "jax_devices": [f"{count} × {kind}" for kind, count in Counter(d.device_kind for d in jax.devices()).items()],
     }
-
-
-def _processor() -> str:
-    lines = CPUS.read_text().splitlines() if CPUS.exists() else []  # Linux alone has them
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def _memory() -> float | None:
-    try:
-        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
-    except (AttributeError, ValueError, OSError):  # not POSIX
-        return None
 
 
 def _delete_stale(programs: Path) -> None:
@@ -171,16 +164,13 @@ def _delete_stale(programs: Path) -> None:
     looked.touch()  # first, so that programs written meanwhile are verified next time
     size = 0
     with contextlib.suppress(FileNotFoundError):  # deleted by another process
-        found = [(path, path.stat()) for path in programs.glob("*-cache") if path.is_file()]
-        for path, about in sorted(found, key=lambda each: _used(each[1]), reverse=True):
-            size += about.st_size
-            begun = about.st_mtime >= since and _is_truncated(path.read_bytes())
-            if begun or size > MOST or time.time() - _used(about) > UNUSED:
+        about = {path: path.stat() for path in programs.glob("*-cache") if path.is_file()}
+        used = {path: max(each.st_atime, each.st_mtime) for path, each in about.items()}
+        for path in sorted(about, key=used.__getitem__, reverse=True):
+            size += about[path].st_size
+            begun = about[path].st_mtime >= since and _is_truncated(path.read_bytes())
+            if begun or size > MOST or time.time() - used[path] > UNUSED:
                 path.unlink()
-
-
-def _used(about: os.stat_result) -> float:
-    return max(about.st_atime, about.st_mtime)
 
 
 def _is_truncated(program: bytes) -> bool:

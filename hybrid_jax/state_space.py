@@ -238,6 +238,10 @@ class StateSpace:
             x = x.at[part].set(one.normalise(x[part]))
         return x
 
+    def projected(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
+        """The state next to numbers that rounding, or a solver's step, has left near to one."""
+        return self.nearest(self.normalise(x), x)
+
     def nearest(self, x: Float[Array, " d"], to: Float[Array, " d"]) -> Float[Array, " d"]:
         """The same state as x, by those of its numbers that are nearest to another's.
 

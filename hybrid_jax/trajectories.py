@@ -82,17 +82,13 @@ def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> N
         checks.unit_quaternions(f"{name}: x", trajectories.x)
 
 
-def check_like(trajectories: Trajectories, windows: Trajectories, name: str) -> None:
-    """Raise ValueError unless states and inputs are of as many numbers as those of other windows."""
+def check_like(trajectories: Trajectories, windows: Trajectories, name: str, dt: bool = True) -> None:
+    """Raise ValueError unless sizes of states and inputs, and dt if that counts, are those of other windows."""
     for part, axis in (("x0", "states"), ("u", "inputs")):
         expected, found = (getattr(each, part).shape[-1] for each in (windows, trajectories))
         if found != expected:
             raise ValueError(f"{name}: {axis} of {expected} numbers expected, as in the other windows, got {found}")
-
-
-def check_dt(trajectories: Trajectories, windows: Trajectories, name: str) -> None:
-    """Raise ValueError for another dt than that of other windows."""
-    if not math.isclose(trajectories.dt, windows.dt, rel_tol=SAME):
+    if dt and not math.isclose(trajectories.dt, windows.dt, rel_tol=SAME):
         raise ValueError(f"{name}: dt must be {windows.dt}, as of the other windows, got {trajectories.dt}")
 
 

@@ -10,9 +10,11 @@ from choices import slow
 from pendulum import pendulum
 
 from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.integrate import RK4, SOLVERS, along, rollout, rollout_batch
 from hybrid_jax.networks.mlp import residual_network
-from hybrid_jax.rollouts import rollout_minibatch
+from hybrid_jax.rollouts import predict, rollout_minibatch
+from hybrid_jax.vehicle import IRIS
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 
@@ -185,3 +187,15 @@ def test_along_pairs_each_input_with_the_state_it_found():
 def test_the_error_of_a_solver_by_name_says_where_the_names_are():
     with pytest.raises(ValueError, match=r"one of diffrax or of hybrid_jax\.SOLVERS, got 'rk4'"):
         path_of("rk4")
+
+
+def test_an_attitude_stays_one_however_long_it_turns():
+    """RK4 shrinks the quaternion of a body that spins, to nothing after some thousand steps."""
+    x0, u = np.eye(13)[3], np.tile(IRIS.hover_speed * np.array([1.0, 1.0, 0.9, 0.9]), (3000, 1))
+    body = rigid_body(IRIS)
+    flown = rollout(body, x0, u, 0.01)
+    assert np.abs(flown[-1, 10:]).max() > 10  # rad/s
+    np.testing.assert_allclose(np.linalg.norm(flown[:, 3:7], axis=1), 1, atol=1e-12)
+    for many in (rollout_batch, predict):
+        np.testing.assert_allclose(many(body, x0[None], u[None], 0.01)[0, :500], flown[:500], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(rollout(body, x0, u[:500], 0.01), flown[:500], rtol=1e-6, atol=1e-6)

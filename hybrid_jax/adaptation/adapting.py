@@ -40,7 +40,7 @@ from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.objective import Settings
-from hybrid_jax.trajectories import Trajectories, check_dt, check_like
+from hybrid_jax.trajectories import Trajectories, check_like
 
 HELD_OUT = 5  # one in so many windows validates
 NAMED = 50  # physics with more parameters is a network, and its weights are not listed
@@ -229,12 +229,11 @@ def adapt(
     learned_from = motion_of(field) if learned_from is None else learned_from
     if learned_from is not None:
         learned_from = check_windows(field, learned_from, "learned_from")
-        check_like(learned_from, windows, "learned_from")
+        check_like(learned_from, windows, "learned_from", dt=False)
     check_level(level)
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
     held_out = check_windows(field, held_out, "validation")
     check_like(held_out, train, "validation")
-    check_dt(held_out, train, "validation")
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
     checks.instance("settings", settings, Settings)
     for data in (windows,) if validation is None else (windows, validation):

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.metrics import mean_over
+from hybrid_jax.metrics import CHUNK
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories, check
 
@@ -82,7 +83,7 @@ class ChannelLoss(TrajectoryLoss):
             predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, settings.solver)
             return jnp.mean(self.error(predicted - jnp.asarray(windows.x)), axis=-1)
 
-        return mean_over(data, errors)
+        return jnp.mean(in_chunks(errors, data, CHUNK))
 
     def error(self, difference: Float[Array, "*n d"]) -> Float[Array, "*n"]:
         """Σ over channels of ρ(‖error‖ / scale).

@@ -25,7 +25,7 @@ from hybrid_jax.status import Status
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, FitState, Optimiser, RunConfig, make_run_config
 from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
-from hybrid_jax.trajectories import Trajectories, check, check_dt
+from hybrid_jax.trajectories import Trajectories, check, check_like
 
 WEIGHT = 1e-3  # λ, where none is given
 RATE = 1e-2
@@ -180,7 +180,7 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
                 checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from error
-            check_dt(windows, data["train"], name)
+            check_like(windows, data["train"], name)
             check_batch_norm(field, *(np.asarray(part).T for part in (windows.x0[:2], windows.u[:2, 0])))
 
 
