@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from rich.console import Console
@@ -150,61 +150,49 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
     write_report(out, report)
 
 
-class Effect(NamedTuple):
-    """What a value does to the test error after fine-tuning, over that of the default, paired by seed."""
+def effects(rows: Results) -> dict[tuple[str, str], dict[str, Interval]]:
+    """By choice and value, and by domain: the error after fine-tuning at the smallest N over that of the default.
 
-    choice: str
-    value: str
-    ratios: dict[str, Interval]  # by domain, with a 95 % interval: of geometric means over seeds
-
-
-def effects(rows: Results) -> list[Effect]:
-    """Of every value that is not the default, at the smallest N; seeds that diverged leave no interval."""
-    found = []
+    Geometric means over seeds, paired, with a 95 % interval, which seeds that diverged do not leave.
+    """
+    found: dict[tuple[str, str], dict[str, Interval]] = {}
     tuned = rows.where(mode=FINE_TUNED)
-    tuned = tuned.where(n_train=min(tuned["n_train"], default=0))
-    for choice, group in tuned.group("choice").items():
-        default = group.where(default=True).group("domain")
-        for value, own in group.where(default=False).group("value").items():
-            ratios = {}
-            for domain, ours in own.group("domain").items():
-                if domain in default:
-                    errors, others = ours.paired(default[domain], "test_mse")
-                    with np.errstate(all="ignore"):
-                        logs = mean_interval(np.log(errors) - np.log(others), ours["seed"])
-                        ratios[domain] = Interval(*map(float, np.exp(logs)))
-            found += [Effect(choice, value, ratios)] * bool(ratios)
+    for (choice, domain), group in (
+        tuned.where(n_train=min(tuned["n_train"], default=0)).group("choice", "domain").items()
+    ):
+        for value, ours in group.where(default=False).group("value").items() if any(group["default"]) else ():
+            with np.errstate(all="ignore"):
+                errors, others = np.log(ours.paired(group.where(default=True), "test_mse"))
+                ends = np.exp(mean_interval(errors - others, ours["seed"]))
+            found.setdefault((choice, value), {})[domain] = Interval(*map(float, ends))
     return found
 
 
 def conclusion(rows: Results) -> list[str]:
     """Which choices help in every domain, which do nothing, which harm, and by how much."""
     found = effects(rows)
-    better = [each for each in found if all(ratio.below(1) for ratio in each.ratios.values())]
-    worst = max(found, key=lambda each: max(ratio.value for ratio in each.ratios.values()), default=None)
-    by_choice = {choice: [e for e in found if e.choice == choice] for choice in dict.fromkeys(e.choice for e in found)}
-    idle = [
-        choice
-        for choice, own in by_choice.items()
-        if all(abs(ratio.value - 1) <= LITTLE for each in own for ratio in each.ratios.values())
-    ]
+    largest = {key: max(ratio.value for ratio in ratios.values()) for key, ratios in found.items()}
+    better = [key for key, ratios in found.items() if all(ratio.below(1) for ratio in ratios.values())]
+
+    def times(key: tuple[str, str]) -> str:
+        ratios = ", ".join(f"{ratio.value:.2f} times ({label(domain)})" for domain, ratio in found[key].items())
+        return f"{key[0]} = {key[1]}: {ratios}"
+
     sentences = []
     if better:
-        best = min(better, key=lambda each: max(ratio.value for ratio in each.ratios.values()))
         others = len(better) - 1
         more = f"; {others} other value{'s are' if others > 1 else ' is'} better everywhere, too" if others else ""
-        sentences.append(f"Best of all is {best.choice} = {best.value}: {_times(best)} the default's error{more}.")
+        sentences.append(f"Best of all is {times(min(better, key=largest.__getitem__))} the default's error{more}.")
     elif found:
         sentences.append("No value is better than the default in every domain.")
-    if worst and max(ratio.value for ratio in worst.ratios.values()) > 1:
-        sentences.append(f"What harms most is {worst.choice} = {worst.value}: {_times(worst)}.")
-    if idle:
+    if found and largest[worst := max(largest, key=largest.__getitem__)] > 1:
+        sentences.append(f"What harms most is {times(worst)}.")
+    moved = {
+        key[0] for key, ratios in found.items() if any(not abs(ratio.value - 1) <= LITTLE for ratio in ratios.values())
+    }
+    if idle := [choice for choice in dict.fromkeys(key[0] for key in found) if choice not in moved]:
         sentences.append(f"Changes nothing by more than {LITTLE:.0%}: {', '.join(idle)}.")
     return sentences
-
-
-def _times(effect: Effect) -> str:
-    return ", ".join(f"{ratio.value:.2f} times ({label(domain)})" for domain, ratio in effect.ratios.items())
 
 
 ABOUT = "Which choices of the method matter, and where it breaks."

@@ -15,7 +15,7 @@ from rich.console import Console
 from experiments.paper import study
 from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, OneFlight, preset_like
-from experiments.paper.regret import CLAIMS, conclusion, error_figure, error_table, regret_figure, regret_table
+from experiments.paper.regret import CLAIMS, conclusion, error_figure, error_table, regret_table
 from experiments.paper.study import EVERY, flown, pretrained, source_splits, target_splits, windows_of
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
@@ -131,8 +131,7 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
     errors = (
         "Prediction error by change, % of that without adaptation; bands reach from the least to the most of all cases"
     )
-    regret = "Test error over that of the best candidate"
-    return {"errors": (error_figure(rows), errors), "regret": (regret_figure(rows), regret)}
+    return {"errors": (error_figure(rows), errors)}
 
 
 def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, stages: Stages) -> list[Row]:
