@@ -58,18 +58,13 @@ def write(
     out, found = config.out / NAME, cells(rows)
     best = max((cell for cell in found if cell[0] in (ADAPTED, LEARNED)), key=lambda cell: cell[1])
     drawn = [(names.HOLD, 0), (names.THRUST, 0), (names.PHYSICS_ONLY, 0), *dict.fromkeys([(LEARNED, 0), best])]
-    figure = errors.figure(
-        {label(*cell): np.stack([curves[key_of(row)] for row in found[cell]]) for cell in drawn}, config.dt
-    )
+    lines = {label(*cell): np.stack([curves[key_of(row)] for row in found[cell]]) for cell in drawn}
+    figure = errors.figure(lines, config.dt)
     caption = "RMSE over the time since a prediction began, on flights held out"
     claims = verdicts(found, best)
     tables = [expected_table(found), *score_tables(rows, found, config.dt), verdict_table(claims, "Hypotheses")]
     tables += [by_flight_table(found, best, max(config.horizon)), parameter_table(found)]
-    parts = {"train": lambda fold: fold.train, "test": lambda fold: fold.test}
-    split = [
-        {"tested_on": fold.name} | {part: [flight_of(log) for log in of(fold)] for part, of in parts.items()}
-        for fold in folds
-    ]
+    split = [{"train": [*map(flight_of, fold.train)], "test": [*map(flight_of, fold.test)]} for fold in folds]
     said = [f"{name}: {line}" for name, each in sets.items() for line in each.said]
     flown = ", ".join(f"{len(each.logs)} {name} ({each.seconds:.0f} s)" for name, each in sets.items())
     made = Report(

@@ -157,7 +157,7 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
     mends = [(log.name, c.name, c.suggestion) for log in logs for c in log.checks if c.verdict in (FAILS, WARNS)] + [
         (log.name, "flight", log.refusal) for log in logs if log.refusal
     ]
-    learn = f"hybrid-jax fit {options.folder} -o source.npz --vehicle {options.vehicle or 'v.toml'}"
+    learn = f"Learn from them: hybrid-jax fit {options.folder} -o source.npz --vehicle {options.vehicle or 'v.toml'}"
     read = [log for log in logs if log.recording is not None]
     worst = sorted(logs, key=lambda log: log.result == "ready")
     return page.Page(
@@ -170,9 +170,7 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
             if log.recording is not None
         ],
         [NOT_RUN] if options.vehicle is None and read else [],
-        [f"{log}: {check}: {mend}" for log, check, mend in mends[:LINES]]
-        if not ready
-        else [f"Learn from them: {learn}"],
+        [*([] if ready else [f"{log}: {check}: {mend}" for log, check, mend in mends[:LINES]]), learn],
         [
             page.Table(
                 "All logs",

@@ -9,7 +9,6 @@ import jax
 import matplotlib as mpl
 import numpy as np
 import tyro
-from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from hybrid_jax import checks
@@ -74,29 +73,22 @@ def run(options: Options) -> int:
     checks.writable_folder("--out", options.out)
     checks.writable_folder("--output", options.output.parent)
     model = load(options.model)
-    dt = model.about.get("dt", 0.01)
+    dt, field = model.about.get("dt", 0.01), with_disturbance(model.field)
     box = FlightBounds(options.low, options.high, options.speed, options.tilt, options.yaw, options.rotor_speed)
     search = {name: getattr(options, name) for name in ("seconds", "bandwidth", "starts", "steps", "seed")}
+    search |= {"noise": options.noise or None, "window": WINDOW * dt, "dt": dt}
     with step("searching for the flight, a minute or two"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        field = with_disturbance(model.field)
-        found = excitation(
-            field, options.learn or None, box, noise=options.noise or None, window=WINDOW * dt, dt=dt, **search
-        )
-    points = _set_points(found)
+        found = excitation(field, options.learn or None, box, **search)
+    place, yaw = jax.vmap(found.reference)(found.t)
+    points = np.column_stack([found.t, place, yaw, found.states[:, VELOCITY]])
     lines = [HEADER, *(",".join(f"{number:.5g}" for number in row) for row in points)]
     write_atomic(options.output, ("\n".join(lines) + "\n").encode())
     values = {name: float(value) for name, value in named_parameters(field).items()}
     said = [str(each.message).removeprefix("excitation: ") for each in caught]
-    shown = _page(options, found, points, values, said)
     told = {"standard_errors": found.standard_errors, "margins": found.margins, "set_points": options.output}
-    page.write(options.out, "plan", shown, told)
+    page.write(options.out, "plan", _page(options, found, points, values, said), told)
     return 0
-
-
-def _set_points(found: Excitation) -> Float[np.ndarray, "n 8"]:
-    place, yaw = jax.vmap(found.reference)(found.t)
-    return np.column_stack([found.t, place, yaw, found.states[:, VELOCITY]])
 
 
 def _page(options: Options, found: Excitation, points: np.ndarray, values: dict[str, float], said) -> page.Page:
@@ -116,7 +108,7 @@ def _page(options: Options, found: Excitation, points: np.ndarray, values: dict[
             f"Then: hybrid-jax adapt {options.model} LOGS -o adapted.npz.",
         ],
         [
-            *([page.Table("All intervals", header, rows)] * (len(rows) > 5)),
+            page.Table("All intervals", header, rows),
             page.Table("Limits", ("limit", "left"), [(name, f"{left:.0%}") for name, left in found.margins.items()]),
         ],
     )
