@@ -15,12 +15,13 @@ from matplotlib.figure import Figure
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
+from hybrid_jax.cli.learning import lagged
 from hybrid_jax.cli.logs import LISTS, FlightOptions, read_flights, windows_of
 from hybrid_jax.cli.model import known_of, reading_of
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.io.models import load
-from hybrid_jax.state import POSITION, QUATERNION
+from hybrid_jax.state import POSITION
 from hybrid_jax.trajectories import Trajectories
 
 __all__ = ["LISTS", "Options", "run"]
@@ -33,8 +34,7 @@ Forecasts = Mapping[str, Float[np.ndarray, "n t 3"]]
 class Options(FlightOptions):
     """Show a flight in 3-D, and at each time where a model expects the vehicle next, under the inputs that were flown.
 
-    Writes replay.gif, which the page shows, and if rerun is installed (pip install 'hybrid_jax[replay]') replay.rrd for
-    its viewer: rerun replay.rrd.
+    Writes replay.gif, which the page shows.
     """
 
     model: Annotated[Path, tyro.conf.Positional]
@@ -58,6 +58,7 @@ def run(options: Options) -> int:
     models = {path: known_of(path, load(path)) for path in (options.model, options.other) if path is not None}
     first = models[options.model]
     logs = read_flights(options.flight, first.vehicle, first.dt, reading_of(first, options), changed=True).logs
+    logs = lagged(logs, first.about.get("lag", 0.0))
     if len(logs) > 1:
         raise ValueError(f"{options.flight}: holds {len(logs)} flights; give one of them")
     steps, every = max(1, round(options.ahead / first.dt)), max(1, round(1 / SHOWN / first.dt))
@@ -69,7 +70,6 @@ def run(options: Options) -> int:
         }
         picture = _animated(windows, forecasts, every * windows.dt)
         write_atomic(options.out / "replay.gif", picture)
-        recorded = _recorded(options.out / "replay.rrd", windows, forecasts, first.vehicle, every * windows.dt)
     ends = {name: np.linalg.norm(each[:, -1] - windows.x[:, -1, POSITION], axis=1) for name, each in forecasts.items()}
     rms = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in ends.items()}
     rows = [(name, f"{rms[name]:.3g} m", f"{np.max(each):.3g} m") for name, each in ends.items()]
@@ -79,9 +79,8 @@ def run(options: Options) -> int:
         f"{seconds:g} s ahead it is {rms[str(options.model)]:.3g} m from where {options.model.name} expects it.",
         page.Table(f"Distance after {seconds:g} s", ("model", "RMS", "largest"), rows),
         [("The flight, and what models expect next, in real time", picture)],
-        todo=["In 3-D: rerun " + str(recorded) if recorded else "For 3-D: pip install 'hybrid_jax[replay]'"],
     )
-    page.write(options.out, "replay", shown, {"distance": rms, "files": [options.out / "replay.gif", recorded]})
+    page.write(options.out, "replay", shown, {"distance": rms, "files": [options.out / "replay.gif"]})
     return 0
 
 
@@ -110,25 +109,3 @@ def _animated(windows: Trajectories, forecasts: Forecasts, dt: float) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         moving.save(Path(folder) / "a.gif", PillowWriter(fps=round(1 / dt)))
         return (Path(folder) / "a.gif").read_bytes()
-
-
-def _recorded(path: Path, windows: Trajectories, forecasts: Forecasts, vehicle, dt: float) -> Path | None:
-    """A recording for the viewer of rerun; none if that is not installed."""
-    try:
-        import rerun
-    except ImportError:
-        return None
-    recorder, x = rerun.RecordingStream("hybrid_jax"), np.asarray(windows.x0)
-    recorder.save(path)
-    recorder.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    arms = [np.array([[0, 0, 0], [*rotor, 0]]) for rotor in vehicle.rotor_positions]
-    recorder.log("world/vehicle/arms", rerun.LineStrips3D(arms, radii=0.01), static=True)
-    for i, state in enumerate(x):
-        recorder.set_time("flight", duration=i * dt)
-        quaternion = rerun.Quaternion(xyzw=np.roll(state[QUATERNION], -1))
-        recorder.log("world/vehicle", rerun.Transform3D(translation=state[POSITION], quaternion=quaternion))
-        recorder.log("world/path", rerun.LineStrips3D([x[: i + 1, POSITION]]))
-        for name, each in forecasts.items():
-            recorder.log(f"world/{name}", rerun.LineStrips3D([each[i]], radii=0.005))
-    recorder.flush()
-    return path

@@ -158,8 +158,6 @@ def test_a_flight_is_shown_with_what_a_model_expects(fitted, called):
     assert 'src="data:image/gif;base64,' in (out / "report.html").read_text()
     with Image.open(out / "replay.gif") as picture:
         assert picture.n_frames == 10  # pyright: ignore[reportAttributeAccessIssue]
-    verify = [sys.executable, "-m", "rerun", "rrd", "verify", out / "replay.rrd"]
-    assert subprocess.run(verify, capture_output=True, check=False).returncode == 0
 
 
 @pytest.mark.slow
