@@ -14,6 +14,7 @@ from hybrid_jax.cli.identify import (
     Read,
     figure,
     identified,
+    layout_of,
     predicted,
     read_checked,
     values_of,
@@ -21,7 +22,6 @@ from hybrid_jax.cli.identify import (
 )
 from hybrid_jax.cli.logs import require_unseen
 from hybrid_jax.dynamics.actuators import Actuated
-from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import Model, save
 
@@ -31,7 +31,7 @@ HEADER = ("parameter", "before", "after", "from", "to", "unit")
 
 def adapt(options: Any, model: Model) -> int:
     """Identify it again, from where it is, by logs after a change."""
-    read, layout = _like(options, options.after, model), _layout(model)
+    read, layout = _like(options, options.after, model), layout_of(model.about["identified"])
     found, logs = identified(read, layout), [*read.logs.values()]
     before, after = model.about["parameters"], values_of(found)
     changed = [name for name, one in after.items() if _apart(one, before[name])]
@@ -65,7 +65,7 @@ def adapt(options: Any, model: Model) -> int:
 
 def check(options: Any, model: Model) -> int:
     """What it predicts of each quantity that was measured, in all logs and in each."""
-    read, layout = _like(options, options.flights, model), _layout(model)
+    read, layout = _like(options, options.flights, model), layout_of(model.about["identified"])
     logs = [*read.logs.values()]
     whole = predicted(model.field, logs, layout, "all logs")
     ends = "; ".join(f"{name} by {error} {unit}" for name, unit, _, error in whole.lines)
@@ -105,8 +105,3 @@ def _apart(one: Any, other: Any) -> bool:
     return bool(one["low"] > high or one["high"] < low) and abs(one["value"] - other["value"]) > ALIKE * abs(
         other["value"]
     )
-
-
-def _layout(model: Model) -> Layout:
-    fits = model.about["identified"]
-    return Layout(fits["dt"], fits["steps"], fits["windows"])

@@ -1,7 +1,7 @@
 """`hybrid-jax identify`: learn a vehicle from logs of its commands and of whatever was measured beside them."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,10 +31,10 @@ from hybrid_jax.io.models import save
 from hybrid_jax.vehicle import Vehicle
 
 __all__ = ["LISTS", "Options", "run"]
-LISTS = ("--learn", "--motor-order", "--topics")
+LISTS = ("--learn", "--motor-order", "--topics", "--disturbance")
 ENDS = ("value", "low", "high")
 LINES = 5  # of what is not folded
-FITS = ("dt", "steps", "windows")  # options that a model remembers
+FITS = ("dt", "steps", "windows", "disturbance")  # options that a model remembers
 ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below counts until they pass."
 
 
@@ -76,9 +76,9 @@ class Options(LogOptions):
     windows: Annotated[int, RARE] = 300
     """Windows at most: half are those that tell most of what is learned, the others are spread evenly."""
 
-    @property
-    def layout(self) -> Layout:
-        return Layout(self.dt, self.steps, self.windows)
+    disturbance: Annotated[tuple[float, ...], RARE] = Layout.disturbance
+    """First guess of the standard deviation of a constant force [m/s²] and torque [rad/s²] of a window, along x, y and
+    z; 0 for none: of a damaged rotor the trim tells, which a free torque would take up."""
 
 
 class Read(NamedTuple):
@@ -100,13 +100,18 @@ def run(options: Options) -> int:
     checks.writable_folder("--out", options.out)
     checks.writable_folder("--output", options.output.parent)
     read = checked(options)
-    found = identified(read, options.layout)
+    found = identified(read, layout_of(vars(options)))
     about = {"dt": options.dt, "learned_from": read.contents, "parameters": values_of(found)}
     about |= {"identified": {name: getattr(options, name) for name in FITS}}
     save(options.output, found.field, json_value(about))
     shown = _page(options, found, read)
     page.write(options.out, "identify", shown, {"parameters": about["parameters"], "model": options.output})
     return 0
+
+
+def layout_of(fits: Mapping[str, Any]) -> Layout:
+    """How recordings are cut into windows, of FITS."""
+    return Layout(fits["dt"], fits["steps"], fits["windows"], disturbance=tuple(fits["disturbance"]))
 
 
 def checked(options: Options) -> Read:
@@ -193,16 +198,17 @@ def _learn(names: Sequence[str], without: Sequence[str]) -> str:
 
 def _page(options: Options, found: Identified, read: Read) -> page.Page:
     values, logs = values_of(found), [*read.logs.values()]
+    errors = figure(found.field, logs, layout_of(vars(options)))
     lines = [(name, *(f"{one[end]:.4g}" for end in ENDS), one["unit"]) for name, one in values.items()]
     unseen = [name for name, one in values.items() if not np.isfinite(one["high"])]
     header = ("parameter", "estimate", "from", "to", "unit")
-    fitted = [(name, _unit(name), "  ".join(f"{e:.3g}" for e in errors)) for name, errors in found.errors.items()]
+    fitted = [(name, _unit(name), "  ".join(f"{e:.3g}" for e in each)) for name, each in found.errors.items()]
     again = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     return page.Page(
         f"What do {len(logs)} logs of {options.folder} tell of the vehicle?",
         f"{len(values) - len(unseen)} of {len(lines)} numbers are told by {found.seconds:.4g} s of flight.",
         page.Table("Parameters, with 95 % intervals", header, lines[:LINES]),
-        [("Errors of predictions from the state that earlier samples tell", figure(found.field, logs, options.layout))],
+        [("Errors of predictions from the state that earlier samples tell", errors)],
         [*warned(read, found), *_notes(found, logs, unseen)],
         [f"Fly what excites {', '.join(unseen)}, or learn less." if unseen else again],
         [
