@@ -10,12 +10,10 @@ Its steps can be taken one by one. Split by flight before cutting, since windows
 
 from hybrid_jax.flights.checks.cleaning import (
     Cleaning,
-    align_motors,
     clean,
     delay_motors,
     in_flight,
     lag_motors,
-    low_pass,
     resample,
 )
 from hybrid_jax.flights.checks.consistency import Check, check_log
@@ -37,7 +35,6 @@ __all__ = [
     "LogWindows",
     "Recording",
     "Signal",
-    "align_motors",
     "check_log",
     "check_recording",
     "clean",
@@ -53,7 +50,6 @@ __all__ = [
     "load_log",
     "load_logs",
     "load_windows",
-    "low_pass",
     "read_recording",
     "resample",
     "to_flight",

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -103,12 +103,18 @@ def load_logs(
         raise ValueError(f"failed must be one of {', '.join(known)}, got {failed!r}")
     cleaning = cleaning or Cleaning()
     dt = cleaning.resample if dt is None else dt
-    raws = read_folder(folder, columns=columns, topics=topics, motor_order=motor_order)[0]
+    paths, left = find_logs(folder)
+    if not paths:
+        others = "; ".join(f"{path.name}: {why}" for path, why in [*left.items()][:5])
+        found = f"; it holds {others}" if left else ""
+        raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
+    columns = load_column_map(columns) if isinstance(columns, str | Path) else columns
+    raws = [read_recording(path, columns, topics, motor_order) for path in paths]
     report([(raw.name, c) for raw in raws for c in check_recording(raw, vehicle, dt or own_interval(raw))], failed)
 
     def cleaned(log: FlightLog) -> FlightLog:
         fits = dt is None or (log.dt == dt and not unevenness(log).any())
-        return clean(log, replace(cleaning, resample=None if fits else dt), vehicle)[0]
+        return clean(log, replace(cleaning, resample=None if fits else dt))[0]
 
     return [cleaned(flight_at(raw, dt, polynomial)) for raw in raws]
 
@@ -123,23 +129,6 @@ def report(found: Sequence[tuple[str, Check]], failed: Failed) -> None:
         raise ValueError(f'{lines[FAILS][0]}{more}; failed="warn" goes on all the same')
     for line in (*lines[FAILS], *lines[WARNS]):
         warnings.warn(line, stacklevel=3)
-
-
-def read_folder(
-    folder: str | Path, columns: ColumnMap | str | Path | None = None, **reading: Any
-) -> tuple[list[Recording], dict[Path, str]]:
-    """`read_recording` of all logs of a folder, by their names; also its other files, and why they are left.
-
-    Raises:
-        ValueError: the folder holds no logs, or the file, row, field and what to do, in one line.
-    """
-    paths, left = find_logs(folder)
-    if not paths:
-        others = "; ".join(f"{path.name}: {why}" for path, why in [*left.items()][:5])
-        found = f"; it holds {others}" if left else ""
-        raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
-    columns = load_column_map(columns) if isinstance(columns, str | Path) else columns
-    return [read_recording(path, columns, **reading) for path in paths], left
 
 
 def format_of(path: str | Path) -> tuple[str, str]:

@@ -7,18 +7,15 @@ from surface import refusal
 
 from hybrid_jax.flights.checks.cleaning import (
     Cleaning,
-    align_motors,
     clean,
     delay_motors,
     in_flight,
     lag_motors,
-    low_pass,
     resample,
 )
 from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.trajectories import check
-from hybrid_jax.vehicle import IRIS
 
 
 def with_gap(log, start=400, stop=420):
@@ -99,34 +96,6 @@ def test_coarser_resampling_loses_no_thrust(flight):
     np.testing.assert_allclose(log.u[:-1], means, rtol=1e-6)
 
 
-def tone(flight, hertz):
-    x = np.tile(flight.x[:1], (len(flight), 1))
-    x[:, 12] = np.sin(2 * np.pi * hertz * flight.t)
-    u = np.tile(500 + 100 * x[:, 12:], (1, 4))
-    return FlightLog(flight.t, x, u)
-
-
-def test_attenuation_at_the_cutoff(flight):
-    log, done = low_pass(tone(flight, 5.0), 5.0)
-    middle = slice(400, 800)
-    assert np.abs(log.x[middle, 12]).max() == pytest.approx(0.5, rel=0.02)
-    # States and motors are filtered alike, and slow motion is not delayed.
-    np.testing.assert_allclose(log.u[middle, 0], 500 + 100 * log.x[middle, 12], atol=1e-6)
-    assert "zero phase" in done
-    slow = tone(flight, 0.5)
-    np.testing.assert_allclose(low_pass(slow, 5.0)[0].x[middle, 12], slow.x[middle, 12], atol=1e-3)
-
-
-def test_filters_end_at_gaps_and_repeated_samples(flight):
-    other = flight.x.copy()
-    other[420:, 10:] += 5.0
-    a, b = (low_pass(with_gap(FlightLog(flight.t, x, flight.u)), 5.0)[0] for x in (flight.x, other))
-    np.testing.assert_array_equal(a.x[:400], b.x[:400])
-    log, done = low_pass(with_repeat(flight), 20.0)
-    assert [part.stop - part.start for part in segments(log)] == [700, len(flight) - 701]
-    assert "1 repeated samples left out" in done
-
-
 def test_time_on_the_ground_is_cut_but_not_a_short_fall(flight):
     u, x = flight.u.copy(), flight.x.copy()
     u[:80], u[500:530] = 3.0, 3.0  # 0.8 s, and 0.3 s without thrust
@@ -155,15 +124,6 @@ def test_a_shift_by_whole_samples_moves_rows(flight, steps):
     assert f"{abs(steps)} samples cut" in done
 
 
-def test_alignment_finds_the_shift(flight):
-    late = FlightLog(flight.t[:-5], flight.x[:-5], flight.u[5:])
-    log, done = align_motors(late, IRIS)
-    assert float(done.split("by ")[1].split(" ms")[0]) == pytest.approx(50, abs=2)
-    np.testing.assert_allclose(log.u, flight.u[5:-1][: len(log)], rtol=0.02)
-    still = FlightLog(flight.t, flight.x, flight.u * 0 + 400)
-    refusal(lambda: align_motors(still, IRIS), "do not follow the motors")
-
-
 def test_step_response_of_the_lag_is_exponential(flight):
     u = np.where(np.arange(len(flight))[:, None] < 100, 400.0, 500.0) * np.ones(4)
     log, done = lag_motors(FlightLog(flight.t, flight.x, u), 0.05)
@@ -184,21 +144,19 @@ def test_lag_recovers_rotor_speeds_from_commands(flight):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"low_pass": 60.0}, r"low_pass: cutoff must lie between 0 and half the sampling frequency 50 Hz, got 60"),
         ({"resample": 5.0}, r"resample: no segment without gaps is as long as dt = 5.0 s"),
         ({"delay": 5.0}, r"delay: no segment without gaps is longer than the lag of 5.0 s"),
     ],
 )
 def test_impossible_cleaning_is_refused_with_log_and_option(options, message):
     with pytest.raises(ValueError, match=f"^{LOGS[0].name}: {message}"):
-        clean(LOGS[0], Cleaning(**options), IRIS)
+        clean(LOGS[0], Cleaning(**options))
 
 
 @pytest.mark.parametrize(
     ("option", "value", "expected"),
     [
         ("resample", 0.0, "positive"),
-        ("low_pass", -1.0, "positive"),
         ("longest_gap", -0.1, "finite number of at least 0"),
         ("delay", np.nan, "finite"),
     ],

@@ -10,10 +10,8 @@ import scipy  # not scipy.signal, which takes a second: it is imported where it 
 from hybrid_jax import checks
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.checks.airborne import on_ground
-from hybrid_jax.flights.checks.motor_response import respond
 from hybrid_jax.flights.log import GAP, FlightLog, even_segments, repeats, runs_of, segments
-from hybrid_jax.state import QUATERNION, STATE_SIZE
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.state import QUATERNION
 
 TIME_CONSTANTS = (0.0, *np.geomspace(0.005, 0.2, 24).tolist())  # s
 
@@ -26,40 +24,32 @@ class Cleaning:
         in_flight: cut out periods of half a second and more with hardly any thrust: the vehicle is on the ground.
         resample: new interval between samples [s].
         longest_gap: with resample, interpolate across gaps and repeated samples up to this long [s].
-        low_pass: cut-off frequency [Hz] of a zero-phase low-pass filter of states and motors.
-        align: shift the motors of each log by their lag to the gyro, found by cross-correlation.
-        delay: instead of align, delay of the motors [s].
+        delay: of the motors [s]: the gyro's lag behind them, as `check_log` finds it.
 
     Raises:
-        ValueError: a number out of its range, or arguments that exclude each other.
+        ValueError: a number out of its range, or longest_gap without resample.
     """
 
     in_flight: bool = False
     resample: float | None = None
     longest_gap: float = 0.0
-    low_pass: float | None = None
-    align: bool = False
     delay: float = 0.0
 
     def __post_init__(self):
-        for name in ("resample", "low_pass"):
-            if (value := getattr(self, name)) is not None:
-                checks.positive(name, value)
+        if self.resample is not None:
+            checks.positive("resample", self.resample)
         checks.not_negative("longest_gap", self.longest_gap)
         checks.number("delay", self.delay)
-        if self.align and self.delay:
-            raise ValueError("align must be left out where delay is given: it finds the delay itself")
         if self.longest_gap and self.resample is None:
             raise ValueError("longest_gap needs resample")
 
 
-def clean(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle | None = None) -> tuple[FlightLog, list[str]]:
+def clean(log: FlightLog, cleaning: Cleaning) -> tuple[FlightLog, list[str]]:
     """Apply some changes to a log; also return one line per change.
 
     Args:
         log: the log.
         cleaning: which changes.
-        vehicle: the vehicle, which `align` needs.
 
     Raises:
         ValueError: the log, the field of `cleaning` and why it is impossible, in one line.
@@ -67,8 +57,6 @@ def clean(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle | None = None) ->
     steps: dict[str, tuple[Any, Callable[[FlightLog, Any], tuple[FlightLog, str]]]] = {
         "in_flight": (cleaning.in_flight, lambda log, _: in_flight(log)),
         "resample": (cleaning.resample, lambda log, dt: resample(log, dt, cleaning.longest_gap)),
-        "low_pass": (cleaning.low_pass, low_pass),
-        "align": (cleaning.align, lambda log, _: align_motors(log, vehicle)),
         "delay": (cleaning.delay, delay_motors),
     }
     done: list[str] = []
@@ -131,31 +119,6 @@ def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
     return log[flying], f"{len(log) - flying.sum()} samples on the ground cut out"
 
 
-def low_pass(log: FlightLog, cutoff: float) -> tuple[FlightLog, str]:
-    """Filter states and motors with the same Butterworth filter, forward and back, segment by segment.
-
-    Args:
-        log: the flight, with even samples.
-        cutoff: frequency of half the amplitude [Hz].
-
-    Raises:
-        ValueError: the cutoff is not between 0 and half the sampling frequency, or samples are not evenly spaced.
-    """
-    rate = 1 / log.dt
-    if not 0 < cutoff < rate / 2:
-        raise ValueError(f"cutoff must lie between 0 and half the sampling frequency {rate / 2:.6g} Hz, got {cutoff!r}")
-    sections = scipy.signal.butter(2, cutoff, fs=rate, output="sos")
-    log, all_samples = log[~repeats(log)], len(log)  # filtered, they could no longer be recognised
-    x, u = log.x.copy(), log.u.copy()
-    for part in even_segments(log):
-        both = np.concatenate([x[part], u[part]], axis=1)
-        both = scipy.signal.sosfiltfilt(sections, both, axis=0, padlen=min(9, len(both) - 1))
-        x[part], u[part] = both[:, :STATE_SIZE], np.maximum(both[:, STATE_SIZE:], 0.0)
-    x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
-    done = f"low-pass of second order at {cutoff:g} Hz, zero phase, states and motors"
-    return FlightLog(log.t, x, u, log.name), f"{done}; {all_samples - len(log)} repeated samples left out"
-
-
 def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
     """Delay the motor values by `lag` [s]; samples that would need unknown values are cut.
 
@@ -202,21 +165,3 @@ def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
             u[part] = held + (speed - held) * (1 - kept) / step
     done = f"rotors follow the log's motors with a time constant of {1000 * time_constant:.1f} ms"
     return FlightLog(log.t, log.x, u, log.name), done
-
-
-def align_motors(log: FlightLog, vehicle: Vehicle | None) -> tuple[FlightLog, str]:
-    """Apply `delay_motors` with the lag of the best cross-correlation with the angular acceleration.
-
-    Args:
-        log: the flight.
-        vehicle: the vehicle, for the places and spins of its rotors and its inertia.
-
-    Raises:
-        ValueError: there is no vehicle, or the log has too little motion to estimate the lag.
-    """
-    if vehicle is None:
-        raise ValueError(f"{log.name}: needs a vehicle, for the places of its rotors")
-    found = respond(log, vehicle)
-    if found is None or sum(found.correlations[:2]) < 0.2:
-        raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be estimated")
-    return delay_motors(log, found.lag)
