@@ -1,6 +1,6 @@
 """A predictive controller flies with every model, before and after adaptation: python -m experiments.closed_loop"""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import jax
@@ -9,20 +9,10 @@ from rich.console import Console
 
 from experiments.closed_loop import figures, models
 from experiments.closed_loop.claims import Evidence, Speed, claims
-from experiments.closed_loop.config import ABLATED, PRESETS, ClosedLoopConfig
+from experiments.closed_loop.config import PRESETS, ClosedLoopConfig
 from experiments.closed_loop.flights import DOMAINS, Flown, ModelSet, Scenario, fly_all, results_of
 from experiments.closed_loop.models import Trained
-from experiments.closed_loop.path_figures import flown_paths, rendered
-from experiments.closed_loop.results import (
-    ORACLE,
-    SOURCES,
-    Agent,
-    ablation_tables,
-    conclusion,
-    gap_tables,
-    speed_table,
-    tables,
-)
+from experiments.closed_loop.results import ORACLE, SOURCES, Agent, conclusion, gap_tables, speed_table, tables
 from experiments.closed_loop.timing import call_times
 from experiments.flying.timing import on_one_core
 from experiments.paper.config import Config
@@ -97,9 +87,8 @@ def experiment(config: ClosedLoopConfig, console: Console) -> None:
     training: Training = {}
     trained, training[FLIGHTS] = train_all(config, console, training), stages_of(config, console)
     flown = fly_models(config, trained, training)
-    ablation = fly_ablation(config, console, training) if config.ablation else []
     if hosts.is_main_process():
-        write(config, trained, flown, ablation, training)
+        write(config, trained, flown, training)
 
 
 def train_one(console: Console, training: Training, name: str, model: str, config: Config) -> Trained:
@@ -128,19 +117,6 @@ def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], training: 
     return fly_all([*home, *away], config.controller(), config.seconds, training[FLIGHTS], config.hardware())
 
 
-def fly_ablation(config: ClosedLoopConfig, console: Console, training: Training) -> list[Flown]:
-    """Train and fly the networks of the ablation."""
-    own = config.ablated()
-    trained = models.train_networks(config.ablation, own, partial(train_one, console, training))
-    places = [(name, 0.0) for name in ABLATED if name in config.references] + [("hover", config.away)]
-    found = []
-    for unit in (True, False) if "quaternion" in config.ablation else (True,):
-        sets = {domain.name: models.variants(config.ablation, domain, trained, own, unit) for domain in DOMAINS}
-        own_scenarios = scenarios(config, sets, places)
-        found += fly_all(own_scenarios, config.controller(unit), config.seconds, training[FLIGHTS], config.hardware())
-    return found
-
-
 def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Places) -> list[Scenario]:
     """The models of each domain along each reference at each distance from home [m]."""
     own = [domain for domain in (SOURCE, *DOMAINS) if domain.name in sets]
@@ -159,24 +135,16 @@ def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, d
     return dict(zip(fields, times, strict=True))
 
 
-def write(
-    config: ClosedLoopConfig,
-    trained: dict[str, Trained],
-    flown: Sequence[Flown],
-    ablation: Sequence[Flown],
-    training: Training,
-) -> None:
-    out, few, every, timed = config.out / NAME, min(config.sizes), [*flown, *ablation], speeds(config, trained)
-    rows, ablated, call = results_of(flown), results_of(ablation), timed[Agent("hybrid", few).name]
-    count = sum(len(each.scenario.keys()) for each in every)
-    spent, worked = sum(each.seconds for each in every), sum(each.processor_seconds for each in every)
-    clocked = call["processor_ms"], call["median_ms"], config.seconds * count, spent, worked, every[0].devices
+def write(config: ClosedLoopConfig, trained: dict[str, Trained], flown: Sequence[Flown], training: Training) -> None:
+    out, few, timed, rows = config.out / NAME, min(config.sizes), speeds(config, trained), results_of(flown)
+    call, simulated = timed[Agent("hybrid", few).name], config.seconds * len(rows)
+    spent, worked = sum(each.seconds for each in flown), sum(each.processor_seconds for each in flown)
+    clocked = call["processor_ms"], call["median_ms"], simulated, spent, worked, flown[0].devices
     verdicts = evaluate(claims(few), Evidence(rows, Speed(*clocked)))
-    drawn, missing = draw(rows, ablated, flown, few)
+    drawn, missing = draw(rows, flown, few)
     notes = [f"{name}: {note}" for name, stages in training.items() for note in stages.notes()]
     notes += [f"least squares: {note}" for note in models.disturbance_counts(trained["least_squares"])]
     seconds = {f"{name}, {stage}": taken for name, own in training.items() for stage, taken in own.seconds.items()}
-    titled = [verdict_table(verdicts, "Hypotheses"), *tables(rows), *gap_tables(rows), *ablation_tables(ablated)]
     report = Report(
         experiment=NAME,
         config=config.described(),
@@ -185,46 +153,28 @@ def write(
         claims=verdicts,
         figures=save_figures(out, drawn),
         notes=[*missing, *notes],
-        extra={"ablation": ablated.rows, "speed": timed},
+        extra={"speed": timed},
         head=head(config),
         conclusion=conclusion(rows, few),
-        tables=[*titled, speed_table(timed)],
-        more_rows=ablated,
+        tables=[verdict_table(verdicts, "Hypotheses"), *tables(rows), *gap_tables(rows), speed_table(timed)],
     )
     write_report(out, report, Console())
 
 
-def draw(
-    rows: Results, ablated: Results, flown: Sequence[Flown], few: int
-) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
+def draw(rows: Results, flown: Sequence[Flown], few: int) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
     """Figures with their captions by file, and notes on those that could not be drawn."""
-    nominal, sources = Agent("nominal"), [Agent("hybrid"), Agent("invariant")]
-    adapted = [Agent(model, few) for model in SOURCES]
-    followed = (nominal, sources[0], *adapted, ORACLE)
-    wanted: dict[str, tuple[str, Callable[[], Figure]]] = {}
+    followed = (Agent("nominal"), Agent("hybrid"), *(Agent(model, few) for model in SOURCES), ORACLE)
+    made, missing = {}, []
     for domain in (each.name for each in DOMAINS):
         for file, caption, drawing in (
             ("errors", "Position RMSE of all seeds", partial(figures.errors, rows, domain)),
-            (
-                "gap",
-                "Position RMSE before and after adaptation",
-                partial(figures.shares, rows, domain),
-            ),
-            ("paths", "Flights of seed 0", partial(flown_paths, flown, domain, followed)),
-            ("ablation", "Ablation of the invariant residual", partial(figures.errors, ablated, domain, True)),
+            ("gap", "Position RMSE before and after adaptation", partial(figures.shares, rows, domain)),
+            ("paths", "Flights of seed 0", partial(figures.flown_paths, flown, domain, followed)),
         ):
-            if file != "ablation" or len(ablated):
-                wanted[f"{file}_{domain}"] = f"{caption}, {label(domain)}", drawing
-    costs = partial(figures.open_loop_costs, rows, (nominal, *sources, *adapted, ORACLE))
-    wanted["open_loop_costs"] = "Actual over predicted open-loop cost of plans", costs
-    wanted["away"] = "The same flights away from home", partial(figures.away_from_home, rows)
-    wanted["strip"] = "Hover in the wind; the red mark is the reference", partial(rendered, flown, few)
-    made, missing = {}, []
-    for file, (caption, drawing) in wanted.items():
-        try:
-            made[file] = drawing(), caption
-        except ValueError as error:  # nothing of it was flown, or there is no renderer
-            missing.append(f"{file}.png is missing: {error}.")
+            try:
+                made[f"{file}_{domain}"] = drawing(), f"{caption}, {label(domain)}"
+            except ValueError as error:  # nothing of it was flown
+                missing.append(f"{file}_{domain}.png is missing: {error}.")
     return made, missing
 
 

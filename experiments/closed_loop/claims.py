@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from experiments.closed_loop.config import THREE
 from experiments.closed_loop.results import LEARNED, ORACLE, SOURCES, Agent, away, gaps, uncrashed
 from experiments.flying.scenario import REFERENCES
 from experiments.reporting.claims import Claim, Part, Undecided, all_of, every
@@ -17,7 +18,6 @@ from experiments.reporting.results import Results
 from experiments.reporting.statistics import Interval
 
 RMSE = uncrashed("position_rmse", 100.0)  # cm
-THREE = ("hover", "figure_eight", "low_pass")
 WIND_FACTOR, GAP_SHARE, COST_TOLERANCE, AWAY_FACTOR = 4.0, 0.9, 0.1, 1.1
 DECIMALS = 6  # of a cm; more are below single precision
 RESOLUTION = float(np.spacing(np.float32(1.0)))  # m; of positions between 1 and 2 m, where most flights are
@@ -37,7 +37,7 @@ class Speed(NamedTuple):
 
 @dataclass(frozen=True)
 class Evidence:
-    """All rows but those of the ablation, and the speed."""
+    """All rows, and the speed."""
 
     rows: Results
     speed: Speed

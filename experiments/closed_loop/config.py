@@ -9,8 +9,7 @@ from experiments.runner.options import Count, NotNegative, Positive, distinct
 from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.vehicle import IRIS
 
-Option = Literal["networks", "offset", "statistics", "quaternion"]
-ABLATED: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
+THREE: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
 
 
 @dataclass(frozen=True)
@@ -56,13 +55,6 @@ class ClosedLoopConfig(Config):
     """Learning rate of its output bias in adaptation [m/s² or rad/s² per step]; see --rates.offset."""
     invariant_disturbance: Literal["needed", "always"] = "needed"
     """Fit a constant disturbance by least squares always, or only where it lowers the leave-one-out error."""
-    ablation: tuple[Option, ...] = get_args(Option)
-    """Options of the invariant residual to undo. networks: its inputs and outputs. offset: the learning rate of its
-    output bias. statistics: batch statistics of the target. quaternion: renormalised in each step of a prediction."""
-    ablation_source: Count = 3000
-    """Source trajectories of the ablation's networks."""
-    ablation_epochs: Count = 400
-    """At most so many epochs for them."""
     calls: Count = 300
     """Calls of the controller to time."""
 
@@ -90,14 +82,14 @@ class ClosedLoopConfig(Config):
         """Between controller and vehicle."""
         return hardware(self.noise, self.latency, self.rotor_lag)
 
-    def controller(self, unit_quaternion: bool = True) -> Controller:
-        return Controller(IRIS, unit_quaternion=unit_quaternion, rotor_lag=self.rotor_lag)
+    def controller(self) -> Controller:
+        return Controller(IRIS, rotor_lag=self.rotor_lag)
 
     @property
     def flown_away(self) -> tuple[Reference, ...]:
         if self.away_references is not None:
             return self.away_references
-        return tuple(name for name in ABLATED if name in self.references)
+        return tuple(name for name in THREE if name in self.references)
 
     @property
     def ends(self) -> tuple[int, ...]:
@@ -105,12 +97,20 @@ class ClosedLoopConfig(Config):
         return tuple(dict.fromkeys((min(self.sizes), max(self.sizes))))
 
     def invariant(self) -> Config:
-        """The configuration that trains the invariant residual, with the sizes that fly."""
+        """The configuration that trains the invariant residual, with the sizes that fly.
+
+        It has the options of all experiments in simulation, so that their stages are shared.
+        """
         first, *others = self.invariant_rates
-        own = self._limited(self.ends, self.invariant_source, self.invariant_epochs)
-        return replace(
-            own,
-            rates=replace(own.rates, pretraining=first, decay=tuple(rate / first for rate in others)),
+        offset = self.rates.offset if self.invariant_offset is None else self.invariant_offset
+        return preset_like(
+            Config,
+            self,
+            sizes=self.ends,
+            pool=self.shared_pool(),
+            source_train=min(self.source_train, self.invariant_source),
+            max_epochs=min(self.max_epochs, self.invariant_epochs),
+            rates=replace(self.rates, offset=offset, pretraining=first, decay=tuple(rate / first for rate in others)),
             residual_inputs=self.invariant_inputs,
             residual_outputs=self.invariant_outputs,
             residual_linear=self.invariant_linear,
@@ -118,26 +118,16 @@ class ClosedLoopConfig(Config):
             norm=self.invariant_norm,
         )
 
-    def ablated(self) -> Config:
-        return self._limited(self.ends[:1], self.ablation_source, self.ablation_epochs)
-
-    def _limited(self, sizes: tuple[int, ...], source: int, epochs: int) -> Config:
-        """The options of all experiments in simulation, so that their stages are shared, with the own rate of bias."""
-        rates = self.rates if self.invariant_offset is None else replace(self.rates, offset=self.invariant_offset)
-        most = {"source_train": min(self.source_train, source), "max_epochs": min(self.max_epochs, epochs)}
-        return preset_like(Config, self, sizes=sizes, pool=self.shared_pool(), rates=rates, **most)
-
 
 PRESETS = {
     "paper": ClosedLoopConfig(),
     "quick": preset_like(
-        ClosedLoopConfig, QUICK, sizes=(100, 1000), seconds=6.0, references=ABLATED, away_references=("hover",),
-        ablation=(),
+        ClosedLoopConfig, QUICK, sizes=(100, 1000), seconds=6.0, references=THREE, away_references=("hover",),
     ),
     "smoke": preset_like(
         ClosedLoopConfig, SMOKE, sizes=(20,), source_train=20, seconds=1.0, references=("hover", "low_pass"),
-        away_references=("hover",), ablation=("statistics",), calls=20,
-        # The ablation's invariant network, so that few programs are compiled.
+        away_references=("hover",), calls=20,
+        # The shape of the paper's network, so that few programs are compiled.
         invariant_inputs="no_xy_yaw", invariant_outputs="accelerations", invariant_linear=False, invariant_hidden=8,
         invariant_norm="batch", invariant_disturbance="always",
     ),

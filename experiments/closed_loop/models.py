@@ -1,4 +1,4 @@
-"""Prediction models of the closed loop, trained or from the shared cache; those of the ablation undo a choice each."""
+"""Prediction models of the closed loop, trained or from the shared cache, and that of the true vehicle."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from experiments.closed_loop.flights import DOMAINS, ModelSet
 from experiments.closed_loop.results import SOURCES, Agent
 from experiments.paper import study
-from experiments.paper.config import Config, ResidualInputs, ResidualOutputs
+from experiments.paper.config import Config
 from experiments.paper.lanes import Fit
 from experiments.runner.stages import Stages
 from hybrid_jax import rotation
@@ -23,24 +23,11 @@ from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.rigid_body import RigidBody, nominal, rigid_body
 from hybrid_jax.io import portable
 from hybrid_jax.io.datasets import Dataset
-from hybrid_jax.networks.normalisation import BatchNorm
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.forces import WIND_MEAN, drag, ground_effect, parameters_of, wind
 from hybrid_jax.state import QUATERNION, VELOCITY, Input, State
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS, Vehicle
-
-# The networks of the ablation; those COMPARED are also flown with its other options.
-PAPER, INVARIANT = "paper: all of x → all 13", "invariant: no p_x, p_y, yaw → v̇, ω̇"
-NETWORKS: dict[str, tuple[ResidualInputs, ResidualOutputs]] = {
-    PAPER: ("all", "all"),
-    "no p_x, p_y → all 13": ("no_xy", "all"),
-    "all of x → v̇, ω̇": ("all", "accelerations"),
-    "no p_x, p_y → v̇, ω̇": ("no_xy", "accelerations"),
-    INVARIANT: ("no_xy_yaw", "accelerations"),
-}
-COMPARED = (PAPER, INVARIANT)
-SLOW = "invariant, output bias at the common rate"
 
 
 @dataclass(frozen=True)
@@ -111,59 +98,6 @@ def fused(fields: AbstractVectorField) -> AbstractVectorField:
 def as_stack(field: Any) -> Any:
     """One field as a stack of one."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[None], field)
-
-
-def with_statistics_of(source: AbstractVectorField, field: AbstractVectorField) -> AbstractVectorField:
-    """The field with the running batch-norm statistics of `source`."""
-
-    def running(tree) -> list:
-        nodes = jax.tree.leaves(tree, is_leaf=lambda node: isinstance(node, BatchNorm))
-        return [node.running for node in nodes if isinstance(node, BatchNorm)]
-
-    return eqx.tree_at(running, field, running(source))
-
-
-def train_networks(
-    options: Sequence[str], config: Config, train: Callable[[str, str, Config], Trained]
-) -> dict[str, Trained]:
-    """The networks that these options of the ablation compare, trained by `train(name, model, config)`."""
-    wanted = {name: NETWORKS[name] for name in NETWORKS if "networks" in options or name in COMPARED}
-    if "offset" in options:
-        wanted[SLOW] = NETWORKS[INVARIANT]
-    trained = {}
-    for name, (inputs, outputs) in wanted.items():
-        # A network that writes all derivatives is adapted as in the paper.
-        fast = outputs == "accelerations" and name != SLOW
-        rates = replace(config.rates, offset=config.rates.offset if fast else None)
-        own = replace(config, residual_inputs=inputs, residual_outputs=outputs, rates=rates)
-        trained[name] = train(f"ablation, {name}", "hybrid", own)
-    return trained
-
-
-def variants(
-    options: Sequence[str], domain: Domain, trained: dict[str, Trained], config: Config, normalised: bool = True
-) -> ModelSet:
-    """Models for the usual controller: each network adapted, with the statistics of the source, and unadapted with an
-    observer; or for one that does not renormalise the quaternion in its predictions.
-    """
-    (few,) = config.sizes
-    adapted = {name: found.adapted[domain.name, few] for name, found in trained.items()}
-    if not normalised:
-        models = {_variant(name, few, ", |q| not renormalised"): adapted[name] for name in COMPARED}
-        return {agent: fused(field) for agent, field in models.items()}
-    models = {_variant(name, few): field for name, field in adapted.items()}
-    if "statistics" in options and config.norm == "batch":
-        for name in COMPARED:
-            mixed = with_statistics_of(trained[name].source, adapted[name])
-            models[_variant(name, few, ", batch statistics of the source")] = mixed
-    for name in COMPARED:
-        models[replace(_variant(name, 0, ", not adapted, + observer"), observer=True)] = trained[name].source
-    return {agent: fused(field) for agent, field in models.items()}
-
-
-def _variant(network: str, n_train: int, what: str = "") -> Agent:
-    name = network.partition(":")[0] + what if what else network
-    return Agent("invariant" if network.startswith("invariant") else "hybrid", n_train, variant=name)
 
 
 @portable

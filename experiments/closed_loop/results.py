@@ -32,13 +32,12 @@ class Agent:
     model: str  # a key of KNOWN or LEARNED
     n_train: int = 0  # target trajectories for adaptation; 0 for a source model
     observer: bool = False  # with a disturbance observer
-    variant: str = ""  # of the model or the controller, in an ablation
 
     @property
     def name(self) -> str:
         size = f"N = {self.n_train}" if self.n_train else "source"
         name = KNOWN[self.model] if self.model in KNOWN else f"{LEARNED[self.model]}, {size}"
-        return (f"{self.variant}, {name}" if self.variant else name) + (" + observer" if self.observer else "")
+        return name + (" + observer" if self.observer else "")
 
 
 ORACLE = Agent("oracle")
@@ -146,21 +145,6 @@ def gaps(rows: Results, domain: str) -> dict[Agent, dict[str, Interval]]:
                 best = group.paired(flown[ORACLE], ERROR)[1]
                 shares.setdefault(agent, {})[reference] = share_of_gap(before, after, best)
     return shares
-
-
-def ablation_tables(rows: Results) -> list[Table]:
-    """Position RMSE of each variant, a column for each reference and distance, per domain."""
-    made = []
-    for domain, group in rows.group("domain").items():
-        columns = {
-            REFERENCES[reference] + away(distance): {"reference": reference, "distance": distance}
-            for reference, distance in group.group("reference", "distance")
-        }
-        sizes = ", ".join(f"N = {n}" for n in group.unique("n_train") if n)
-        title = f"Ablation of the invariant residual: RMSE [cm], {DOMAINS[domain]}, {sizes}"
-        lines = {agent.variant: own for agent, own in by_agent(group).items()}
-        made.append(cross_table(title, lines, columns, number_text("position_rmse", 100.0, ".2f"), ""))
-    return made
 
 
 def speed_table(speeds: Mapping[str, Mapping[str, Any]]) -> Table:

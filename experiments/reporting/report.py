@@ -34,7 +34,6 @@ class Report:
         extra: further keys of report.json.
         head: title and introduction of the page, Markdown.
         tables: of the page and the terminal.
-        more_rows: of rows.csv; report.json holds them in `extra`.
         conclusion: sentences before that on hypotheses.
         warnings: what a reader must know before any number.
     """
@@ -49,7 +48,6 @@ class Report:
     extra: Mapping[str, Any] = field(default_factory=dict)
     head: str = ""
     tables: Sequence[Table] = ()
-    more_rows: Results = field(default_factory=Results)
     conclusion: Sequence[str] = ()
     warnings: Sequence[str] = ()
 
@@ -105,7 +103,7 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
     """
     out, record = Path(out), lines_of(to_json(report))
     page = report.page(out)
-    contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: markdown_page(page, report)}
+    contents = {CSV_NAME: report.rows.to_csv(), PAGE_NAME: markdown_page(page, report)}
     contents |= {HTML_NAME: document(page), JSON_NAME: record}
     for name, content in {name: content.encode() for name, content in contents.items()}.items():
         write_atomic(out / name, content)

@@ -215,7 +215,7 @@ class Controller:
         twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), start)
         both = jax.lax.scan(interval, twice, (reference, shifted))[1]
         states, variables = (jnp.swapaxes(leaf, 0, 1) for leaf in both)
-        costs = jax.vmap(lambda *plan: self._cost(reference, *plan))(states, variables)
+        costs = jax.vmap(partial(plan_cost, self.weights, reference))(states, jnp.tanh(variables))
         best = jax.tree.map(lambda leaf: jnp.where(costs[1] < costs[0], leaf[1], leaf[0]), (variables, costs, states))
         return Plan(best[0], best[1], plan.damping), best[2]
 
@@ -240,9 +240,6 @@ class Controller:
         command = self._speeds(jnp.tanh(variables))
         return advance_lagged(model, *start, command, self.rotor_lag, self.interval, self.unit_quaternion)
 
-    def _cost(self, reference, states: Float[Array, "t 13"], variables: Float[Array, "t rotors"]) -> Scalar:
-        return plan_cost(self.weights, reference, states, jnp.tanh(variables))
-
     def _improve(self, model, reference, start: _Start, point: _Point) -> _Point:
         """Take the best of the damped Gauss–Newton steps, if it lowers the cost, and keep its damping."""
         plan, states = point
@@ -260,7 +257,7 @@ class Controller:
             variables = plan.variables - step.reshape(plan.variables.shape)
             variables = jnp.clip(variables, -VARIABLE_BOUND, VARIABLE_BOUND)
             states = jax.lax.scan(interval, like(start, damping), variables)[1]
-            cost = self._cost(reference, states, variables)
+            cost = plan_cost(self.weights, reference, states, jnp.tanh(variables))
             return (Plan(variables, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping), states), gain
 
         tried, gains = jax.vmap(attempt)(dampings)

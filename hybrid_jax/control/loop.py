@@ -1,4 +1,4 @@
-"""The closed loop: a plant, a controller with its prediction model and disturbance observer, and how well it flew."""
+"""The closed loop: a plant, a controller with its prediction model and estimator, and how well it flew."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,8 +14,7 @@ from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller, Plan, checked_states
 from hybrid_jax.control.cost import Scalar, plan_cost
 from hybrid_jax.control.observer import Observer
-from hybrid_jax.control.rotor_lag import lagged_speeds
-from hybrid_jax.control.sensitivities import advance
+from hybrid_jax.control.sensitivities import advance, lagged_speeds
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.rotation import heading, normalise
@@ -34,17 +33,14 @@ class Flight(eqx.Module):
         u: rotor speeds that are commanded over each period (t, 4) [rad/s].
         plans: of the controller at each call.
         estimates: state of the estimator at each call.
+        speeds: of the rotors at the start of each period (t, 4) [rad/s].
     """
 
     x: Float[Array, "*n t+1 13"]
     u: Float[Array, "*n t 4"]
     plans: Plan
     estimates: Any
-
-    @property
-    def disturbance(self) -> Float[Array, "*n t 6"]:
-        """Of the observer at each call, see `Estimate`."""
-        return self.estimates.disturbance
+    speeds: Float[Array, "*n t 4"]
 
 
 @dataclass(frozen=True)
@@ -166,20 +162,17 @@ class Loop(NamedTuple):
         controller, estimator, period = self.controller, self.estimator, self.controller.period
         model, x, speeds = estimator.model(now.estimate), now.seen, now.speeds
         for command in now.sent:
-            mean, speeds = self._lag(speeds, command)
+            mean, speeds = lagged_speeds(speeds, command, self.hardware.rotor_lag, period)
             x = advance(model, x, estimator.effective(now.estimate, mean), period)
         wanted = controller.horizon(reference, i + len(now.sent))
         u, plan = controller(model, wanted, x, now.plan, estimator.effective(now.estimate, speeds))
         u = estimator.command(now.estimate, x, u)
         sent = jnp.concatenate([now.sent, u[None]])
-        mean, speeds = self._lag(now.speeds, sent[0])
+        mean, speeds = lagged_speeds(now.speeds, sent[0], self.hardware.rotor_lag, period)
         x = plant(now.x, mean, i * period).astype(now.x.dtype)
         key, noise = jax.random.split(now.key)
         seen = self.hardware.measure(x, noise)
         return Moment(x, seen, speeds, sent[1:], plan, estimator.update(now.estimate, seen, mean), key), u
-
-    def _lag(self, speeds: Input, command: Input) -> tuple[Input, Input]:
-        return lagged_speeds(speeds, command, self.hardware.rotor_lag, self.controller.period)
 
 
 def fly(
@@ -229,11 +222,11 @@ def fly(
 
     def tick(now, i):
         after, u = loop.tick(plant, reference, now, i)
-        return after, (after.x, u, after.plan, now.estimate)
+        return after, (after.x, u, after.plan, now.estimate, now.speeds)
 
     start = like(loop.begin(x0, plan, jax.random.key(0) if key is None else key), x0)
-    x, u, plans, estimates = jax.lax.scan(tick, start, jnp.arange(periods))[1]
-    return Flight(jnp.concatenate([x0[None], x]), u, plans, estimates)
+    x, u, plans, estimates, speeds = jax.lax.scan(tick, start, jnp.arange(periods))[1]
+    return Flight(jnp.concatenate([x0[None], x]), u, plans, estimates, speeds)
 
 
 def performance(
@@ -269,18 +262,6 @@ def performance(
     )
 
 
-class OpenLoopCosts(NamedTuple):
-    """Costs of the plans of some calls of a flight. Plans that run to their end show the model's errors unhidden.
-
-    Attributes:
-        predicted: by the controller's model, of each call (c,).
-        actual: of the same inputs in the plant (c,).
-    """
-
-    predicted: Float[Array, " c"]
-    actual: Float[Array, " c"]
-
-
 def open_loop_costs(
     plant: Plant,
     flight: Flight,
@@ -288,10 +269,11 @@ def open_loop_costs(
     controller: Controller,
     calls: Sequence[int],
     hardware: Hardware | None = None,
-) -> OpenLoopCosts:
-    """Predicted and actual open-loop cost of the plans of these calls, with the hardware that the flight had.
+) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """Predicted cost of the plans of these calls, and the actual one if they run to their end in the plant.
 
-    A plan begins when its command arrives, so that a call must be earlier than the end by the latency.
+    Plans that run to their end show the model's errors unhidden. A plan begins when its command arrives, so that a call
+    must be earlier than the end by the latency.
 
     Args:
         plant: the true vehicle, as in `fly`.
@@ -302,45 +284,20 @@ def open_loop_costs(
         hardware: of the flight; by default none.
     """
     hardware = Hardware() if hardware is None else hardware
-    lag, delay = hardware.rotor_lag, hardware.delay(controller.period)
+    stride, delay = controller.stride, hardware.delay(controller.period)
 
-    def following(speeds, command):
-        mean, speeds = lagged_speeds(speeds, command, lag, controller.period)
-        return speeds, (mean, speeds)
-
-    first = controller.speeds(controller.begin())[0].astype(flight.u.dtype)
-    arriving = jnp.concatenate([jnp.tile(first, (delay, 1)), flight.u])
-    rotors = jnp.concatenate([first[None], jax.lax.scan(following, first, arriving)[1][1]])  # at each moment
-
-    def period(x, inputs):
-        x = plant(x, *inputs)
-        return x, x
+    def period(now, inputs):
+        (x, speeds), (command, t) = now, inputs
+        mean, speeds = lagged_speeds(speeds, command, hardware.rotor_lag, controller.period)
+        x = plant(x, mean, t)
+        return (x, speeds), x
 
     def actual_cost(i: Scalar) -> Scalar:
         plan, i = jax.tree.map(lambda leaf: leaf[i], flight.plans), i + delay
-        commands = jnp.repeat(controller.speeds(plan), controller.stride, axis=0)
-        speeds = jax.lax.scan(following, rotors[i], commands)[1][0] if lag else commands
-        times = controller.period * (i + jnp.arange(len(speeds)))
-        states = jax.lax.scan(period, flight.x[i], (speeds, times))[1][controller.stride - 1 :: controller.stride]
+        commands = jnp.repeat(controller.speeds(plan), stride, axis=0)
+        times = controller.period * (i + jnp.arange(len(commands)))
+        states = jax.lax.scan(period, (flight.x[i], flight.speeds[i]), (commands, times))[1][stride - 1 :: stride]
         return plan_cost(controller.weights, controller.horizon(reference, i), states, jnp.tanh(plan.variables))
 
     chosen = jnp.asarray(calls)
-    return OpenLoopCosts(flight.plans.cost[chosen], jax.vmap(actual_cost)(chosen))
-
-
-def relative_cost_error(costs: OpenLoopCosts, controller: Controller, distance: float = 0.005) -> Float[Array, ""]:
-    """(actual − predicted) / predicted, each summed over the calls.
-
-    The denominator is at least the cost of plans that stay `distance` [m] from the reference, because near zero the
-    ratio means nothing; ValueError if it is not positive.
-
-    Args:
-        costs: what `open_loop_costs` returned.
-        controller: gives the weights and the horizon.
-        distance: of the plans that set the least denominator [m].
-    """
-    checks.positive("distance", distance)
-    weights = controller.weights
-    floor = (controller.steps - 1 + weights.terminal**2) * (weights.position * distance) ** 2
-    error = jnp.sum(costs.actual) - jnp.sum(costs.predicted)
-    return error / jnp.maximum(jnp.sum(costs.predicted), floor * len(costs.predicted))
+    return flight.plans.cost[chosen], jax.vmap(actual_cost)(chosen)

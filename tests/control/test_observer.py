@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import advance
-from hybrid_jax.control.observer import Estimate
+from hybrid_jax.control import Observer, advance
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.networks.mlp import InputScaling
 
@@ -22,12 +21,13 @@ def watch(field, plant, bandwidth, periods=100, sign=1.0):
     speeds = hj.IRIS.hover_speed + 20 * jax.random.normal(jax.random.key(0), (periods, 4))
 
     def tick(carry, u):
-        x, estimate = carry
-        seen = x.at[3:7].multiply(sign)
-        estimate = estimate.correct(seen, bandwidth, DT).predict(field, seen, u, DT)
-        return (advance(plant, x, u, DT), estimate), estimate.disturbance
+        x, state = carry
+        x = advance(plant, x, u, DT)
+        return (x, observer.update(state, x.at[3:7].multiply(sign), u)), state.disturbance
 
-    return np.asarray(jax.lax.scan(tick, (START, Estimate.begin(START)), speeds)[1])
+    observer = Observer(field, bandwidth, DT)
+    start = START, observer.begin(START.at[3:7].multiply(sign))
+    return np.asarray(jax.lax.scan(tick, start, speeds)[1])
 
 
 @pytest.fixture(scope="module")

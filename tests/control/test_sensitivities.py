@@ -10,8 +10,13 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.control import advance
-from hybrid_jax.control.rotor_lag import stage_shares, step_of
-from hybrid_jax.control.sensitivities import advance_lagged, advance_with_jacobian, condensed
+from hybrid_jax.control.sensitivities import (
+    advance_lagged,
+    advance_with_jacobian,
+    condensed,
+    stage_shares,
+    step_of,
+)
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual

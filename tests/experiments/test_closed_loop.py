@@ -17,7 +17,7 @@ import hybrid_jax as hj
 from experiments.closed_loop.__main__ import head
 from experiments.closed_loop.config import ClosedLoopConfig
 from experiments.closed_loop.flights import Scenario, fly_all
-from experiments.closed_loop.models import as_stack, fused, true_field, with_statistics_of
+from experiments.closed_loop.models import as_stack, fused, true_field
 from experiments.closed_loop.results import TAGS, Agent
 from experiments.flying.scenario import PATHS
 from experiments.flying.timing import on_one_core
@@ -25,7 +25,6 @@ from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
 from hybrid_jax.control import Controller, Hardware, fly, performance, sample
 from hybrid_jax.networks.mlp import InputScaling
-from hybrid_jax.networks.normalisation import BatchNorm
 from hybrid_jax.networks.views import make_residual
 from hybrid_jax.runtime import cores
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
@@ -34,18 +33,6 @@ CONTROLLER = Controller(hj.IRIS)
 SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
 BODY = hj.RigidBody({"Ix": jnp.asarray(0.1), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.05)}, hj.IRIS)
 SECONDS = 0.6
-
-
-def network(inputs="all"):
-    """A network with batch norm whose running statistics are not the initial ones."""
-    made = make_residual(jax.random.key(1), hidden=8, scaling=SCALING, vehicle=hj.IRIS, inputs=inputs)
-
-    def moved(node):
-        if not isinstance(node, BatchNorm):
-            return node
-        return eqx.tree_at(lambda norm: (norm.running.mean, norm.shift), node, (jnp.arange(8.0), jnp.ones(8)))
-
-    return jax.tree.map(moved, made, is_leaf=lambda node: isinstance(node, BatchNorm))
 
 
 @pytest.mark.parametrize("domain", [EXTERNAL_FORCE, *slow(SOURCE, PARAMETER_SHIFT)], ids=lambda domain: domain.name)
@@ -69,18 +56,11 @@ def test_calls_are_timed_on_one_core():
     assert cores() == len(os.sched_getaffinity(0))
 
 
-def test_only_running_statistics_are_exchanged():
-    other = make_residual(jax.random.key(2), hidden=8, inputs="no_xy_yaw")
-    field, source = hj.Hybrid(BODY, network("no_xy_yaw")), hj.Hybrid(BODY, other)
-    mixed = with_statistics_of(source, field)
-    np.testing.assert_array_equal(mixed.residual.field.norm.running.mean, np.zeros(8))
-    np.testing.assert_array_equal(mixed.residual.field.weight_in, field.residual.field.weight_in)
-
-
 @pytest.fixture(scope="module")
 def models():
     """Models of three structures by agent, and the hybrid among them."""
-    hybrid = hj.Hybrid(BODY, eqx.tree_at(lambda n: n.weight_out, network(), 0.01 * network().weight_out))
+    network = make_residual(jax.random.key(1), hidden=8, scaling=SCALING, vehicle=hj.IRIS)
+    hybrid = hj.Hybrid(BODY, eqx.tree_at(lambda n: n.weight_out, network, 0.01 * network.weight_out))
     stacked = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), hybrid)
     nominal, true = as_stack(hj.rigid_body(hj.IRIS)), as_stack(true_field(PARAMETER_SHIFT, hj.IRIS))
     return {Agent("nominal"): nominal, Agent("hybrid"): fused(stacked), Agent("oracle"): true}, hybrid
@@ -163,28 +143,26 @@ def test_report_has_all_keys_rows_and_figures(folder):
     out = folder / "out" / "closed_loop"
     report = json.loads((out / "report.json").read_text())
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
-    rows, ablated = Results(report["rows"], TAGS), Results(report["ablation"], TAGS)
+    rows = Results(report["rows"], TAGS)
     # Nominal, oracle; 20 of physics, no-physics, least squares; source and 20 of two hybrids; and six with observers.
     # On the unchanged vehicle nominal, oracle, two sources, and three with observers.
     assert len(rows) == 2 * (2 + 1) * 15 + 2 * 7
     # An unadapted model with an observer flies wherever anything flies.
     place = ("domain", "reference", "distance")
-    for own in (rows, ablated):
-        assert own.where(observer=True, n_train=0).group(*place).keys() == own.group(*place).keys()
+    assert rows.where(observer=True, n_train=0).group(*place).keys() == rows.group(*place).keys()
     assert set(rows["distance"]) == {0.0, 60.0}
     assert set(rows.where(domain="source")["n_train"]) == {0}
-    assert "invariant, batch statistics of the source" in ablated["variant"]
     assert {claim["id"] for claim in report["claims"] + report["not_judged"]} >= {"R1a", "R6b", "R7", "R8"}
     assert set(report["speed"]) == {"nominal physics", "hybrid, N = 20", "invariant hybrid, N = 20"}
     for name in report["figures"]:
         assert (out / name).read_bytes().startswith(b"\x89PNG")
-    assert len(list(csv.DictReader((out / "rows.csv").open()))) == len(rows) + len(ablated)
+    assert len(list(csv.DictReader((out / "rows.csv").open()))) == len(rows)
     assert "no p_x, p_y, yaw" in (out / "report.md").read_text()
 
 
 @pytest.mark.slow
 def test_second_run_trains_and_flies_nothing(folder):
-    less = ("--references", "hover", "--away-references", "hover", "--ablation", "--calls", "1")
+    less = ("--references", "hover", "--away-references", "hover", "--calls", "1")
     again = command("closed_loop", *less, folder=folder, out=folder / "again")
     assert again.returncode == 0, again.stderr
     # Four models: pre-training, of the invariant one in three stages, and two adaptations each.
