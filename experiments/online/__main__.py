@@ -1,14 +1,12 @@
 """The vehicle changes in the air, and the controller's model adapts: python -m experiments.online"""
 
 from functools import partial
-from pathlib import Path
 
 from rich.console import Console
 
-from experiments.flying.scenario import PATHS
-from experiments.online import agents, figures
+from experiments.online import figures
 from experiments.online.config import PRESETS, OnlineConfig
-from experiments.online.flights import Run, Setup, fly_all, setup
+from experiments.online.flights import fly_all
 from experiments.online.results import Evidence, claims, results_of, tables
 from experiments.online.timing import step_time
 from experiments.reporting.claims import evaluate, verdict_table
@@ -43,42 +41,29 @@ then counts as infinite. The settings of filter, observer and L1 were chosen on 
 
 
 def experiment(config: OnlineConfig, console: Console) -> None:
-    own, stages = setup(config), stages_of(config, console)
-    run = fly_all(own, config, stages)
-    rows = results_of(run, own)
-    step = step_time(config.hardware(), own.period)
+    stages = stages_of(config, console)
+    run = fly_all(config, stages)
+    rows, step = results_of(run), step_time(config.hardware(), config.controller().period)
     evidence = Evidence(rows, step, run.seconds, run.processor_seconds, len(rows))
     verdicts = evaluate(claims(list(config.changes)), evidence)
+    reference = "figure_eight" if "figure_eight" in config.references else config.references[0]
+    drawn = {"errors": (figures.errors(run, config, reference), "Errors around the change")}
+    if "online" in config.agents:
+        drawn["parameters"] = figures.parameters(run, config, reference), "Parameters around the change"
     out = config.out / NAME
-    drawn, notes = draw(run, own, config, out)
     report = Report(
         experiment=NAME,
         config=config.described(),
         environment=environment(stages.seconds),
         rows=rows,
         claims=verdicts,
-        figures=save_figures(out, drawn) | notes,
+        figures=save_figures(out, drawn),
         notes=[f"One step of the filter: {step:.3f} ms of processor time on one core, in a compiled loop."],
         extra={"step_ms": step},
         head=HEAD.strip(),
         tables=[verdict_table(verdicts, "Goals"), *tables(rows)],
     )
     write_report(out, report, Console())
-
-
-def draw(run: Run, own: Setup, config: OnlineConfig, out: Path):
-    """Figures with captions by name, and those of the animated picture by file."""
-    reference = "figure_eight" if "figure_eight" in config.references else config.references[0]
-    drawn = {"errors": (figures.errors(run, own, reference), "Errors around the change")}
-    if "online" not in config.agents:
-        return drawn, {}
-    drawn["parameters"] = figures.parameters(run, own, reference), "Parameters around the change"
-    if not set(figures.ANIMATED) <= set(config.agents):
-        return drawn, {}
-    change = "load" if "load" in config.changes else config.changes[0]
-    index = list(PATHS).index(reference)
-    figures.animate(out / "flight.gif", run, own, change, reference, own.references[index])
-    return drawn, {"flight.gif": f"One flight, {agents.CHANGE_NAMES[change]}"}
 
 
 ABOUT = "The vehicle changes in the air. How soon does the controller fly as well as one that was told the change?"

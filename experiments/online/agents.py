@@ -52,7 +52,11 @@ AGENTS = {
     "oracle": "oracle",
 }
 LEARNED = ("Ix", "Iy", "Iz", "centre_of_mass")
-PARTS = 4 * 3  # Ix, Iy, Iz, added drag (3), centre of mass (2), efficiency (4): entries of θ before the disturbance
+NAMES = (  # of the entries of θ before the disturbance
+    *("Ix", "Iy", "Iz", "drag x", "drag y", "drag z", "centre_of_mass x", "centre_of_mass y"),
+    *(f"efficiency {i}" for i in range(4)),
+)
+PARTS = len(NAMES)
 # Logarithms of inertia and efficiency, 1 cm or so of the arm, and half the vehicle's own drag or more.
 PRIOR = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3, "centre_of_mass": 0.05, "efficiency": 0.2, "added_drag": 0.3}
 DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)  # m/s², rad/s²

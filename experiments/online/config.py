@@ -5,7 +5,8 @@ from typing import Literal, get_args
 
 from experiments.flying.scenario import Reference, hardware
 from experiments.runner.options import NotNegative, Positive, Run, distinct
-from hybrid_jax.control import Hardware
+from hybrid_jax.control import Controller, Hardware
+from hybrid_jax.vehicle import IRIS
 
 Change = Literal["inertia", "load", "wind", "weak_rotor", "drag", "nothing"]
 Agent = Literal["unadapted", "observer", "l1", "least_squares", "online", "oracle"]
@@ -13,7 +14,7 @@ Agent = Literal["unadapted", "observer", "l1", "least_squares", "online", "oracl
 
 @dataclass(frozen=True)
 class OnlineConfig(Run):
-    """At 4 s the simulated vehicle changes in the air. Every agent flies every reference through every change."""
+    """The simulated vehicle changes in the air. Every agent flies every reference through every change."""
 
     seconds: Positive = 4.0
     """Length of a flight after the change [s]."""
@@ -46,6 +47,14 @@ class OnlineConfig(Run):
 
     def hardware(self) -> Hardware:
         return hardware(self.noise, self.latency, self.rotor_lag)
+
+    def controller(self) -> Controller:
+        return Controller(IRIS, rotor_lag=self.rotor_lag)
+
+    @property
+    def periods(self) -> int:
+        """Of a flight after the change, and of that before it, as both run the same program."""
+        return round(self.seconds / self.controller().period)
 
 
 PRESETS = {

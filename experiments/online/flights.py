@@ -20,7 +20,7 @@ from experiments.online import agents
 from experiments.online.agents import CHANGES, PARTS
 from experiments.online.config import OnlineConfig
 from experiments.runner.stages import Stages
-from hybrid_jax.control import Controller, Hardware, Loop
+from hybrid_jax.control import Hardware, Loop
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.estimation.least_squares import fit_least_squares
@@ -28,46 +28,12 @@ from hybrid_jax.online.estimator import OnlineAdaptation
 from hybrid_jax.sim import flight as random_flight
 from hybrid_jax.sim.forces import wind
 from hybrid_jax.state import POSITION
-from hybrid_jax.sweep.lanes import LaneMap, lane, stack
+from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.trajectories import Trajectories, windows_of
-from hybrid_jax.vehicle import IRIS
 
-CHANGE = 4.0  # s, when the vehicle changes
 WINDOW = 10  # periods of a window of least squares
-SHOWN_EVERY = 2  # periods between two samples that are kept for figures
 SAME_BEFORE = {"least_squares": "unadapted", "oracle": "unadapted"}  # agents that are another before the change
 KINDS = {"fixed": ("unadapted", "observer", "least_squares", "oracle"), "l1": ("l1",), "online": ("online",)}
-
-
-class Setup(NamedTuple):
-    """What all flights have in common.
-
-    Attributes:
-        controller: that flies.
-        hardware: between it and the vehicle.
-        references: of all PATHS.
-        periods: of the segment before the change, and of that after it.
-        bandwidths: of the agents that have one, by name [rad/s].
-    """
-
-    controller: Controller
-    hardware: Hardware
-    references: Float[np.ndarray, "k n 13"]
-    periods: int
-    bandwidths: Mapping[str, float]
-
-    @property
-    def period(self) -> float:
-        return self.controller.period
-
-
-def setup(config: OnlineConfig) -> Setup:
-    """Both segments run the same program, so that the first is as long as the second."""
-    hardware = config.hardware()
-    controller = Controller(IRIS, rotor_lag=hardware.rotor_lag)
-    references = sampled(controller, 2 * config.seconds + 1)
-    bandwidths = {"observer": config.bandwidth, "l1": config.l1_cutoff}
-    return Setup(controller, hardware, references, round(config.seconds / controller.period), bandwidths)
 
 
 class Trial(NamedTuple):
@@ -108,19 +74,15 @@ class Record(NamedTuple):
     Attributes:
         error: distance from the reference [m].
         altitude: [m].
-        states: true ones, of each SHOWN_EVERY-th period.
         theta: estimated change of θ in the physics' own parametrisation; NaN if nothing is estimated.
         std: its standard deviation.
-        nis: normalised innovation squared.
         changes: how many were found so far.
     """
 
     error: Float[Any, " t"]
     altitude: Float[Any, " t"]
-    states: Float[Any, "s 13"]
     theta: Float[Any, "t p"]
     std: Float[Any, "t p"]
-    nis: Float[Any, " t"]
     changes: Float[Any, " t"]
 
 
@@ -142,55 +104,53 @@ class Run(NamedTuple):
     processor_seconds: float = math.nan
 
 
-def simulate(own: Setup, segment: Segment, references: Float[Array, "k n 13"]):
+def simulate(config: OnlineConfig, segment: Segment, references: Float[Array, "k n 13"]):
     """Fly a segment; returns the moment at its end and a `Record`."""
-    loop = Loop(own.controller, own.hardware, segment.estimator)
-    plant, reference = plant_of(segment.world, own.period), references[segment.path]
+    loop = Loop(config.controller(), config.hardware(), segment.estimator)
+    plant, reference = plant_of(segment.world, loop.controller.period), references[segment.path]
+
+    def estimated(state) -> tuple[Array, ...]:
+        if not isinstance(segment.estimator, OnlineAdaptation):
+            nothing = jnp.full(PARTS + len(agents.DISTURBANCE), jnp.nan)
+            return nothing, nothing, jnp.zeros(())
+        theta, covariance = segment.estimator.estimate(state)
+        return theta, jnp.sqrt(jnp.diagonal(covariance)), state.changes
 
     def tick(now, i):
         after = loop.tick(plant, reference, now, i)[0]
         error = jnp.linalg.norm((after.x - reference[i + 1])[POSITION])
-        return after, (error, after.x, _estimated(segment.estimator, after.estimate))
+        return after, Record(error, after.x[2], *estimated(after.estimate))
 
-    end, (error, x, estimated) = jax.lax.scan(tick, segment.moment, segment.first + jnp.arange(own.periods))
-    return end, Record(error, x[:, 2], x[::SHOWN_EVERY], *estimated)
-
-
-def _estimated(estimator, state) -> tuple[Array, ...]:
-    """θ, its standard deviation, NIS and changes found, of an agent that estimates them."""
-    if not isinstance(estimator, OnlineAdaptation):
-        nothing = jnp.full(PARTS + len(agents.DISTURBANCE), jnp.nan)
-        return nothing, nothing, jnp.zeros(()), jnp.zeros(())
-    theta, covariance = estimator.estimate(state)
-    return theta, jnp.sqrt(jnp.diagonal(covariance)), state.nis, state.changes
+    return jax.lax.scan(tick, segment.moment, segment.first + jnp.arange(config.periods))
 
 
-def before(own: Setup, agent: str, path: str, seed: int, key) -> Segment:
+def before(config: OnlineConfig, agent: str, path: str, seed: int, key, references) -> Segment:
     """The segment before the change."""
     clock: Any = np.float32(np.random.default_rng(seed).uniform(0, random_flight.CLOCK))
-    field = agents.nominal()
-    estimators = {
-        "unadapted": lambda: agents.fixed_model(field, own.period, clock),
-        "observer": lambda: agents.fixed_model(field, own.period, clock, own.bandwidths["observer"]),
-        "l1": lambda: agents.L1(field, 5.0, np.asarray(own.bandwidths["l1"], np.float32), own.period),
-        "online": lambda: agents.online(own.hardware, own.period),
-    }
-    estimator, index = estimators[agent](), list(PATHS).index(path)
-    loop = Loop(own.controller, own.hardware, estimator)
-    start = loop.begin(jnp.asarray(own.references[index, 0]), own.controller.begin(), key)
+    controller, hardware, field = config.controller(), config.hardware(), agents.nominal()
+    period = controller.period
+    if agent == "online":
+        estimator = agents.online(hardware, period)
+    elif agent == "l1":
+        estimator = agents.L1(field, 5.0, np.asarray(config.l1_cutoff, np.float32), period)
+    else:
+        estimator = agents.fixed_model(field, period, clock, config.bandwidth if agent == "observer" else 0.0)
+    index, loop = list(PATHS).index(path), Loop(controller, hardware, estimator)
+    start = loop.begin(jnp.asarray(references[index, 0]), controller.begin(), key)
     world, zero = world_of(CHANGES["nothing"], clock), np.asarray(0, np.int32)
     return agents.as_numpy(Segment(estimator, start, world, np.asarray(index, np.int32), zero))
 
 
-def after(own: Setup, trial: Trial, first: Segment, moment: Any, fitted: Mapping[str, Any]) -> Segment:
+def after(config: OnlineConfig, trial: Trial, first: Segment, moment: Any, fitted: Mapping[str, Any]) -> Segment:
     """The segment after the change: another vehicle, and an estimator that may know more."""
     domain, clock, estimator = CHANGES[trial.change], float(first.world.clock), first.estimator
+    period = config.controller().period
     if trial.agent == "oracle":
         field = agents.as_numpy(agents.with_theta(agents.true_theta(domain)))
-        estimator = agents.fixed_model(field, own.period, clock, share=float(wind in domain.forces))
+        estimator = agents.fixed_model(field, period, clock, share=float(wind in domain.forces))
     if trial.agent == "least_squares":
-        estimator = agents.fixed_model(lane(fitted[trial.change], trial.seed), own.period, clock)
-    start = np.asarray(own.periods, np.int32)
+        estimator = agents.fixed_model(lane(fitted[trial.change], trial.seed), period, clock)
+    start = np.asarray(config.periods, np.int32)
     return Segment(estimator, moment, world_of(domain, clock), first.path, start)
 
 
@@ -214,11 +174,12 @@ def ground_fits(change: str, seeds: int, hardware: Hardware) -> AbstractVectorFi
     return stack([agents.as_numpy(each) for each in found])
 
 
-def fly_all(own: Setup, config: OnlineConfig, stages: Stages) -> Run:
+def fly_all(config: OnlineConfig, stages: Stages) -> Run:
     """Fly every agent along every reference, through every change, with every seed."""
+    references = sampled(config.controller(), 2 * config.seconds + 1)
     fitted: dict[str, Any] = {}
     if "least_squares" in config.agents:
-        jobs = [partial(ground_fits, change, config.seeds, own.hardware) for change in config.changes]
+        jobs = [partial(ground_fits, change, config.seeds, config.hardware()) for change in config.changes]
         fitted = dict(zip(config.changes, stages.parts("least squares on the ground", jobs), strict=True))
     places = list(product(config.references, range(config.seeds)))
     # As plain arrays, of which segments are stacked.
@@ -229,34 +190,28 @@ def fly_all(own: Setup, config: OnlineConfig, stages: Stages) -> Run:
             tags = product(flying, config.changes, places)
             trials[kind] = [Trial(agent, change, *place) for agent, change, place in tags]
     firsts = {
-        kind: {start: before(own, *start, keys[start[1:]]) for start in dict.fromkeys(trial.start for trial in each)}
+        kind: {start: before(config, *start, keys[start[1:]], references) for start in {t.start: 0 for t in each}}
         for kind, each in trials.items()
     }
     kinds = {kind: list(each.values()) for kind, each in firsts.items()}
     most = {kind: len(each) for kind, each in trials.items()}
-    compiled = partial(programs.compiled, partial(simulate, own), kinds, most, (own.references,))
+    compiled = partial(programs.compiled, partial(simulate, config), kinds, most, (references,))
     made = stages.timed("compiling", compiled, f"{len(kinds)} programs")
-    began, worked, early, late = time.perf_counter(), time.process_time(), {}, []
-    for kind, each in trials.items():
-        fly = partial(_fly_kind, own, made[kind], each, firsts[kind], fitted)
-        records, after_change = stages.timed(f"flying {kind}", fly, f"{len(each)} flights")
-        early |= records
-        late.append(after_change)
+    early: dict[tuple[str, str, int], Record] = {}
+
+    def fly(kind: str) -> Record:
+        """Records of the trials after the change; those before it go into `early`."""
+        moments, records = programs.fly(made[kind], kinds[kind], (references,))
+        numbers = {start: i for i, start in enumerate(firsts[kind])}
+        early.update({start: lane(records, i) for start, i in numbers.items()})
+        segments = [
+            after(config, trial, firsts[kind][trial.start], lane(moments, numbers[trial.start]), fitted)
+            for trial in trials[kind]
+        ]
+        return programs.fly(made[kind], segments, (references,))[1]
+
+    began, worked = time.perf_counter(), time.process_time()
+    late = [stages.timed(f"flying {kind}", partial(fly, kind), f"{len(each)} flights") for kind, each in trials.items()]
     spent = time.perf_counter() - began, time.process_time() - worked
     together = Record(*(np.concatenate(leaves) for leaves in zip(*late, strict=True)))
     return Run([trial for each in trials.values() for trial in each], together, early, *spent)
-
-
-def _fly_kind(
-    own: Setup,
-    program: LaneMap,
-    trials: list[Trial],
-    firsts: Mapping[tuple[str, str, int], Segment],
-    fitted: Mapping[str, Any],
-) -> tuple[dict[tuple[str, str, int], Record], Record]:
-    """Records of the trials of one kind of estimator before the change, by their start, and after it, stacked."""
-    moments, records = programs.fly(program, list(firsts.values()), (own.references,))
-    numbers = {start: i for i, start in enumerate(firsts)}
-    seconds = [after(own, trial, firsts[trial.start], lane(moments, numbers[trial.start]), fitted) for trial in trials]
-    late = programs.fly(program, seconds, (own.references,))[1]
-    return {start: lane(records, i) for start, i in numbers.items()}, late
