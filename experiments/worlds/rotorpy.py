@@ -128,7 +128,7 @@ def decide(c: Constants, x: Float[Array, "13"], now: Reference) -> Float[Array, 
     return jnp.sign(squares) * jnp.sqrt(jnp.abs(squares))
 
 
-def _advance(c: Constants, x, speeds, command, t: Scalar):
+def advance(c: Constants, x, speeds, command, t: Scalar):
     """State and rotor speeds after an interval with the command held, by classical RK4, and the mean speeds in it."""
     h = DT / SUBSTEPS
 
@@ -218,7 +218,7 @@ def _fly(truth: Constants, nominal: Constants, kind: Kind, steps: int, keys: PRN
         def interval(carry, now):
             (x, speeds), t = carry
             command = truth.reached * jnp.clip(decide(nominal, x, now), 0.0, nominal.fastest)
-            state, mean = _advance(truth, x, speeds, command, t)
+            state, mean = advance(truth, x, speeds, command, t)
             return (state, t + DT), (state[0], speeds, mean)
 
         hover = jnp.full(4, jnp.sqrt(nominal.mass * G / 4 / nominal.thrust))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax.online.samples import Sample
-from hybrid_jax.online.tuning import Tuning
+from hybrid_jax.online.tuning import SPANS, Tuning
 
 NOTHING = 1e-10  # variance of a sum of corrections that are rounding alone
 
@@ -22,50 +22,48 @@ class ChangeTest(eqx.Module):
     Attributes:
         pull: weighted sums of the corrections of θ.
         spread: their variances if nothing has changed.
-        quiet: time since the last alarm [s].
+        quiet: time since the last alarm, for a pace of 1 [s].
     """
 
     pull: Float[Array, "*n 2 p"]
     spread: Float[Array, "*n 2 p"]
     quiet: Float[Array, "*n"]
 
+    @classmethod
+    def begin(cls, p: int, dtype) -> "ChangeTest":
+        """Before the first sample."""
+        return cls(jnp.zeros((2, p), dtype), jnp.zeros((2, p), dtype), jnp.full((), 1e3, dtype))
+
     @property
-    def squares(self) -> Float[Array, "2 p"]:
-        """The squared test of each parameter, of one degree of freedom."""
-        return jnp.square(self.pull) / jnp.where(self.spread > NOTHING, self.spread, 1.0)
+    def pulled(self) -> Float[Array, " p"]:
+        """The larger squared test of each parameter, of one degree of freedom."""
+        return jnp.max(jnp.square(self.pull) / jnp.where(self.spread > NOTHING, self.spread, 1.0), axis=0)
 
+    def after(
+        self,
+        white: Float[Array, " d"],
+        gains: Float[Array, "d p"],
+        sample: Sample,
+        periods: float,
+        tuning: Tuning,
+        pause: float,
+    ) -> tuple["ChangeTest", Bool[Array, ""]]:
+        """The sums with the innovations of another sample, and whether they say that θ has changed.
 
-def started(p: int, dtype) -> ChangeTest:
-    """Before the first sample."""
-    sums = jnp.zeros((2, p), dtype)
-    return ChangeTest(sums, sums, jnp.full((), 1e3, dtype))
+        Args:
+            white: innovations over their standard deviations.
+            gains: of θ by these, which say what pulls at which parameter.
+            periods: length of one, over the pace [s].
+            pause: least time between two alarms [s].
+        """
+        kept = jnp.where(sample.measured, jnp.exp(-periods / jnp.asarray(SPANS, white.dtype)[:, None]), 1.0)
+        pull = kept * self.pull + jnp.where(sample.measured, white @ gains, 0.0)
+        spread = kept**2 * self.spread + jnp.where(sample.measured, jnp.sum(jnp.square(gains), axis=0), 0.0)
+        summed = ChangeTest(pull, spread, self.quiet)
+        alarmed = (jnp.max(summed.pulled) > tuning.alarm**2) & (self.quiet > pause)
+        return summed.reset(alarmed, periods * sample.elapsed), alarmed
 
-
-def after_sample(
-    test: ChangeTest,
-    white: Float[Array, " d"],
-    gains: Float[Array, "d p"],
-    sample: Sample,
-    dt: float,
-    tuning: Tuning,
-    pause: float,
-) -> tuple[ChangeTest, Bool[Array, ""]]:
-    """The sums with the innovations of another sample, and whether they say that θ has changed.
-
-    Args:
-        white: innovations over their standard deviations.
-        gains: of θ by these, which say what pulls at which parameter.
-        pause: least time between two alarms [s].
-    """
-    kept = jnp.where(sample.measured, jnp.exp(-dt / jnp.asarray(tuning.spans, white.dtype)[:, None]), 1.0)
-    pull = kept * test.pull + jnp.where(sample.measured, white @ gains, 0.0)
-    spread = kept**2 * test.spread + jnp.where(sample.measured, jnp.sum(jnp.square(gains), axis=0), 0.0)
-    summed = ChangeTest(pull, spread, test.quiet)
-    alarmed = (jnp.max(summed.squares) > tuning.alarm**2) & (test.quiet > pause)
-    return reset(summed, alarmed, dt * sample.elapsed), alarmed
-
-
-def reset(test: ChangeTest, alarmed: Bool[Array, ""], passed: Float[Array, ""] | float) -> ChangeTest:
-    """With empty sums after an alarm, else a time later."""
-    pull, spread = (jnp.where(alarmed, 0.0, sums) for sums in (test.pull, test.spread))
-    return ChangeTest(pull, spread, jnp.where(alarmed, 0.0, test.quiet + passed))
+    def reset(self, alarmed: Bool[Array, ""], passed: Float[Array, ""] | float) -> "ChangeTest":
+        """With empty sums after an alarm, else a time later."""
+        pull, spread = (jnp.where(alarmed, 0.0, sums) for sums in (self.pull, self.spread))
+        return ChangeTest(pull, spread, jnp.where(alarmed, 0.0, self.quiet + passed))

@@ -4,14 +4,15 @@ The state of the filter is z = [x, θ]: the state x of the system, which the one
 and θ, all parameters of the physics and the disturbance.
 
 - A test of the innovations finds a change (`change_test`). An alarm opens the covariance.
-- Forgetting: θ is a slow random walk, and the disturbance, such as a gust, walks faster while it is pulled. Parameters
-  of a vehicle are constant between two changes; they do so only where no disturbance is estimated, or beside
-  hypotheses, as the filter of all parameters then matters where the model is wrong in a way that none explains.
+- Forgetting: θ is a slow random walk, and the disturbance, such as a gust, walks faster and faster while it is pulled
+  to one side, until it is no more. Parameters of a vehicle are constant between two changes; they do so only where no
+  disturbance is estimated.
 - Hypotheses: with these, filters of a few parameters compete with that of all (`multiple_model`).
 - Excitation: what samples do not tell stays as it is, with its variance (`excitation`).
 - Consistency: what the filter says is not used while it cannot be true (`consistency`), and the last good estimate is.
 """
 
+import math
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -27,20 +28,20 @@ from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import Interval, intervals
 from hybrid_jax.integrate import check_callable
-from hybrid_jax.online import change_test, consistency, excitation, kalman, multiple_model
+from hybrid_jax.online import consistency, excitation, kalman, multiple_model
 from hybrid_jax.online.change_test import ChangeTest
-from hybrid_jax.online.excitation import Filtered
+from hybrid_jax.online.excitation import Excitation
 from hybrid_jax.online.hypotheses import Hypothesis, ModelSet, Subspace, model_set, subspace_of
-from hybrid_jax.online.kalman import Belief, Each, FilterModel
+from hybrid_jax.online.kalman import Belief, Correction, Each, FilterModel
 from hybrid_jax.online.multiple_model import Verdict
 from hybrid_jax.online.samples import HUGE, Sample, SampleHistory, classify
-from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, check_sizes, flags_of, named_priors
-from hybrid_jax.online.tuning import Tuning
+from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, flags_of, named_priors
+from hybrid_jax.online.tuning import HOLD, PAUSE, Tuning
 from hybrid_jax.runtime import entry
-from hybrid_jax.state_space import StateSpace
 
-FASTEST = 3.0  # share of its prior standard deviation that a parameter may walk in a second
-Judged = tuple[ChangeTest, Bool[Array, ""], Verdict]
+EAGER = 6.0  # squared test, χ² of one degree, from which a disturbance walks faster
+RISE, FALL = 10.0, 0.2  # of the logarithm of how much faster [1/s]
+TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a parameter explains
 
 
 class OnlineAdaptation(AbstractEstimator):
@@ -104,8 +105,9 @@ class OnlineAdaptation(AbstractEstimator):
         if not 0 < (checks.real(initial) or 0) <= 1:
             raise ValueError(f"initial must be a share above 0 and at most 1, got {checks.short_repr(initial)}")
         check_callable(field)
-        self.tuning = Tuning() if tuning is None else tuning
-        checks.instance("tuning", self.tuning, Tuning)
+        tuning = Tuning() if tuning is None else tuning
+        checks.instance("tuning", tuning, Tuning)
+        self.tuning = tuning.at(dt)
         indices = None if indices is None else checks.places("indices", indices)
         if np.any(disturbance):
             known = disturbance_of(field) is not None or state_space(physics_of(field)).disturbed is not None
@@ -122,22 +124,29 @@ class OnlineAdaptation(AbstractEstimator):
     def begin(self, x: Float[Array, " d"]) -> OnlineState:
         """Before the first sample x, at the field's own parameters."""
         x, indices = jnp.asarray(x, float), getattr(disturbance_of(self.field), "indices", None)
-        check_sizes(x, {"noise": self.noise, "process": self.process}, indices)
+        if x.ndim != 1:
+            raise ValueError(f"x must be one sample (d,), got shape {x.shape}")
+        for name, values in (("noise", self.noise), ("process", self.process)):
+            if len(values) not in (1, len(x)):
+                raise ValueError(f"{name} must be one number, or one for each of the {len(x)} of x, got {len(values)}")
+        if indices is not None:
+            checks.places("indices", indices, len(x))
         p, none = ravel_parameters(self.field)[0].size, jnp.zeros_like(x)
         zero, theta, start = jnp.zeros((), x.dtype), jnp.zeros(p, x.dtype), jnp.full(p, self.initial**2, x.dtype)
         variances, mixture = self._variances(x), None
         if self.hypotheses:
-            mixture = multiple_model.initial(self._models(), x, variances, self.tuning.floor)
+            mixture = multiple_model.initial(self._models(), x, variances)
         return OnlineState(
             x=x,
             theta=theta,
             root=kalman.diagonal_root(variances, start),
-            excitation=excitation.begun(len(x), p, x.dtype),
-            test=change_test.started(p, x.dtype),
+            excitation=Excitation.begin(len(x), p, x.dtype),
+            test=ChangeTest.begin(p, x.dtype),
             mixture=mixture,
             trusted=theta,
             settled=theta,
             doubt=zero,
+            haste=theta,
             nis=zero + 1,
             history=SampleHistory(x, none, zero, none),
             changes=zero,
@@ -166,14 +175,35 @@ class OnlineAdaptation(AbstractEstimator):
         x, u = jnp.asarray(x, state.x.dtype), jnp.asarray(u, state.x.dtype)
         if x.shape != state.x.shape:
             raise ValueError(f"x must be one sample {state.x.shape}, as the state is, got shape {x.shape}")
-        x = self._space(x).nearest(x, state.x)
+        x = state_space(self.field, len(x)).nearest(x, state.x)
         sample, history = classify(x, u, elapsed, state.history, self.dt, self.tuning.gap)
         model = self._filter_model(sample, each)
-        filtered = self._filtered(state, model, sample)
-        judged = self._judged(state, model, sample, filtered)
+        d, variances, tuning, periods = len(x), model.variances, self.tuning, self.dt / self.tuning.pace
+        belief, told, correction, gains = self._filtered(state, model, sample)
+        test, opens = state.test.after(correction.white, gains, sample, periods, tuning, PAUSE)
+        verdict = Verdict(None, belief.z[d:], jnp.square(correction.white), opens, opens)
+        if state.mixture is not None:
+            verdict = multiple_model.update(state.mixture, self._models(), model, sample, belief, correction, gains)
+            unexplained = verdict.unexplained & (test.quiet > HOLD)
+            test, opens = test.reset(unexplained, 0.0), opens | unexplained
+        # After a change θ opens to its prior. The state, too, has followed the wrong model since then.
+        belief = kalman.reset_state(belief, sample, opens, variances)
+        fresh = kalman.diagonal_root(variances, jnp.ones_like(state.theta))
+        new = OnlineState(
+            x=belief.z[:d],
+            theta=belief.z[d:],
+            root=jnp.concatenate([belief.root[:d], jnp.where(opens, fresh, belief.root)[d:]]),
+            excitation=told,
+            test=test,
+            mixture=verdict.mixture,
+            haste=self._haste(state, sample, opens),
+            history=history,
+            changes=state.changes + jnp.where(verdict.changed, 1.0, 0.0),
+            restarts=state.restarts,
+            **consistency.believed(state, verdict, sample, periods, tuning),
+        )
         begun = self.begin(jnp.where(jnp.abs(history.last) < HUGE, history.last, 0.0))
-        begun = consistency.again(begun, state, model.variances)
-        return consistency.sound(self._merged(state, filtered, judged, sample, history), begun)
+        return consistency.sound(new, begun, state, variances)
 
     @entry
     def estimate(self, state: OnlineState) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
@@ -185,8 +215,7 @@ class OnlineAdaptation(AbstractEstimator):
         scales, d = jnp.asarray(self.scales, state.x.dtype), len(state.x)
         covariance = state.covariance[d:, d:]
         if state.mixture is not None:
-            joint, tuning = state.joint, self.tuning
-            covariance = multiple_model.covariance(state.mixture, self._models(), joint, tuning.least)
+            covariance = multiple_model.covariance(state.mixture, self._models(), state.joint)
         return scales * state.trusted, scales[:, None] * covariance * scales
 
     @entry
@@ -217,86 +246,49 @@ class OnlineAdaptation(AbstractEstimator):
     def _variances(self, x) -> Float[Array, " d"]:
         return jnp.broadcast_to(jnp.square(jnp.asarray(self.noise, x.dtype)), x.shape)
 
-    def _space(self, x) -> StateSpace:
-        return state_space(self.field, len(x))
-
-    def _rates(self, u):
-        """ẋ as a function of x and θ."""
-        start, unravel = ravel_parameters(self.field)
-
-        def rates(x, theta):
-            moved = start + jnp.asarray(self.scales, x.dtype) * theta
-            return unravel(moved.astype(start.dtype))(x, u)
-
-        return rates
-
-    def _filter_model(self, sample: Sample, each: Each) -> FilterModel:
-        x = sample.x
-        added = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, x.dtype)), x.shape)
-        rates, unit = self._rates(sample.u), self._space(x).normalise
-        return FilterModel(rates, unit, self._variances(x), added, self.dt, self.tuning, each)
-
-    def _predicted(self, state: OnlineState, model: FilterModel, sample: Sample) -> tuple[Belief, Array]:
-        """The filter of all parameters before the sample, and the Jacobian of its x."""
-        tuning, ones = self.tuning, jnp.ones_like(state.theta)
-        pulled = jnp.max(state.test.squares, axis=0)
-        varies = np.array([name.startswith(DISTURBANCE) for name in self.names])
-        all_vary = bool(self.hypotheses) or not varies.any()
-        forgotten = np.where(varies | all_vary, tuning.forgetting, 0.0)
-        faster = 1 + jnp.asarray(forgotten, ones.dtype) * jnp.maximum(pulled - tuning.eager, 0.0)
-        diffusion = self.dt * sample.elapsed * jnp.square(jnp.minimum(tuning.drift * faster, FASTEST))
-        belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted)
-        belief = kalman.limit_covariance(belief, ones)
-        return kalman.reset_state(belief, sample, sample.restart, model.variances), slope
-
-    def _filtered(self, state: OnlineState, model: FilterModel, sample: Sample) -> Filtered:
-        """The filter of all parameters after the sample, which moves what the samples tell."""
-        predicted, slope = self._predicted(state, model, sample)
-        belief, correction = kalman.correct(predicted, sample, model)
-        told, gains = state.excitation, correction.gains[:, len(state.x) :]
-        if self.tuning.excitation:
-            told = excitation.after_sample(told, slope, correction, sample, self.dt, self.tuning)
-            belief, gains = excitation.consider(predicted, belief, correction, told.considered())
-        return Filtered(kalman.triangular(belief, len(state.x)), told, correction, gains)
-
-    def _judged(self, state: OnlineState, model: FilterModel, sample: Sample, filtered: Filtered) -> Judged:
-        """The test of the filter of all parameters, whether that filter opens to its prior, and what is believed."""
-        (belief, _, correction, gains), tuning = filtered, self.tuning
-        white = correction.white
-        test, opens = change_test.after_sample(state.test, white, gains, sample, self.dt, tuning, tuning.pause)
-        if state.mixture is None:
-            return test, opens, Verdict(None, belief.z[len(state.x) :], jnp.square(white), opens, opens)
-        verdict = multiple_model.update(state.mixture, self._models(), model, sample, belief, correction, gains)
-        unexplained = verdict.unexplained & (test.quiet > tuning.hold)
-        return change_test.reset(test, unexplained, 0.0), opens | unexplained, verdict
-
-    def _merged(
-        self, state: OnlineState, filtered: Filtered, judged: Judged, sample: Sample, history: SampleHistory
-    ) -> OnlineState:
-        """The next state: opened to the prior after a change, and believed if it is consistent."""
-        (test, opens, verdict), d, variances = judged, len(state.x), self._variances(state.x)
-        # The state, too, has followed the wrong model since the change.
-        belief = kalman.reset_state(filtered.belief, sample, opens, variances)
-        fresh = kalman.diagonal_root(variances, jnp.ones_like(state.theta))
-        nis = consistency.mean_square(state.nis, verdict.squares, sample, self.dt / self.tuning.window)
-        doubt = consistency.alarms(state.doubt, verdict, sample, self.dt, self.tuning)
-        believed = jnp.where(nis < self.tuning.reject, verdict.theta, state.trusted)
-        trusted = jnp.where(doubt < self.tuning.alarms, believed, state.settled)
-        return OnlineState(
-            x=belief.z[:d],
-            theta=belief.z[d:],
-            root=jnp.concatenate([belief.root[:d], jnp.where(opens, fresh, belief.root)[d:]]),
-            excitation=filtered.excitation,
-            test=test,
-            mixture=verdict.mixture,
-            trusted=trusted,
-            settled=jnp.where(doubt < consistency.SETTLED, trusted, state.settled),
-            doubt=doubt,
-            nis=nis,
-            history=history,
-            changes=state.changes + jnp.where(verdict.changed, 1.0, 0.0),
-            restarts=state.restarts,
-        )
+    def _varies(self) -> np.ndarray:
+        """Whether each parameter is a disturbance."""
+        return np.array([name.startswith(DISTURBANCE) for name in self.names])
 
     def _models(self) -> ModelSet:
         return model_set(self.hypotheses, len(self.names), self.dt)
+
+    def _filter_model(self, sample: Sample, each: Each) -> FilterModel:
+        """With ẋ as a function of x and θ."""
+        x, (start, unravel) = sample.x, ravel_parameters(self.field)
+
+        def rates(x, theta):
+            moved = start + jnp.asarray(self.scales, x.dtype) * theta
+            return unravel(moved.astype(start.dtype))(x, sample.u)
+
+        added = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, x.dtype)), x.shape)
+        unit = state_space(self.field, len(x)).normalise
+        return FilterModel(rates, unit, self._variances(x), added, self.dt, self.tuning, each)
+
+    def _filtered(
+        self, state: OnlineState, model: FilterModel, sample: Sample
+    ) -> tuple[Belief, Excitation, Correction, Array]:
+        """The filter of all parameters, which moves what the samples tell; what that is, and the gains of θ."""
+        d, tuning, ones = len(state.x), self.tuning, jnp.ones_like(state.theta)
+        walk = tuning.drift * jnp.exp(state.haste)
+        diffusion = self.dt / tuning.pace * sample.elapsed * jnp.square(walk)
+        belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted)
+        belief = kalman.limit_covariance(belief, ones)
+        predicted = kalman.reset_state(belief, sample, sample.restart, model.variances)
+        belief, correction = kalman.correct(predicted, sample, model)
+        told, gains = state.excitation, correction.gains[:, d:]
+        if tuning.excitation:
+            share = jnp.asarray(np.where(self._varies(), TAKEN, 1.0), ones.dtype)
+            told = excitation.after_sample(told, slope, correction, sample, walk, share, self.dt / tuning.pace, tuning)
+            belief, gains = excitation.consider(predicted, belief, correction, told, share)
+        return kalman.triangular(belief, d), told, correction, gains
+
+    def _haste(self, state: OnlineState, sample: Sample, opens: Bool[Array, ""]) -> Float[Array, " p"]:
+        """How much faster parameters walk: disturbances, or all if there is none, while they are pulled to one side."""
+        varies, tuning = self._varies(), self.tuning
+        pulled = state.test.pulled / EAGER - 1
+        rise = jnp.where(pulled > 0, RISE * jnp.minimum(pulled, 4.0), -FALL)
+        rise = self.dt / tuning.pace * jnp.where(sample.measured, rise, 0.0)
+        haste = jnp.clip(state.haste + rise + jnp.where(opens & (pulled > 0), 1.0, 0.0), 0.0, math.log(tuning.gusts))
+        # What opens to its prior need not walk there.
+        return jnp.asarray(varies, haste.dtype) * haste if varies.any() else jnp.where(opens, 0.0, haste)

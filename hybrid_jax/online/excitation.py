@@ -10,15 +10,13 @@ The information is that of the innovations, by their sensitivity to θ, as of th
 (Friedland, "Treatment of bias in recursive filtering", 1969).
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax.online.kalman import Belief, Correction
 from hybrid_jax.online.samples import Sample
-from hybrid_jax.online.tuning import Tuning
+from hybrid_jax.online.tuning import MEMORY, Tuning
 
 LARGEST = 1e5  # information of a number beyond which its last digits would count for some
 SHARPER = 5  # passes that make shares zero or one
@@ -31,11 +29,16 @@ class Excitation(eqx.Module):
     Attributes:
         sensitivity: of the error of the estimated x to that of θ.
         root: a square root of the matrix that has, in place of each eigenvalue I of the information of a sample,
-            1 / (1 + I / `Tuning.excitation`).
+            1 / (1 + I / `Tuning.excitation`); each parameter over its share.
     """
 
     sensitivity: Float[Array, "*n d p"]
     root: Float[Array, "*n p p"]
+
+    @classmethod
+    def begin(cls, d: int, p: int, dtype) -> "Excitation":
+        """Before the first sample, which has told nothing."""
+        return cls(jnp.zeros((d, p), dtype), jnp.eye(p, dtype=dtype))
 
     def considered(self) -> Float[Array, "*n p p"]:
         """The projection on the directions that samples do not tell."""
@@ -46,38 +49,33 @@ class Excitation(eqx.Module):
         return found
 
 
-class Filtered(NamedTuple):
-    """What the filter of all parameters made of a sample."""
-
-    belief: Belief
-    excitation: Excitation
-    correction: Correction
-    gains: Float[Array, "d p"]  # of θ along what the samples tell
-
-
-def begun(d: int, p: int, dtype) -> Excitation:
-    """Before the first sample, which has told nothing."""
-    return Excitation(jnp.zeros((d, p), dtype), jnp.eye(p, dtype=dtype))
-
-
 def after_sample(
     excitation: Excitation,
     slope: Float[Array, "d d+p"],
     correction: Correction,
     sample: Sample,
-    dt: float,
+    walk: Float[Array, " p"],
+    share: Float[Array, " p"],
+    periods: float,
     tuning: Tuning,
 ) -> Excitation:
-    """After a period with this Jacobian, and the sample at its end."""
+    """After a period with this Jacobian, and the sample at its end.
+
+    Args:
+        walk: of each parameter, its deviation after a second; what walks, as in gusts, hides what others do.
+        share: of each, how willingly it takes what a sum of parameters explains.
+        periods: length of one, over the pace [s].
+    """
     d, root = len(sample.x), excitation.root
     sensitivity = jnp.where(sample.restart, 0.0, slope[:, :d] @ excitation.sensitivity + slope[:, d:])
     sensitivity = jnp.where(sample.acted | sample.restart, sensitivity, excitation.sensitivity)
-    share = jnp.where(sample.measured, -jnp.expm1(-dt / tuning.memory), 0.0)
-    root = root + share / 2 * (root - root @ (root.T @ root))
-    noise = tuning.excitation / jnp.maximum(share, 1e-9)
+    new = jnp.where(sample.measured, -jnp.expm1(-periods / MEMORY), 0.0)
+    root = root + new / 2 * (root - root @ (root.T @ root))
+    noise = tuning.excitation / jnp.maximum(new, 1e-9)
     for i in range(d):
         seen = jnp.where(sample.used[i], sensitivity[i] / correction.sizes[i], 0.0)
         sensitivity = sensitivity - correction.gains[i, :d, None] * seen
+        seen = share * seen / jnp.sqrt(1 + MEMORY * jnp.sum(jnp.square(seen * walk)))
         row = seen / jnp.sqrt(1 + jnp.sum(jnp.square(seen)) / LARGEST) @ root
         variance = jnp.sum(jnp.square(row)) + noise
         root = root - (root @ row)[:, None] * row / (variance + jnp.sqrt(noise * variance))  # as `kalman.correct`
@@ -85,12 +83,12 @@ def after_sample(
 
 
 def consider(
-    before: Belief, after: Belief, correction: Correction, considered: Float[Array, "p p"]
+    before: Belief, after: Belief, correction: Correction, told: Excitation, share: Float[Array, " p"]
 ) -> tuple[Belief, Float[Array, "d p"]]:
     """What a sample corrected, but with θ where it was along what is considered; and the gains of θ."""
-    d = len(correction.white)
+    d, considered = len(correction.white), told.considered() * share[:, None] / share
     gains = correction.gains[:, d:]
-    held = gains @ considered
+    held = gains @ considered.T
     z = jnp.concatenate([after.z[:d], after.z[d:] + considered @ (before.z[d:] - after.z[d:])])
     added = jnp.concatenate([jnp.zeros((d, d), z.dtype), held.T])
     return Belief(z, jnp.concatenate([after.root, added], axis=1)), gains - held

@@ -49,19 +49,16 @@ class Hypothesis:
         checks.not_negative(f"hypothesis {self.name}: lead", self.lead)
 
 
-@dataclass(frozen=True)
-class Subspace:
+class Subspace(NamedTuple):
     """A hypothesis in the order of θ, of p parameters in their prior standard deviations: numbers a of which θ = S a.
 
     Attributes:
-        name: of the hypothesis.
         effects: the k rows of Sᵀ.
         own: of each parameter, whether a number moves it alone.
         rates: of each number, the deviation of its rate over its own [1/s]; 0 for none.
         lead: how far ahead the delivered model is [s].
     """
 
-    name: str
     effects: tuple[tuple[float, ...], ...]
     own: tuple[bool, ...]
     rates: tuple[float, ...]
@@ -94,29 +91,22 @@ def subspace_of(hypothesis: Hypothesis, names: tuple[str, ...], scales: tuple[fl
     Raises:
         ValueError: a name that is unknown, or of a parameter that is held, with a prior of zero.
     """
-    names, rows, rates = tuple(name if scale else "" for name, scale in zip(names, scales, strict=True)), [], []
-    for name, size in hypothesis.parameters.items():
-        for i in _places(hypothesis, name, names):
-            rows.append(_row({i: size}, scales))
-            rates.append(hypothesis.rates.get(name, 0.0) / size)
-    own = np.any(rows, axis=0) if rows else np.zeros(len(names), bool)
-    for mapping in hypothesis.together:
-        sizes = {i: size for name, size in mapping.items() for i in _places(hypothesis, name, names)}
-        rows.append(_row(sizes, scales))
-        rates.append(0.0)
-    return Subspace(hypothesis.name, tuple(rows), tuple(own.tolist()), tuple(rates), hypothesis.lead)
+    known = [name for name, scale in zip(names, scales, strict=True) if scale]
 
+    def places(name: str) -> list[int]:
+        if not any(name in (each, each.partition("[")[0]) for each in known):
+            raise ValueError(f"hypothesis {hypothesis.name}: {name} must be among {', '.join(known)}")
+        return [i for i, each in enumerate(names) if scales[i] and name in (each, each.partition("[")[0])]
 
-def _places(hypothesis: Hypothesis, name: str, names: tuple[str, ...]) -> list[int]:
-    """Where a parameter, or the entries of an array, stand in θ."""
-    found = [i for i, each in enumerate(names) if name in (each, each.partition("[")[0])]
-    if not found:
-        raise ValueError(f"hypothesis {hypothesis.name}: {name} must be among {', '.join(filter(None, names))}")
-    return found
+    def row(sizes: Mapping[int, float]) -> tuple[float, ...]:
+        return tuple(sizes.get(i, 0.0) / (scale or 1.0) for i, scale in enumerate(scales))
 
-
-def _row(sizes: Mapping[int, float], scales: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(sizes.get(i, 0.0) / (scale or 1.0) for i, scale in enumerate(scales))
+    alone = [(i, name, size) for name, size in hypothesis.parameters.items() for i in places(name)]
+    rates = [hypothesis.rates.get(name, 0.0) / size for _, name, size in alone] + [0.0] * len(hypothesis.together)
+    shared = [{i: size for name, size in each.items() for i in places(name)} for each in hypothesis.together]
+    rows = [*(row({i: size}) for i, _, size in alone), *map(row, shared)]
+    own = tuple(i in {place for place, _, _ in alone} for i in range(len(names)))
+    return Subspace(tuple(rows), own, tuple(rates), hypothesis.lead)
 
 
 def model_set(hypotheses: tuple[Subspace, ...], p: int, dt: float) -> ModelSet:

@@ -23,11 +23,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hybrid_jax.online import change_test, kalman
-from hybrid_jax.online.change_test import ChangeTest, started
+from hybrid_jax.online import kalman
+from hybrid_jax.online.change_test import ChangeTest
 from hybrid_jax.online.hypotheses import ModelSet
 from hybrid_jax.online.kalman import Belief, Correction, FilterModel
 from hybrid_jax.online.samples import Sample
+from hybrid_jax.online.tuning import SETTLE
+
+# Logarithms: how many times less likely one can become than the likeliest, and is after an alarm than what was before.
+FLOOR, CHANGE = 25.0, 4.0
+LEAST = 1e-3  # weight, relative to the largest, up to which one is left out of the estimate
 
 
 class Mixture(eqx.Module):
@@ -66,21 +71,20 @@ class Verdict(NamedTuple):
     unexplained: Bool[Array, ""]
 
 
-def initial(models: ModelSet, x: Float[Array, " d"], variances: Float[Array, " d"], floor: float) -> Mixture:
+def initial(models: ModelSet, x: Float[Array, " d"], variances: Float[Array, " d"]) -> Mixture:
     """Before the first sample x."""
     h, p, k = models.effects.shape
     none = jnp.zeros(k, x.dtype)
     z = jnp.tile(jnp.concatenate([x, none]), (h + 1, 1))
-    root = kalman.diagonal_root(variances, none)
-    root = jnp.tile(root, (h + 1, 1, 1))
+    root = jnp.tile(kalman.diagonal_root(variances, none), (h + 1, 1, 1))
     before = jnp.zeros(h, x.dtype).at[0].set(1)
-    log_weights = jnp.full(h + 2, -floor, x.dtype).at[0].set(0)
-    return Mixture(z, root, before, log_weights, started(p, x.dtype))
+    log_weights = jnp.full(h + 2, -FLOOR, x.dtype).at[0].set(0)
+    return Mixture(z, root, before, log_weights, ChangeTest.begin(p, x.dtype))
 
 
-def weights(mixture: Mixture, least: float) -> Float[Array, " h+1"]:
-    """Of the hypotheses; exactly zero for one that has less than `least` of the largest."""
-    found = jnp.maximum(jnp.exp(mixture.log_weights) - least, 0.0)
+def weights(mixture: Mixture) -> Float[Array, " h+1"]:
+    """Of the hypotheses; exactly zero for one that has less than LEAST of the largest."""
+    found = jnp.maximum(jnp.exp(mixture.log_weights) - LEAST, 0.0)
     return found / jnp.sum(found)
 
 
@@ -91,18 +95,13 @@ def with_previous(mixture: Mixture, own: Float[Array | np.ndarray, "h-1 ..."]) -
     return jnp.concatenate([jnp.sum(before * own, axis=0, keepdims=True), own])
 
 
-def mean(mixture: Mixture, models: ModelSet, joint: Belief, least: float) -> Float[Array, " p"]:
-    """θ of the mixture, as far ahead as hypotheses say."""
-    return weights(mixture, least) @ _means(mixture, models, joint)
-
-
-def covariance(mixture: Mixture, models: ModelSet, joint: Belief, least: float) -> Float[Array, "p p"]:
+def covariance(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "p p"]:
     """Of θ in the mixture: that within its parts, and of these around the mean.
 
     A parameter for which a hypothesis has no number of its own may have changed by as much as the samples would not
     tell: its variance is that in the filter of all parameters.
     """
-    share, means = weights(mixture, least), _means(mixture, models, joint)
+    share, means = weights(mixture), _means(mixture, models, joint)
     effects = with_previous(mixture, models.ahead)
     d = len(joint.z) - effects.shape[1]
     outside = jax.vmap(jnp.diag)(with_previous(mixture, models.outside) * jnp.diagonal(joint.covariance)[d:])
@@ -114,6 +113,7 @@ def covariance(mixture: Mixture, models: ModelSet, joint: Belief, least: float) 
 
 
 def _means(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "h+1 p"]:
+    """θ of each hypothesis, as far ahead as it says."""
     effects = with_previous(mixture, models.ahead)
     d = len(joint.z) - effects.shape[1]
     return jnp.concatenate([jnp.sum(effects * mixture.z[:, None, d:], axis=2), joint.z[None, d:]])
@@ -129,20 +129,23 @@ def update(
     gains: Float[Array, "d p"],
 ) -> Verdict:
     """After a sample, with the filter of all parameters as that sample corrected it, and the gains of its θ."""
-    tuning, shares = model.tuning, weights(mixture, model.tuning.least)
+    shares, periods = weights(mixture), model.dt / model.tuning.pace
     mixture, white, likelihoods = filtered(mixture, models, model, sample)
     white = jnp.concatenate([white, correction.white[None]])
-    pulled = shares @ white, gains
-    test, changed = change_test.after_sample(mixture.test, *pulled, sample, model.dt, tuning, tuning.settle)
+    test, changed = mixture.test.after(shares @ white, gains, sample, periods, model.tuning, SETTLE)
+    # Bayes' rule; what is at the floor stays there, but for the filter of all parameters.
+    before = mixture.log_weights
     likelihoods = jnp.concatenate([likelihoods, correction.log_likelihood[None]])
-    before, mixture = mixture.log_weights[-1], reweighted(mixture, likelihoods, tuning.floor)
+    log_weights = jnp.where((before <= -FLOOR).at[-1].set(False), -jnp.inf, before + likelihoods)
+    log_weights = jnp.maximum(log_weights - jnp.max(log_weights), -FLOOR)
+    mixture = eqx.tree_at(lambda m: m.log_weights, mixture, log_weights)
     # The filter of all parameters has found what the test has not.
-    taken = (mixture.log_weights[-1] == 0) & (before < 0) & (mixture.test.quiet > tuning.settle)
-    unexplained, changed = changed & (mixture.log_weights[-1] < 0), changed | taken
+    taken = (log_weights[-1] == 0) & (before[-1] < 0) & (mixture.test.quiet > SETTLE)
+    unexplained, changed = changed & (log_weights[-1] < 0), changed | taken
     mixture = reinitialised(mixture, models, model, sample, changed)
-    mixture = eqx.tree_at(lambda m: m.test, mixture, change_test.reset(test, taken, 0.0))
-    theta, squares = mean(mixture, models, joint, tuning.least), shares @ jnp.square(white)
-    return Verdict(mixture, theta, squares, changed, unexplained)
+    mixture = eqx.tree_at(lambda m: m.test, mixture, test.reset(taken, 0.0))
+    theta = weights(mixture) @ _means(mixture, models, joint)
+    return Verdict(mixture, theta, shares @ jnp.square(white), changed, unexplained)
 
 
 def filtered(
@@ -150,7 +153,8 @@ def filtered(
 ) -> tuple[Mixture, Float[Array, "h d"], Float[Array, " h"]]:
     """After a sample, in which all hypotheses learn; and of each the white innovations and their likelihood."""
     prior = with_previous(mixture, models.prior)
-    diffusion = model.dt * sample.elapsed * (with_previous(mixture, models.diffusion) + model.tuning.drift**2 * prior)
+    drift = model.tuning.drift**2 / model.tuning.pace * prior
+    diffusion = model.dt * sample.elapsed * (with_previous(mixture, models.diffusion) + drift)
 
     def one(z, root, effects, transition, prior, diffusion):
         def field(x, a):
@@ -164,13 +168,6 @@ def filtered(
     effects, transition = with_previous(mixture, models.effects), with_previous(mixture, models.transition)
     belief, white, likelihood = model.each(one)(mixture.z, mixture.root, effects, transition, prior, diffusion)
     return eqx.tree_at(lambda m: (m.z, m.root), mixture, tuple(belief)), white, likelihood
-
-
-def reweighted(mixture: Mixture, likelihoods: Float[Array, " h+1"], floor: float) -> Mixture:
-    """With Bayes' rule for the weights; what is at the floor stays there but for the filter of all parameters."""
-    stays = (mixture.log_weights <= -floor).at[-1].set(False)
-    log_weights = jnp.where(stays, -jnp.inf, mixture.log_weights + likelihoods)
-    return eqx.tree_at(lambda m: m.log_weights, mixture, jnp.maximum(log_weights - jnp.max(log_weights), -floor))
 
 
 def reinitialised(
@@ -195,7 +192,7 @@ def reinitialised(
     root = jnp.concatenate([jnp.tensordot(first, mixture.root, 1)[None], mixture.root[1:]])
     belief = model.each(one)(z, root, with_previous(mixture, models.prior), restart)
     # What learns goes on with its weight.
-    least = jnp.full_like(mixture.log_weights, -model.tuning.change)
+    least = jnp.full_like(mixture.log_weights, -CHANGE)
     log_weights = least.at[0].set(least[0] * joint).at[-1].set(jnp.maximum(mixture.log_weights[-1], least[0]))
     new = Mixture(belief.z, belief.root, first[0] * mixture.previous + first[1:], log_weights, mixture.test)
     return jax.tree.map(lambda a, b: jnp.where(alarm, a, b), new, mixture)

@@ -37,6 +37,7 @@ class OnlineState(eqx.Module):
         trusted: the last θ that was consistent, which the model has.
         settled: the last of these before alarms began, to which it returns if they do not end.
         doubt: count of alarms of late.
+        haste: logarithm of how much faster each parameter walks than `Tuning.drift`, as a disturbance does in gusts.
         nis: mean normalised innovation squared, 1 if noise and model are as stated.
         history: what samples were like until now.
         changes: how many alarms there were.
@@ -52,6 +53,7 @@ class OnlineState(eqx.Module):
     trusted: Float[Array, "*n p"]
     settled: Float[Array, "*n p"]
     doubt: Float[Array, "*n"]
+    haste: Float[Array, "*n p"]
     nis: Float[Array, "*n"]
     history: SampleHistory
     changes: Float[Array, "*n"]
@@ -130,26 +132,12 @@ def named_priors(
     return names, tuple(found)
 
 
-def check_sizes(x: Array, numbers: Mapping[str, tuple[float, ...]], indices: tuple[int, ...] | None) -> None:
-    """Refuse what is no sample x (d,), numbers that are not one for each of its states or for all, and indices."""
-    if x.ndim != 1:
-        raise ValueError(f"x must be one sample (d,), got shape {x.shape}")
-    for name, values in numbers.items():
-        if len(values) not in (1, len(x)):
-            raise ValueError(f"{name} must be one number, or one for each of the {len(x)} of x, got {len(values)}")
-    if indices is not None:
-        checks.places("indices", indices, len(x))
-
-
 def _names(field: AbstractVectorField) -> tuple[str, ...]:
     """The name of each parameter; the field may be traced."""
-
-    def numbers(theta, unravel):
-        return jnp.stack(list(named_parameters(unravel(theta)).values()))
-
     with jax.ensure_compile_time_eval():
         like = jax.tree.map(lambda a: jnp.zeros(a.shape, jnp.result_type(a)) if eqx.is_inexact_array(a) else a, field)
         theta, unravel = ravel_parameters(like)
-        slopes = np.asarray(jax.jacfwd(numbers)(theta, unravel))  # each number depends on one parameter
+        # Each number depends on one parameter.
+        slopes = jax.jacfwd(lambda theta: jnp.stack(list(named_parameters(unravel(theta)).values())))(theta)
         labels = list(named_parameters(like))
-    return tuple(labels[i] for i in np.argmax(np.abs(slopes), axis=0))
+    return tuple(labels[i] for i in np.argmax(np.abs(np.asarray(slopes)), axis=0))

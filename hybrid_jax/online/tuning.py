@@ -1,8 +1,15 @@
 """How an `OnlineAdaptation` is tuned."""
 
+import dataclasses
 from dataclasses import dataclass
 
 from hybrid_jax import checks
+
+# Times in seconds, for `Tuning.pace` 1.
+SPANS = (0.05, 0.5)  # of the two sums of the change test
+PAUSE, SETTLE, HOLD = 0.1, 0.3, 0.6  # least time from an alarm to the next, of a mixture, and to an unexplained one
+WINDOW, TRIAL, MEMORY = 0.2, 10.0, 2.0  # of the mean NIS, of the count of alarms, of what samples tell
+SLOWEST = 0.05  # period up to which a pace of 1 is right
 
 
 @dataclass(frozen=True)
@@ -12,75 +19,53 @@ class Tuning:
     The values were tuned by hand on simulated flights of a quadrotor at 100 Hz, of other seeds than those of the report
     on online adaptation. They count in standard deviations of the prior and of the noise, so that they carry over to
     other systems once `prior`, `noise` and `process` are right. If you change anything, begin with `alarm` (missed
-    changes against false alarms), `drift` and `caution` (intervals that are too narrow), and with the times, in
-    proportion, if your system is much slower or sampled much less often.
+    changes against false alarms), `drift` and `caution` (intervals that are too narrow), and with `pace` if your system
+    is much slower or sampled much less often.
 
     Attributes:
-        drift: random walk of a parameter, as a share of its prior standard deviation [1/√s].
-        forgetting: random walk: how much faster a parameter walks for each unit of its squared test beyond `eager`.
-        eager: random walk: squared test, χ² of one degree, from which a parameter walks faster.
-        spans: change test: time constants of its two sums [s].
-        alarm: change test: value that gives an alarm, of a standard normal number if nothing has changed.
-        pause: change test: least time between two alarms [s].
-        window: guard: time constant of the mean normalised innovation squared, NIS [s].
-        reject: guard: mean NIS from which the filter is not believed.
-        clip: guard: standard deviations at which an innovation is cut off, so that an outlier does little.
-        gap: guard: after so long without a sample the state is taken from the next one [s].
-        frozen: guard: equal samples in a row from which a sensor counts as frozen.
-        bound: guard: prior standard deviations that a parameter may move.
-        excitation: guard: information of a sample, in units of the prior, below which a direction of θ is not
-            learned; 0 to learn all.
-        memory: guard: time constant of that information [s].
-        trial: guard: time constant of the count of alarms [s]; a parameter at its bound counts as 2.5 a second.
-        alarms: guard: count from which the filter is not believed, until it has fallen to half of twice as many.
-        caution: guard: share of what uncertain parameters do to a step that counts as noise, for its nonlinearity.
-        floor: hypotheses: how many times less likely, as a logarithm, one can become than the likeliest.
-        least: hypotheses: weight, relative to the largest, up to which one is left out of the estimate.
-        change: hypotheses: how much less likely, as a logarithm, each is after an alarm than what was before.
-        settle: hypotheses: least time between two alarms of their mixture [s].
-        hold: hypotheses: least time from one opening of the filter of all parameters until they open it again [s].
+        pace: factor on all times of the filter but `gap`; 0 for 1, or the period over 0.05 s if that is more.
+        drift: random walk of a parameter, as a share of its prior standard deviation [1/√s, for a pace of 1].
+        gusts: how many times as fast a disturbance may walk while it is pulled to one side, as in gusts.
+        alarm: value of the change test that gives an alarm, of a standard normal number if nothing has changed.
+        reject: mean normalised innovation squared, NIS, from which the filter is not believed.
+        alarms: count of alarms in 10 s from which it is not believed, until it has fallen to half of twice as many.
+        clip: standard deviations at which an innovation is cut off, so that an outlier does little.
+        gap: after so long without a sample the state is taken from the next one [s]; 0 for 0.1 s times the pace.
+        frozen: equal samples in a row from which a sensor counts as frozen.
+        bound: prior standard deviations that a parameter may move.
+        excitation: information of a sample, in units of the prior, below which a direction of θ is not learned; 0 to
+            learn all.
+        caution: share of what uncertain parameters do to a step that counts as noise, for its nonlinearity.
 
     Raises:
         ValueError: a number that is negative, or zero where it must be positive.
     """
 
+    pace: float = 0.0
     drift: float = 0.002
-    forgetting: float = 30.0
-    eager: float = 6.0
-    spans: tuple[float, float] = (0.05, 0.5)
+    gusts: float = 500.0
     alarm: float = 5.0
-    pause: float = 0.1
-    window: float = 0.2
     reject: float = 6.0
+    alarms: float = 5.0
     clip: float = 5.0
-    gap: float = 0.1
+    gap: float = 0.0
     frozen: int = 3
     bound: float = 4.0
     excitation: float = 0.05
-    memory: float = 2.0
-    trial: float = 10.0
-    alarms: float = 5.0
     caution: float = 1.5
-    floor: float = 25.0
-    least: float = 1e-3
-    change: float = 4.0
-    settle: float = 0.3
-    hold: float = 0.6
 
     def __post_init__(self):
-        for name in (
-            "drift",
-            "forgetting",
-            "eager",
-            "caution",
-            "excitation",
-            "pause",
-            "least",
-            "change",
-            "settle",
-            "hold",
-        ):
+        for name in ("pace", "drift", "gap", "excitation", "caution"):
             checks.not_negative(name, getattr(self, name))
-        for name in ("window", "memory", "trial", "alarms", "alarm", "reject", "clip", "gap", "bound", "floor"):
+        for name in ("gusts", "alarm", "reject", "alarms", "clip", "bound"):
             checks.positive(name, getattr(self, name))
         checks.count("frozen", self.frozen)
+
+    def at(self, dt: float) -> "Tuning":
+        """With a pace and a gap for samples every dt [s].
+
+        Args:
+            dt: time between two samples [s].
+        """
+        pace = self.pace or max(1.0, dt / SLOWEST)
+        return dataclasses.replace(self, pace=pace, gap=self.gap or 0.1 * pace)

@@ -3,12 +3,14 @@
 import json
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from smoke import command, experiments, refused, unbegun
 
 from experiments.online.agents import CHANGES, L1, NAMES, fixed_model, nominal, online, true_theta, with_theta
+from experiments.online.hover import WORLDS, Hovered, adaptation_of, hover
 from experiments.online.results import TAGS, Evidence, claims, tables
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
@@ -98,6 +100,17 @@ def test_options_that_cannot_be_are_refused():
         unbegun("online", "--preset", "smoke", "--latency", "0.015"), "online"
     )
     assert "--seconds must be" in refused(unbegun("online", "--preset", "smoke", "--seconds", "1"), "online")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", WORLDS)
+def test_hover_is_never_worse_than_without_adapting_and_a_wind_is_found(world):
+    keys = jax.random.split(jax.random.key(0))
+    found = Hovered(*map(np.asarray, hover(adaptation_of(world, 1.0), world, 1.0, 300, jnp.array([0.0, 1.0]), keys)))
+    assert found.ratios(10, 300).max() < 1.05
+    assert np.abs(found.theta[:, :300, :3]).max() < 0.1
+    assert found.ratios(310, 330)[0, 0] < 0.8  # the calm flight, from a second after the wind on
+    assert (found.changes[0, 310] > found.changes[0, 299]).all()
 
 
 @pytest.mark.slow

@@ -116,7 +116,7 @@ def test_what_is_outside_all_causes_is_found_no_worse_than_by_the_filter_of_all(
     """Two things at once, which only the filter of all parameters explains."""
     both = cart(stiffness=1.8, gain=0.5, push=0.6)
     found, alone = (errors(watched(hypotheses, both, seeds=24)[1], both) for hypotheses in (True, False))
-    assert found < 1.15 * alone
+    assert found < 1.2 * alone
 
 
 def test_a_push_that_grows_is_delivered_ahead():

@@ -14,7 +14,7 @@ from hybrid_jax.integrate import rk4_step
 from hybrid_jax.online import OnlineAdaptation, Tuning
 
 DT, NOISE = 0.05, 0.01
-CALM = Tuning(caution=0.0, alarm=1e3, forgetting=0.0, drift=0.0, clip=1e3, excitation=0.0)  # the plain Kalman filter
+CALM = Tuning(caution=0.0, alarm=1e3, gusts=1.0, drift=0.0, clip=1e3, excitation=0.0)  # the plain Kalman filter
 
 
 class Slide(hj.AbstractVectorField):
@@ -266,5 +266,15 @@ def test_a_parameter_with_a_prior_of_zero_is_held(hypotheses):
 
 
 def test_a_tuning_that_makes_no_sense_is_refused():
-    with pytest.raises(ValueError, match="pause must be"):
-        Tuning(pause=-1.0)
+    with pytest.raises(ValueError, match="drift must be"):
+        Tuning(drift=-1.0)
+
+
+def test_times_follow_the_period_of_a_slow_system():
+    """As in hours: the filter of a system whose samples are 600 times as far apart is the same."""
+    slow = Slide(SLIDE.friction / 600, SLIDE.idle)
+    found = OnlineAdaptation(slow, 600 * DT, NOISE, prior={"friction": 0.5 / 600, "idle": 0.5})
+    samples, inputs = run(SLIDE, 60)
+    quick, late = watch(adaptation(), samples, inputs), watch(found, samples, inputs / 600)
+    np.testing.assert_allclose(late.theta, quick.theta, atol=1e-3)
+    assert not found.flags(late).gap.any()

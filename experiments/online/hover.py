@@ -1,0 +1,161 @@
+"""Minutes of hover in two worlds, then a side wind: is adapting in the air ever worse than not to?
+
+python -m experiments.online.hover [SECONDS], by default 600.
+"""
+
+import sys
+from itertools import product
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from experiments.flying.scenario import hardware
+from experiments.worlds.rotorpy import HUMMINGBIRD, ROTORPY, advance, decide
+from experiments.worlds.world import DT, Reference
+from hybrid_jax import control
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import with_disturbance
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.online import Hypothesis, OnlineAdaptation
+from hybrid_jax.sim import pilot
+from hybrid_jax.sim.domain import SOURCE
+from hybrid_jax.sim.forces import Wrench, parameters_of
+from hybrid_jax.state import BODY_RATES, VELOCITY, State
+from hybrid_jax.vehicle import IRIS
+
+HOME, BLOCK = np.array([0.0, 0.0, 2.0], np.float32), 10  # m; periods of a prediction
+MEMORY = 1.0  # s, of a gust
+CHANGE = np.array([0.0, -8 / 3, 0.0])  # m/s²: the side wind at the end
+AFTER = 30  # blocks after it
+PRIOR = {"Ix": 0.3, "Iy": 0.3, "k": 0.2}
+DISTURBANCE, PROCESS = (3.0,) * 3 + (5.0,) * 3, (0.0,) * 7 + (0.003,) * 3 + (0.005,) * 3
+PUSHES = tuple(f"disturbance[v{axis}]" for axis in "xyz")
+HYPOTHESES = (
+    Hypothesis("inertia", {"Ix": 0.3, "Iy": 0.3}),
+    Hypothesis("thrust", {"k": 0.2}),
+    Hypothesis("wind", dict.fromkeys(PUSHES, 3.0), rates=dict.fromkeys(PUSHES, 1.5), lead=0.1),
+)
+
+
+def _iris(integral, x: State, seen: State, push: Float[Array, "3"]):
+    """A period of the project's own simulator, under an acceleration [m/s²]."""
+    plan = pilot.Plan(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(()), jnp.zeros(4))
+    integral, u = pilot.act(integral, seen, plan, parameters_of(IRIS), IRIS, pilot.scale_of(IRIS))
+    truth = SOURCE.quadrotor()
+    moved = type(truth)(truth.parameters, (lambda x, u, t, p: Wrench(p.mass * push, jnp.zeros(3)),))
+    return integral, moved.step(x, u, jnp.zeros(()), DT), u
+
+
+def _hummingbird(speeds, x: State, seen: State, push: Float[Array, "3"]):
+    """A period of RotorPy's, in a wind that moves it about as much."""
+    still = Reference(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(()))
+    command = jnp.clip(decide(HUMMINGBIRD, seen, still), 0.0, HUMMINGBIRD.fastest)
+    (x, speeds), mean = advance(HUMMINGBIRD._replace(wind=1.5 * push), x, speeds, command, 0.0)
+    return speeds, x, mean
+
+
+WORLDS = {
+    "iris": (_iris, IRIS, jnp.zeros(3)),
+    "hummingbird": (_hummingbird, ROTORPY[0].vehicle, jnp.full(4, ROTORPY[0].vehicle.hover_speed)),
+}
+
+
+class Hovered(NamedTuple):
+    """What is kept of a flight at the end of each block of 0.1 s.
+
+    Attributes:
+        errors: squared, of v and ω, of predictions over a block by the adapted and by the first model; with noise.
+        theta: estimated change of Ix, Iy, k and of the disturbance.
+        deviation: of these.
+        unexcited: flags.
+        inconsistent: flag.
+        changes: how many were found.
+    """
+
+    errors: Float[Any, "*n t 2 2"]
+    theta: Float[Any, "*n t p"]
+    deviation: Float[Any, "*n t p"]
+    unexcited: Float[Any, "*n t p"]
+    inconsistent: Float[Any, "*n t"]
+    changes: Float[Any, "*n t"]
+
+    def ratios(self, first: int, last: int) -> Float[Any, "*n 2"]:
+        """RMS error of the adapted model over that of the first one in these blocks, of v and of ω."""
+        rms = np.sqrt(self.errors[..., first:last, :, :].mean(axis=-3))
+        return rms[..., 0, :] / rms[..., 1, :]
+
+
+def adaptation_of(world: str, noise: float, named: bool = False) -> OnlineAdaptation:
+    """The filter that docs/howto/online.md builds, or that with hypotheses."""
+    sizes = tuple(hardware(noise, 0, 0).sizes().tolist())
+    options: Any = {"process": PROCESS, "hypotheses": HYPOTHESES if named else ()}
+    return OnlineAdaptation(rigid_body(WORLDS[world][1]), DT, sizes, PRIOR, DISTURBANCE, **options)
+
+
+@eqx.filter_jit
+def hover(
+    adaptation: OnlineAdaptation, world: str, noise: float, blocks: int, gusts: Float[Array, " n"], keys: PRNGKeyArray
+) -> Hovered:
+    """Hover for some blocks and AFTER more in a side wind, for each rms of gusts [m/s²] and key."""
+    (step, _, start), device, kept = WORLDS[world], hardware(noise, 0, 0), np.exp(-DT / MEMORY)
+    first, sizes = with_disturbance(adaptation.field), np.square(device.sizes())
+
+    def error(model: AbstractVectorField, before: State, after: State, inputs) -> Float[Array, "2"]:
+        expected = jax.lax.scan(lambda x, u: (control.advance(model, x, u, DT), None), before, inputs)[0]
+        squares = jnp.square(after - expected) + sizes
+        return jnp.stack([jnp.sum(squares[VELOCITY]), jnp.sum(squares[BODY_RATES])])
+
+    def flight(gust, key):
+        def period(now, given):
+            (own, x, seen, push, state), (key, steady) = now, given
+            one, two = jax.random.split(key)
+            push = kept * push + gust * np.sqrt(1 - kept**2) * jax.random.normal(one, (3,))
+            own, x, u = step(own, x, seen, push + steady * CHANGE)
+            seen = device.measure(x, two)
+            return (own, x, seen, push, adaptation.update(state, seen, u)), u
+
+        def block(now, given):
+            after, inputs = jax.lax.scan(period, now, (jax.random.split(given[0], BLOCK), jnp.full(BLOCK, given[1])))
+            models, state = (adaptation.model(now[4]), first), after[4]
+            errors = jnp.stack([error(model, now[1], after[1], inputs) for model in models])
+            (theta, covariance), flags = adaptation.estimate(state), adaptation.flags(state)
+            deviation = jnp.sqrt(jnp.diagonal(covariance))
+            return after, Hovered(errors, theta, deviation, flags.unexcited, flags.inconsistent, state.changes)
+
+        x = jnp.zeros(13).at[2].set(HOME[2]).at[3].set(1.0)
+        now = start, x, x, jnp.zeros(3), adaptation.begin(x)
+        steady = jnp.where(jnp.arange(blocks + AFTER) < blocks, 0.0, 1.0)
+        return jax.lax.scan(block, now, (jax.random.split(key, blocks + AFTER), steady))[1]
+
+    return jax.vmap(flight)(gusts, keys)
+
+
+def main() -> None:
+    """Print a line for each filter, noise, world and rms of gusts."""
+    blocks = round(float(sys.argv[1] if sys.argv[1:] else 600) / DT / BLOCK)
+    gusts, keys = jnp.array([0.0, 1.0]), jax.random.split(jax.random.key(7))
+    print("filter, noise, world, gusts | error of v, ω over the first model's | v after a wind | found after [s] |")
+    print("largest change of Ix, Iy, k [%] | least deviation over the prior's | inconsistent [%]")
+    for named, noise, world in product((False, True), (1.0, 0.1), WORLDS):
+        found = Hovered(*map(np.asarray, hover(adaptation_of(world, noise, named), world, noise, blocks, gusts, keys)))
+        for i, gust in enumerate(gusts.tolist()):
+            own = Hovered(*(leaf[i] for leaf in found))
+            (v, omega), late = own.ratios(10, blocks), own.ratios(blocks + 10, blocks + AFTER)[0]
+            alarms = np.flatnonzero(own.changes[blocks:] > own.changes[blocks - 1])
+            when = f"{DT * BLOCK * (alarms[0] + 1):.1f}" if len(alarms) else "-"
+            parts = " ".join(f"{100 * part:.1f}" for part in np.abs(own.theta[:blocks, :3]).max(axis=0))
+            least = (own.deviation[10:blocks, :3].min(axis=0) / list(PRIOR.values())).min()
+            name = "hypotheses" if named else "all"
+            print(
+                f"{name}, {noise:g}, {world}, {gust:g} | {v:.2f} {omega:.2f} | {late:.2f} | "
+                f"{when} | {parts} | {least:.2f} | {100 * own.inconsistent[:blocks].mean():.0f}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

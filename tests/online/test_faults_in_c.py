@@ -1,0 +1,115 @@
+"""The C of a filter passes faults under sanitizers: no report, always finite, and it ends where JAX does."""
+
+import shutil
+import subprocess
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from test_excited_directions import DT, HOVER, NOISE, SECOND, filter_of
+
+from hybrid_jax.export import export_adaptation_c
+
+STEPS, FAULT = 24 * SECOND, slice(12 * SECOND, None)
+MAIN = """
+#include "adaptation.h"
+#include <stdio.h>
+#include <stdlib.h>
+int main(void) {
+    float *one = malloc(%d * sizeof(float)), *two = malloc(%d * sizeof(float)), given[3];
+    if (fread(given, sizeof(float), 1, stdin) != 1) return 2;
+    adaptation_begin(given, one);
+    while (fread(given, sizeof(float), 3, stdin) == 3) {
+        adaptation_update(one, given, given + 1, given[2], two);
+        fwrite(two, sizeof(float), %d, stdout);
+        float *old = one;
+        one = two;
+        two = old;
+    }
+    free(one);
+    free(two);
+    return 0;
+}
+"""
+
+
+def spoiled(column, numbers, part=FAULT):
+    def spoil(flight):
+        flight[part, column] = numbers(flight[part, column]) if callable(numbers) else numbers
+
+    return spoil
+
+
+FAULTS = {
+    "none": lambda flight: None,
+    "missing": spoiled(0, np.nan, slice(1200, 1400)),
+    "infinite": spoiled(0, -np.inf, slice(1200, 1400)),
+    "jumps": spoiled(0, 1e38, slice(1200, 1400, 7)),
+    "input unknown": spoiled(1, np.nan, slice(1200, 1400)),
+    "input jumps": spoiled(1, 3e38, slice(1200, 1400, 7)),
+    "frozen": spoiled(0, lambda x: x[0], slice(1200, 1400)),
+    "late": spoiled(2, 1e30, slice(1200, 1210)),
+    "at once": spoiled(2, 0.0, slice(1200, 1400)),
+    "sign": spoiled(0, lambda x: -x),
+    "unit": spoiled(0, lambda x: 57.3 * x),
+}
+
+
+def flight():
+    """Sample, input and periods of each step, while a controller lets the speed swing."""
+    rng, v, rows = np.random.default_rng(0), 0.0, []
+    for i in range(STEPS):
+        u = HOVER - 4 * (v + NOISE * rng.normal() - 0.5 * np.sin(5 * DT * i))
+        v += DT * (u - HOVER)
+        rows.append((v + NOISE * rng.normal(), u, 1.0))
+    return np.array(rows, np.float32)
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    """The C with a main function, under sanitizers."""
+    if shutil.which("gcc") is None:
+        pytest.skip("gcc is not installed")
+    folder = tmp_path_factory.mktemp("filter")
+    source = export_adaptation_c(folder, filter_of(NOISE), state_size=1, input_size=1)[1]
+    size = ravel_pytree(filter_of(NOISE).begin(jnp.zeros(1)))[0].size
+    (folder / "main.c").write_text(MAIN % (size, size, size))
+    flags = ("-std=c99", "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    subprocess.run(["gcc", *flags, folder / "main.c", source, "-o", folder / "main", "-lm"], check=True)
+    return folder / "main"
+
+
+@pytest.fixture(scope="module")
+def states_of():
+    adaptation = filter_of(NOISE)
+
+    @eqx.filter_jit
+    def states(given):
+        def step(state, row):
+            state = adaptation.update(state, row[:1], row[1:2], row[2])
+            return state, state
+
+        return jax.lax.scan(step, adaptation.begin(jnp.zeros(1)), given)[1]
+
+    return states
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_ends_as_in_jax(name, program, states_of):
+    given = flight()
+    FAULTS[name](given)
+    sent = np.zeros(1, np.float32).tobytes() + given.tobytes()
+    done = subprocess.run([program], input=sent, capture_output=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr[:2000].decode()
+    assert not done.stderr
+    adaptation, expected = filter_of(NOISE), states_of(jnp.asarray(given))
+    unravel = ravel_pytree(adaptation.begin(jnp.zeros(1)))[1]
+    found = jax.vmap(unravel)(jnp.asarray(np.frombuffer(done.stdout, np.float32).reshape(STEPS, -1)))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    wrong = np.asarray(adaptation.flags(found).inconsistent)
+    assert (wrong == np.asarray(adaptation.flags(expected).inconsistent)).mean() > 0.99
+    assert wrong[-1] == (name in ("sign", "unit"))
+    np.testing.assert_allclose(found.trusted[-1], expected.trusted[-1], atol=0.02)
