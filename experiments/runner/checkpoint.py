@@ -48,9 +48,6 @@ class Checkpoints:
                 return load_archive(path, FORMAT)
             except ValueError as error:
                 say(f"{error}; renamed to {path.rename(backup_path(path, 'damaged')).name}")
-        if any(path.is_dir() for path in self._folder.glob("*")):  # an earlier version wrote a folder for each
-            renamed = self._folder.rename(backup_path(self._folder, "before"))
-            say(f"{self._folder}: checkpoints of an earlier version, moved to {renamed.name}; this stage starts anew")
         return None
 
     def delete(self) -> None:

@@ -104,14 +104,8 @@ class Stages:
             OSError: the state cannot be saved.
         """
         finished = self._cache.path(name, sweep_identity(states, plans, settings, data))
-        with self._alone(name, finished.with_suffix(".lock")):
-            return self._sweep(name, states, plans, settings, data, min_capacity, finished)
-
-    def _sweep(self, name, states, plans, settings, data, min_capacity, finished: Path) -> FitState:
         begun = finished.with_suffix(".begun")
         checkpoints = Checkpoints(begun)
-        if self._cache.fresh and begun.exists() and hosts.is_main_process():
-            self._cache.move_aside(begun)
 
         def look() -> tuple[tuple[bool, float], Arrays]:
             """Whether the sweep is finished, the seconds spent on it, and its states."""
@@ -122,32 +116,36 @@ class Stages:
             require_same(f"{begun}: was begun with versions", found[0], {"versions": versions(*PACKAGES)})
             return (False, found[0]["seconds"]), found[1]
 
-        (done, spent), arrays = hosts.from_first(look)
-        states = with_leaves(states, arrays, finished if done else begun)
-        if done:
-            self.seconds[name] = spent
-            self.reused.append(name)
-            self._say(f"{name}: {summary(states)}, as found in the cache")
-            return states
-        if spent:
-            self._say(f"{name}: goes on where it was interrupted, at epoch {states.epoch.max()}, after {clock(spent)}")
-        with DeferredSignals() as signals, Line(name, self._console) as line:
-            autosave = Autosave(checkpoints, signals, name, spent, self._share)
+        with self._alone(name, finished.with_suffix(".lock")):
+            if self._cache.fresh and begun.exists() and hosts.is_main_process():
+                self._cache.move_aside(begun)
+            (done, spent), arrays = hosts.from_first(look)
+            states = with_leaves(states, arrays, finished if done else begun)
+            if done:
+                self.seconds[name] = spent
+                self.reused.append(name)
+                self._say(f"{name}: {summary(states)}, as found in the cache")
+                return states
+            if spent:
+                at = f"epoch {states.epoch.max()}, after {clock(spent)}"
+                self._say(f"{name}: goes on where it was interrupted, at {at}")
+            with DeferredSignals() as signals, Line(name, self._console) as line:
+                autosave = Autosave(checkpoints, signals, name, spent, self._share)
 
-            def on_block(states: FitState, progress: Progress) -> None:
-                line.show_sweep(progress)
-                autosave.after_block(states)
+                def on_block(states: FitState, progress: Progress) -> None:
+                    line.show_sweep(progress)
+                    autosave.after_block(states)
 
-            splits = data.splits["train"], data.splits["validation"]
-            try:
-                states = sweep(states, plans, *splits, settings, min_capacity=min_capacity, on_block=on_block)
-            except hosts.PeerLost:
-                autosave.save_last_block()
-                raise
-            self.seconds[name] = autosave.seconds()
-            if hosts.is_main_process():
-                self._cache.save(finished, {"name": name, "seconds": self.seconds[name]}, named_leaves(states))
-                checkpoints.delete()
+                splits = data.splits["train"], data.splits["validation"]
+                try:
+                    states = sweep(states, plans, *splits, settings, min_capacity=min_capacity, on_block=on_block)
+                except hosts.PeerLost:
+                    autosave.save_last_block()
+                    raise
+                self.seconds[name] = autosave.seconds()
+                if hosts.is_main_process():
+                    self._cache.save(finished, {"name": name, "seconds": self.seconds[name]}, named_leaves(states))
+                    checkpoints.delete()
         self._ran += self.seconds[name] - spent
         self._saving += autosave.saving
         self._say(f"{name}: {summary(states)}, {clock(self.seconds[name])}")
@@ -175,14 +173,19 @@ class Stages:
 
         `identity` says what determines them, besides their names; see `identity_of`.
         """
-        paths = {job: self._cache.path(f"{name} {job}", identity) for job in jobs}
-        found = {job: kept for job, path in paths.items() if (kept := self._load(name, path))}
+        found, missing = dict[str, Found](), dict[str, Job]()
+        for job, work in jobs.items():
+            path = self._cache.path(f"{name} {job}", identity)
+            about, arrays = hosts.from_first(lambda path=path: self._cache.load(path) or (None, {}))
+            if about is None:
+                missing[job] = partial(self._run_and_save, path, work)
+            else:
+                self.seconds[name] = self.seconds.get(name, 0.0) + about["seconds"]
+                found[job] = json.loads(about["rows"]), arrays
         if found:
-            self.reused.append(name if len(found) == len(jobs) else f"{len(found)} of {len(jobs)} parts of {name}")
-        missing = [job for job in jobs if job not in found]
+            self.reused.append(f"{len(found)} of {len(jobs)} parts of {name}" if missing else name)
         if missing:
-            ran = self.parts(name, [partial(self._run_and_save, paths[job], jobs[job]) for job in missing])
-            found |= dict(zip(missing, ran, strict=True))
+            found |= dict(zip(missing, self.parts(name, list(missing.values())), strict=True))
         return {job: found[job] for job in jobs}
 
     def notes(self) -> list[str]:
@@ -208,14 +211,6 @@ class Stages:
             yield
         finally:
             lock.release()
-
-    def _load(self, stage: str, path: Path) -> Found | None:
-        """What a job found before, on every process; its seconds are added to the stage's."""
-        about, arrays = hosts.from_first(lambda: self._cache.load(path) or (None, {}))
-        if about is None:
-            return None
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + about["seconds"]
-        return json.loads(about["rows"]), arrays
 
     def _run_and_save(self, path: Path, work: Job) -> Found:
         began = time.perf_counter()

@@ -74,15 +74,6 @@ def test_a_truncated_checkpoint_is_named_and_renamed(left, tmp_path):
     assert loaded(tmp_path)[0][0] == {"number": 9}
 
 
-def test_checkpoints_of_the_version_before_are_moved_and_the_stage_starts_anew(tmp_path):
-    (tmp_path / "old.begun" / "000001" / "arrays").mkdir(parents=True)
-    found, (line,) = loaded(tmp_path / "old.begun")
-    assert found is None
-    assert "of an earlier version, moved to old.begun.before-" in line
-    saved(tmp_path / "old.begun", 1).delete()
-    assert [name.split("-")[0] for name in names(tmp_path)] == ["old.begun.before"]
-
-
 def test_deleting_leaves_renamed_files(tmp_path):
     saved(tmp_path / "one", 2).delete()
     assert not (tmp_path / "one").exists()
