@@ -1,10 +1,14 @@
 """How a process is set up."""
 
 import os
+import re
+import signal
+import subprocess
+import sys
 import time
 
 import pytest
-from smoke import script
+from smoke import ROOT, script
 
 from hybrid_jax import runtime
 from hybrid_jax.runtime import EXTRA, FLAGS, PROGRAMS
@@ -144,3 +148,30 @@ def test_nothing_is_deleted_in_a_folder_that_the_user_named(tmp_path):
     (tmp_path / "folder-cache").mkdir()
     printed(PROGRAM, tmp_path)
     assert {"theirs-cache", "notes.txt", "folder-cache"} <= {path.name for path in tmp_path.iterdir()}
+
+
+# Ctrl-C while the first module of a program loads.
+INTERRUPTED = """
+import sys
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "{module}":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupt())
+{program}
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "program"),
+    [
+        ("hybrid_jax.cli.command", "import hybrid_jax.cli; hybrid_jax.cli.main()"),
+        ("jax", "import experiments, experiments.param_shift"),
+    ],
+)
+def test_an_interrupt_while_modules_load_is_told_in_a_line(module, program):
+    code = INTERRUPTED.format(module=module, program=program)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode in (130, -signal.SIGINT)
+    assert done.stdout == ""
+    assert re.fullmatch(r"(hybrid-jax: )?interrupted.*\n", done.stderr)

@@ -20,4 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         print(f"hybrid-jax: needs {error.name}: pip install 'hybrid_jax[cli]'", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:  # before the script can say so itself
+        print("hybrid-jax: interrupted, nothing was written", file=sys.stderr)
+        sys.exit(130)
     run(sys.argv[1:] if arguments is None else arguments)
