@@ -15,6 +15,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
@@ -26,6 +27,7 @@ from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories
 
+MANY, CHUNK = 10_000, 1000  # windows: of more, a triangle takes the place of J and r, and is found by so many at a time
 LEAST = 0.1  # of what rounding does to the states: a step of which less is expected is the last
 
 COARSE = 0.5  # standard errors that half the solver's step may move a parameter
@@ -119,6 +121,11 @@ def warn_of_steps(discretisation: float, remedy: str) -> None:
 def _fit_and_compare(field: AbstractVectorField, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale):
     """`fit_free`, and its `discretisation`: of the step of Gauss and Newton to what half the step predicts."""
     fit, jacobian, errors = fit_and_linearise(field, windows, solver, max_steps, scale)
+    n = len(windows)
+    if n > MANY:  # some tell how far a parameter would move; its standard error is that of all
+        windows = windows[np.linspace(0, n - 1, CHUNK).astype(int)]
+        theta, unravel = ravel_parameters(fit.field)
+        jacobian, errors = _linearised(lambda at, w: prediction_errors(unravel(at), w, solver, scale), theta, windows)
 
     def halved(window: Trajectories):
         fine = replace(window, x=jnp.repeat(window.x, 2, axis=0), u=jnp.repeat(window.u, 2, axis=0), dt=window.dt / 2)
@@ -130,7 +137,33 @@ def _fit_and_compare(field: AbstractVectorField, windows: Trajectories, solver: 
     unit = _nonzero(jnp.linalg.norm(jacobian, axis=0))
     inverse = jnp.linalg.pinv((jacobian / unit).T @ (jacobian / unit), hermitian=True)
     steps = inverse @ ((jacobian / unit).T @ change) / _nonzero(jnp.sqrt(jnp.diagonal(inverse)))
-    return replace(fit, discretisation=jnp.max(jnp.abs(steps)) / _nonzero(noise))
+    more = (n / len(windows)) ** 0.5
+    return replace(fit, discretisation=more * jnp.max(jnp.abs(steps)) / _nonzero(noise))
+
+
+def _linearised(errors: Callable[[Theta, Trajectories], Array], theta: Theta, windows: Trajectories):
+    """The Jacobian of the errors of all windows, and the errors."""
+    return jax.jacfwd(lambda theta: 2 * (jax.vmap(partial(errors, theta))(windows),), has_aux=True)(theta)
+
+
+def _triangle(errors: Callable[[Theta, Trajectories], Array], theta: Theta, windows: Trajectories):
+    """A Jacobian and errors, of one window of p + 1 errors, with the norms and products of those of all windows.
+
+    They are the triangle of a QR decomposition, some windows at a time: memory does not grow with their number.
+    """
+    n, p = len(windows), theta.size
+
+    def add(i, triangle):
+        first = jnp.minimum(i * CHUNK, n - CHUNK)  # the last chunk begins earlier, with windows that were counted
+        part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, CHUNK), windows)
+        jacobian, r = _linearised(errors, theta, part)
+        rows = jnp.concatenate([jacobian.reshape(CHUNK, -1, p), r.reshape(CHUNK, -1, 1)], axis=2)
+        rows = jnp.where((first + jnp.arange(CHUNK) >= i * CHUNK)[:, None, None], rows, 0)
+        return jnp.linalg.qr(jnp.concatenate([triangle, rows.reshape(-1, p + 1)]), mode="r")
+
+    dtype = jnp.result_type(theta, windows.x)
+    found = jax.lax.fori_loop(0, -(-n // CHUNK), add, jnp.zeros((p + 1, p + 1), dtype))
+    return found[None, None, :, :p], found[None, None, :, p]
 
 
 def check_determined(field: AbstractVectorField, n: int, fitted: int | None = None) -> None:
@@ -167,10 +200,12 @@ def fit_and_linearise(
     max_steps: int,
     scale: Scale,
     free=None,
-    weigh: Callable[[Float[Array, "n t d"]], Float[Array, "n s d"]] = lambda errors: errors,
+    weigh: Callable[[Float[Array, "n t d"]], Float[Array, "n s d"]] | None = None,
     held: Theta | float = 0.0,
 ) -> tuple[LeastSquaresFit, Float[Array, "n s d p"], Float[Array, "n s d"]]:
     """`fit_free`, and there the Jacobian of the predictions, and their errors with the opposite sign.
+
+    Of more than `MANY` windows that are not weighed, these two are what `_triangle` finds.
 
     Points are in units, see `_units`; the best one is kept with its errors, their Jacobian and the units.
 
@@ -180,9 +215,13 @@ def fit_and_linearise(
     """
     start, unravel = ravel_parameters(field)
 
-    def errors(theta: Theta):
-        found = jax.vmap(lambda window: prediction_errors(unravel(theta), window, solver, scale))(windows)
-        return 2 * (weigh(found),)
+    def errors(theta: Theta, window: Trajectories):
+        return prediction_errors(unravel(theta), window, solver, scale)
+
+    def linearised(theta: Theta):
+        if weigh is None:
+            return (_triangle if len(windows) > MANY else _linearised)(errors, theta, windows)
+        return jax.jacfwd(lambda theta: 2 * (weigh(jax.vmap(partial(errors, theta))(windows)),), has_aux=True)(theta)
 
     def theta_at(z: Theta, unit: Theta) -> Theta:
         return (start + unit * z).astype(start.dtype)
@@ -195,7 +234,7 @@ def fit_and_linearise(
 
     def evaluate(z: Theta, state: State):
         units = state.best[3]
-        jacobian, found = jax.jacfwd(errors, has_aux=True)(theta_at(z, units[0]))
+        jacobian, found = linearised(theta_at(z, units[0]))
         own = _units(jacobian, found, windows, scale, free, held)
         units = jax.tree.map(partial(jnp.where, state.steps == 0), own, units)
         cost = jnp.sum(jnp.square(scaled(found, units[1]))) + jnp.sum(jnp.square(anchor(units) * z))
@@ -208,13 +247,13 @@ def fit_and_linearise(
         move, expected = move_of_rows(rows, jnp.concatenate([scaled(found, size), to_start * z]), damping)
         return z + move, expected, jnp.square(LEAST * rounding(windows, scale) / size)
 
-    shape = jax.eval_shape(lambda: errors(start)[0])
+    shape = jax.eval_shape(lambda: linearised(start)[1])
     zero = jnp.zeros(start.shape)  # of JAX's default precision, as all numbers of the loop but the errors are
     nothing = jnp.zeros(shape.shape, shape.dtype), jnp.zeros((*shape.shape, start.size), shape.dtype)
     units = jnp.zeros(start.shape, shape.dtype), jnp.ones((), shape.dtype)
     end = minimise(evaluate, aim, begin(zero, (zero, *nothing, units)), max_steps)
     z, found, jacobian, (unit, _) = end.best
-    mse = jnp.mean(jnp.sum(jnp.square(found), axis=-1))
+    mse = jnp.sum(jnp.square(found)) / (len(windows) * (windows.horizon if weigh is None else found.shape[1]))
     theta = jnp.where(jnp.isfinite(mse), theta_at(z, unit), start)
     return LeastSquaresFit(unravel(theta), mse, end.steps, end.status), jacobian, found
 

@@ -14,6 +14,7 @@ from pushes import Push, pushes
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
+from hybrid_jax.estimation import least_squares
 from hybrid_jax.estimation.least_squares import fit_least_squares, ravel_parameters
 from hybrid_jax.estimation.uncertainty import covariance_of
 from hybrid_jax.integrate import RK4, rollout_batch
@@ -49,6 +50,18 @@ def test_a_linear_problem_meets_its_closed_form_in_any_unit(unit):
     np.testing.assert_allclose(found.field.gains, gains, rtol=1e-5)
     # One step would do without damping; with 1e-3 of it each step leaves 1e-3 of the error.
     assert found.steps <= 6
+
+
+def test_many_windows_are_fitted_a_few_at_a_time_with_the_same_result(monkeypatch):
+    (windows, _), start = pushes(30, 0.1, 1.0), Push(jnp.array([1.0, 1.0]))
+    whole = fit_least_squares(start, windows)
+    monkeypatch.setattr(least_squares, "MANY", 20)
+    monkeypatch.setattr(least_squares, "CHUNK", 8)  # not a part of 30
+    parts = fit_least_squares(start, windows, max_steps=99)  # traced anew
+    assert (parts.converged, parts.steps) == (whole.converged, whole.steps)
+    np.testing.assert_allclose(parts.field.gains, whole.field.gains, rtol=1e-5)
+    np.testing.assert_allclose(parts.mse, whole.mse, rtol=1e-5)
+    assert parts.discretisation < 0.1
 
 
 class Coil(AbstractVectorField):
