@@ -83,8 +83,8 @@ class Hardware:
         """The state as the sensors see it."""
         if not any(self.noise):
             return x
-        noisy = x + jnp.asarray(self.sizes(), x.dtype) * jax.random.normal(key, x.shape, x.dtype)
-        return noisy.at[QUATERNION].set(normalise(noisy[QUATERNION]))
+        x = x + jnp.asarray(self.sizes(), x.dtype) * jax.random.normal(key, x.shape, x.dtype)
+        return x.at[QUATERNION].set(normalise(x[QUATERNION]))
 
     def sizes(self) -> Float[np.ndarray, "13"]:
         """The standard deviation of each entry of the state."""
@@ -253,13 +253,8 @@ def performance(
     low, high = controller.min_speed, controller.vehicle.max_rotor_speed
     margin = SATURATION_MARGIN * (high - low)
     at_limit = (flight.u < low + margin) | (flight.u > high - margin)
-    return Performance(
-        jnp.sqrt(jnp.mean(jnp.square(error))),
-        jnp.sqrt(jnp.mean(jnp.square(yaw_error))),
-        error.max(),
-        ~sound.all(),
-        at_limit.mean(),
-    )
+    rmse, yaw_rmse = (jnp.sqrt(jnp.mean(jnp.square(each))) for each in (error, yaw_error))
+    return Performance(rmse, yaw_rmse, error.max(), ~sound.all(), at_limit.mean())
 
 
 def open_loop_costs(
