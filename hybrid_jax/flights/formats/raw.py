@@ -118,12 +118,12 @@ def record(
         ordered[name] = part._replace(ticks=part.ticks[kept], values=part.values[kept])
         said += [f"{part.source}: {line}: left out" for line in lines]
     start = min(part.ticks[0] for part in ordered.values())
-    lost = _lost("attitude", ordered["attitude"]) if "attitude" in ordered else np.zeros(0, bool)
+    lost = _lost("attitude", ordered["attitude"]) if "attitude" in ordered else np.ones(1, bool)
     for name, part in ordered.items():
         t, gone = (part.ticks - start).astype(float) * tick, _lost(name, part)
-        # A message without an attitude tells no position either.
-        if name != "attitude" and "attitude" in ordered and _of_one_message(part, ordered["attitude"]):
-            gone |= lost if lost.mean() <= LOST else False
+        beside = ordered.get("attitude", part)
+        if part.source.split()[:1] == beside.source.split()[:1] and np.array_equal(part.ticks, beside.ticks):
+            gone |= lost if lost.mean() <= LOST else False  # a message without an attitude tells no position either
         if gone.any() and (name in OPTIONAL or gone.mean() <= LOST):
             why = f"{name} is no {'rotation' if name == 'attitude' else 'number'} in {gone.sum()} samples"
             said.append(f"{part.source}: {why}, the first at {t[gone][0]:.4g} s: left out")
@@ -156,10 +156,6 @@ def _wrong(name: str, part: Samples, row: int, t: np.ndarray) -> str:
             return f"the quaternion {at} has norm {np.linalg.norm(values):.4g}, must be 1"
     column = int((~(np.abs(values) < LARGEST)).argmax())
     return f"{axes_of(name, len(values))[column]} is {values[column]:.6g} {at}, must be a number below {LARGEST:g}"
-
-
-def _of_one_message(a: Samples, b: Samples) -> bool:
-    return a.source.split()[:1] == b.source.split()[:1] and np.array_equal(a.ticks, b.ticks)
 
 
 def _in_order(where: str, ticks: np.ndarray, tick: float) -> tuple[np.ndarray, list[str]]:
