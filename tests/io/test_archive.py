@@ -14,6 +14,8 @@ import pytest
 from surface import refusal
 
 import hybrid_jax as hj
+from experiments.real_flight.simulated import vehicle_toml
+from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights import load_column_map
 from hybrid_jax.io.archive import HEADER, load_archive
 from hybrid_jax.io.datasets import load_dataset
@@ -42,6 +44,13 @@ def test_what_is_no_regular_file_is_refused_and_not_waited_for(load, tmp_path):
     (tmp_path / "nowhere").symlink_to(tmp_path / "none")
     for path in (*tmp_path.iterdir(), Path("/dev/zero"), tmp_path):
         refusal(lambda path=path: load(path), path)
+
+
+@pytest.mark.parametrize("line", ["learn = 3", "learn = [3]", "purpose = {a = 3}", "terms = 3", "actuator = 1"])
+def test_a_part_of_a_vehicle_file_of_another_type_is_refused_with_the_name_of_the_file(line, tmp_path):
+    path = tmp_path / "vehicle.toml"
+    path.write_text(f"{line}\n{vehicle_toml(hj.IRIS)}")
+    refusal(lambda: load_vehicle_model(path), path, line.split()[0])
 
 
 def test_nothing_is_written_through_a_link_and_nothing_is_left(tmp_path, monkeypatch):
