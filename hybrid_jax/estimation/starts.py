@@ -1,10 +1,8 @@
 """Windows whose first state was measured, too: errors that are free of the noise in it.
 
-A prediction begins at a measured state, and its noise is in the errors of the whole window. Worse, it is in the
-derivatives along the parameters as well: where nothing moves, a drag that is far too large predicts best, since it
-forgets the noise of the measured velocity (errors in variables; Fuller, Measurement Error Models, 1987). So each window
-starts where all of its samples say that it started, and what another start would change is taken out of the errors.
-For errors that are normal, these are then independent of the start.
+That noise is in the errors of a whole window, and in the derivatives along the parameters as well (errors in variables;
+Fuller, Measurement Error Models, 1987). So each window starts where all of its samples say that it did, and what
+another start would change is taken out of the errors. For errors that are normal, these are independent of the start.
 """
 
 import math

@@ -1,12 +1,9 @@
-"""Identify a vehicle from recordings of commands and of whatever was measured, through the ODE solver.
+"""Identify a vehicle from recordings of commands and of whatever was measured, by the estimator of records.
 
-The measurements of each window are compared with those that the field predicts from the window's initial state, which
-is unknown, too: it enters with the estimate of `recordings.initial_states` as a prior (an arrival cost; Rao, Rawlings
-and Mayne 2003). So does a force and a torque that is constant over a window: wind, a battery that sags, and other slow
-errors that a pilot corrects, which would pass for effects of the commands. Both are eliminated window by window from
-the normal equations of the parameters (multiple shooting; Bock 1983). Levenberg–Marquardt takes the steps. In rounds
-each channel is weighted by its own errors, and the disturbances get the variance that they turn out to have (empirical
-Bayes by expectation maximisation; Dempster, Laird and Rubin 1977).
+The state in which a window begins is unknown, with the estimate of `recordings.initial_states` as a prior (an arrival
+cost; Rao, Rawlings and Mayne 2003). So is a force and a torque that is constant over it: wind, a battery that sags, and
+other slow errors that a pilot corrects, which would pass for effects of the commands. These disturbances get the
+variance that they turn out to have (empirical Bayes by expectation maximisation; Dempster, Laird and Rubin 1977).
 """
 
 from collections.abc import Sequence
@@ -19,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hybrid_jax import checks
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
@@ -39,10 +35,9 @@ from hybrid_jax.runtime import entry
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.status import Status
 
-ROUNDS = 3  # of weights
+ROUNDS, MAX_STEPS = 3, 20  # of weights, and of Levenberg–Marquardt in each
 CANDIDATES = 8  # windows for each one that is fitted
-CLUSTER = 2.0  # s of windows that are taken as one observation,
-FEWEST_CLUSTERS = 6  # of which there are so many, though, if there are as many windows
+CLUSTER, FEWEST_CLUSTERS = 2.0, 6  # s of windows that are taken as one observation, at least so many of them
 OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "mass", "k", "k_rotors", "drag"}
 OF_VELOCITY = {"drag", "aerodynamic_moment", "velocity_lag", "velocity_gain"}
 FORCE_STEPS = 5  # times as many steps have windows of forces, which no instability limits
@@ -56,7 +51,7 @@ class Identified(NamedTuple):
 
     Attributes:
         field: with the fitted parameters.
-        intervals: confidence interval of each parameter, number by number, by default of 95 %.
+        intervals: 95 % confidence interval of each parameter, number by number.
         errors: RMS of each quantity's channels over the windows, from the estimated initial states.
         windows: how many were fitted.
         seconds: length of all windows [s].
@@ -89,9 +84,6 @@ def identify(
     *,
     free: Sequence[str] | None = None,
     known: Float[np.ndarray, "p p"] | None = None,
-    rounds: int = ROUNDS,
-    max_steps: int = 20,
-    level: float = 0.95,
 ) -> Identified:
     """Fit the learned parameters of the field's physics to recordings.
 
@@ -102,9 +94,6 @@ def identify(
         measured: quantities that are compared, by default all that every recording has.
         free: names of parameters that are fitted, such as k or efficiency[2], by default all; the others stay.
         known: the covariance of those that stay, to which the fitted ones owe a part of theirs; by default zero.
-        rounds: fits, each with channels weighted by the errors of the one before.
-        max_steps: of Levenberg–Marquardt in each round.
-        level: confidence of the intervals, between 0 and 1.
 
     Returns:
         A parameter that the windows do not tell has an infinite interval and stays as it was, as do those of
@@ -114,7 +103,6 @@ def identify(
         ValueError: of a recording that lacks something, or too few windows: name and what was expected.
     """
     layout = Layout() if layout is None else layout
-    checks.count("rounds", rounds)
     with jax.enable_x64(True):
         search, windows, root = _search(field, recordings, layout, measured, CANDIDATES * layout.most)
         moves, measurable = _moving(field, free, recordings)
@@ -124,8 +112,8 @@ def identify(
         if len(own) > layout.most:
             kept = _telling(search.equations(theta, own), p, layout.most, moves & measurable)
             search, windows, own = search.part(kept), jax.tree.map(lambda part: part[kept], windows), own[kept]
-        for _ in range(rounds):
-            options = {"free": moves & measurable, "least": NO_EFFECT, "max_steps": max_steps, "tolerance": TOLERANCE}
+        options = {"free": moves & measurable, "least": NO_EFFECT, "max_steps": MAX_STEPS, "tolerance": TOLERANCE}
+        for _ in range(ROUNDS):
             theta, own, equations, _, status = descend(search.equations, theta, own, **options)
             search = search.weighted(search.errors(theta, own))
             variance = jnp.diagonal(inverses(equations.gram[:, p:, p:]).matrix, axis1=1, axis2=2)
@@ -139,7 +127,7 @@ def identify(
         covariance = _covariance(equations, cluster, moves, known, measurable)
         found, last = search.model(theta).field.field, search.errors(theta, own)
         shares = _explained(search, theta, own)
-        intervals = uncertainty.intervals(found, covariance, level, max(1, -(-len(own) // cluster) - 1))
+        intervals = uncertainty.intervals(found, covariance, degrees=max(1, -(-len(own) // cluster) - 1))
     errors = {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in last.items()}
     intervals = {name: _widened(name, interval, shares) for name, interval in intervals.items()}
     span = layout.dt * layout.steps * len(own)
@@ -178,10 +166,9 @@ def identify_in_turn(
 ) -> Identified:
     """First what makes the thrust, from the accelerometer; then, given that, what turns the vehicle, from the gyro.
 
-    An error of the torques, such as the delay of a filtered gyro, then cannot bend the thrust curve and the lag.
-    Windows of forces are `FORCE_STEPS` times as long. The result has the intervals of both; the second ones hold the
-    uncertainty of the first. For errors see `identify`, which does all at once where one of the two has no parameter or
-    no sensor.
+    An error of the torques, such as the delay of a filtered gyro, then cannot bend the thrust curve and the lag. The
+    second intervals hold the uncertainty of the first. Where one of the two has no parameter or no sensor, this is
+    `identify`. Windows of forces are `FORCE_STEPS` times as long.
 
     Args:
         field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
@@ -191,18 +178,15 @@ def identify_in_turn(
     layout = Layout() if layout is None else layout
     theta = {*dict(_names(field))}
     force, torque = tuple(theta & OF_FORCE), tuple(theta - OF_FORCE)
-    signals = [each.signals.keys() for each in recordings]
-    if not force or not torque or not all({"specific_force", "rates"} <= each for each in signals):
+    sensed = all({"specific_force", "rates"} <= each.signals.keys() for each in recordings)
+    if not (force and torque and sensed):
         return identify(field, recordings, layout)
     long = replace(layout, steps=layout.steps * FORCE_STEPS, most=max(layout.most // 2, 1), disturbance=(0.0,) * 6)
     first = identify(field, recordings, long, ("specific_force",), free=force)
     second = identify(first.field, recordings, layout, ("rates",), free=torque, known=first.covariance)
     own = {name: value for name, value in first.intervals.items() if name.partition("[")[0] in force}
-    return second._replace(
-        intervals=second.intervals | own,
-        errors=first.errors | second.errors,
-        status=max(first.status, second.status),
-    )
+    both = {"intervals": second.intervals | own, "errors": first.errors | second.errors}
+    return second._replace(**both, status=max(first.status, second.status))
 
 
 @entry
@@ -212,7 +196,7 @@ def prediction_errors(
     layout: Layout | None = None,
     measured: Sequence[str] = (),
 ) -> dict[str, Float[np.ndarray, "n t k"]]:
-    """y − ŷ of every window, predicted from the state that the samples before it tell; NaN where there is no y.
+    """y − ŷ of every window, from the state that the samples before it tell; NaN where there is no y.
 
     Args:
         field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
@@ -229,11 +213,10 @@ def prediction_errors(
 
 
 def _telling(equations: NormalEquations, p: int, most: int, moves) -> Int[np.ndarray, " most"]:
-    """Which windows are fitted: half of them tell most of the parameters, the others are spread evenly.
+    """Which windows are fitted: half have the greatest leverage tr G⁻¹ Gᵢ, the others are spread evenly.
 
-    Most is told by those of greatest leverage tr G⁻¹ Gᵢ, where Gᵢ is what a window tells at the start of the search,
-    and G what all of them do. So a few seconds that alone tell a parameter are among them. What was measured has no
-    part in it. The other half stands for the whole, which a model that is wrong somewhere should fit on average.
+    Gᵢ is what a window tells at the start of the search, and G what all of them do, so a few seconds that alone tell a
+    parameter are among them. The others stand for the whole, which a model that is wrong should fit on average.
     """
     gram = masked(reduced(equations, p).equations, moves).gram
     leverage = jnp.einsum("pq,nqp->n", inverse(jnp.sum(gram, axis=0)).matrix, gram)
@@ -277,8 +260,7 @@ def _explained(search: Search, theta, own) -> np.ndarray:
 def _widened(name: str, interval: Interval, shares) -> Interval:
     """An interval that holds both regressions, of torque on acceleration and the other way round.
 
-    Noise in the one that explains shrinks a coefficient, to R² of the other at most (Frisch 1934; Klepper and Leamer
-    1984). Which of the two is right a log does not say, as commands follow from what was measured.
+    Noise in the one that explains shrinks a coefficient, to R² of the other at most (Klepper and Leamer 1984).
     """
     value, low, high = map(np.asarray, interval)
     share = np.asarray(shares[AXES_OF[name]]) if name in AXES_OF else np.ones(())
@@ -294,10 +276,7 @@ def _names(field) -> list[tuple[str, str]]:
 
 
 def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
-    """Which numbers of θ are fitted, and which are not of a velocity that no recording measures.
-
-    Windows would tell those by chance.
-    """
+    """Which numbers of θ are fitted, and which are not of a velocity that no recording measures."""
     own = _names(field)
     for name in free or ():
         if name.partition("[")[0] not in dict(own):
@@ -308,14 +287,10 @@ def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) 
 
 
 def _covariance(equations: NormalEquations, cluster: int, moves, known, measurable) -> Array:
-    """The sandwich of `uncertainty`, with windows clustered; infinite for what has no effect.
-
-    To it comes what follows from the uncertainty of known parameters: S C Sᵀ with S = −H⁻¹ ∂g/∂known (delta method).
-    """
+    """The sandwich with windows clustered, and S C Sᵀ of known parameters with S = −H⁻¹ ∂g/∂known; ∞ of no effect."""
     gram = np.asarray(equations.gram.sum(axis=0))
     seen = (np.diagonal(gram) > NO_EFFECT) & moves & measurable
-    found = np.zeros_like(gram)
-    both = np.ix_(seen, seen)
+    found, both = np.zeros_like(gram), np.ix_(seen, seen)
     found[both] = np.asarray(uncertainty.sandwich(masked(equations, seen), int(seen.sum()), cluster))[both]
     if known is not None:
         fixed = ~moves & np.isfinite(np.diagonal(known))

@@ -1,14 +1,13 @@
 """What commands may have done between two samples of a log that holds few of them.
 
-An autopilot sends hundreds of commands in a second, and by default PX4 logs ten of them. Between two samples a command
-is then the line between them plus a Brownian bridge: a random walk that is known at both ends. Its covariance is that
-of the changes from sample to sample. The bridge is its Karhunen–Loève series
+Between two samples a command is the line between them plus a Brownian bridge, with the covariance of the changes from
+sample to sample, here by its Karhunen–Loève series
 
     B(s) = √T L Σⱼ ξⱼ √2 sin(jπ s) / (jπ),   ξⱼ ~ N(0, 1),   L Lᵀ = cov(changes) / T,   0 ≤ s ≤ 1
 
-over an interval of T seconds. Predictions know the line only. What the bridge does to them is an error with a known
-covariance, B Bᵀ with B = ∂ŷ/∂ξ, by which the errors of a window are weighted (generalised least squares). Fitted as
-unknowns, like an initial state, the ξ would favour vehicles that turn at smaller ξ: inertias come out too small.
+over an interval of T seconds. Predictions know the line only; what the bridge does to them is an error of covariance
+B Bᵀ, B = ∂ŷ/∂ξ, by which the errors of a window are weighted (generalised least squares). Fitted as unknowns, like an
+initial state, the ξ would favour vehicles that turn at smaller ξ: inertias come out too small.
 """
 
 import numpy as np

@@ -1,9 +1,4 @@
-"""What a planned trajectory will tell of the parameters: the covariance of least squares, before any flight.
-
-A trajectory is cut into windows that touch. Least squares compares the samples of each with a rollout from its first
-sample (`hybrid_jax.adaptation.fit_least_squares`). So the noise of a first sample acts on the whole window, and that
-of a sample that two windows share on both.
-"""
+"""What a planned trajectory will tell of the parameters: the covariance of least squares, before any flight."""
 
 from typing import NamedTuple
 
@@ -49,6 +44,9 @@ def information_of(
 ) -> Information:
     """The information in a trajectory, cut into windows of `steps` intervals; what is left at its end is not used.
 
+    Windows touch, and each is compared with a rollout from its first sample. So the noise of a first sample acts on the
+    whole window, and that of a sample that two windows share on both.
+
     Args:
         x: the true states, one before each interval of `dt` [s] and one after the last.
         noise: standard deviation of the white noise on each state.
@@ -70,11 +68,3 @@ def information_of(
     alone = effects[:, :-1].reshape(-1, theta.size)
     shared = shared.reshape(-1, theta.size)
     return Information(jnp.einsum("ntdp,ntdq->pq", effects, effects), alone.T @ alone + shared.T @ shared)
-
-
-def told_apart(information: Information, free: Bool[Array, " p"], least: float) -> tuple[bool, Float[Array, " p"]]:
-    """Whether the free parameters are told apart, and how much each takes part in what is told least."""
-    gram = jnp.where(free & free[:, None], information.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
-    size = jnp.sqrt(jnp.diagonal(gram))
-    values, vectors = jnp.linalg.eigh(gram / (size[:, None] * size))
-    return bool(values[0] > least), jnp.abs(vectors[:, 0])

@@ -24,7 +24,7 @@ from hybrid_jax.dynamics.disturbance import sized
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
 from hybrid_jax.estimation.least_squares import ravel_parameters, rounding
 from hybrid_jax.estimation.uncertainty import named_parameters
-from hybrid_jax.planning.fisher_information import Information, information_of, told_apart
+from hybrid_jax.planning.fisher_information import Information, information_of
 from hybrid_jax.planning.input_designs import (
     RAMP,
     Coefficients,
@@ -123,12 +123,11 @@ def excitation(
         checks.count(name, value, least=int(name == "starts"))
     checks.count("seed", seed, least=0)
     states = STATE_SIZE if isinstance(design, FlatOutputs) else len(bounds.start)  # pyright: ignore
-    model, sizes = sized(model, states), _noise(noise, states)
+    model = sized(model, states)
     wanted = _wanted(model, parameters)
-    search = _Search(design, model, jnp.asarray(sizes), round(window / dt))
-    coarse = (
-        search if search.window % 2 else _Search(replace(design, dt=2 * dt), model, search.noise, search.window // 2)
-    )
+    search = coarse = _Search(design, model, jnp.asarray(_noise(noise, states)), round(window / dt))
+    if search.window % 2 == 0:
+        coarse = _Search(replace(design, dt=2 * dt), model, search.noise, search.window // 2)
     begun = _begun(search, starts, seed)
     asked, seen = _excited(search, begun, wanted)
     found = jnp.concatenate([begun, coarse.improved(begun, asked, seen, steps)])
@@ -275,9 +274,11 @@ def _excited(search: _Search, begun, wanted: tuple[str, ...]) -> tuple[Bool[Arra
     asked = jnp.asarray([name in wanted for name in names]) & seen
     if not asked.any():
         raise ValueError(f"parameters: no input excites any of {', '.join(wanted)}")
-    apart, shares = max((told_apart(one, seen, TOLD_APART) for one in each), key=lambda pair: pair[0])
-    if not apart:
-        alike = [name for name, share in zip(names, shares, strict=True) if share > 0.3]
+    grams = np.stack([np.where(np.outer(seen, seen), one.gram, np.diag(np.where(seen, 0.0, 1.0))) for one in each])
+    sizes = np.sqrt(np.diagonal(grams, axis1=1, axis2=2))
+    values, vectors = np.linalg.eigh(grams / (sizes[:, :, None] * sizes[:, None]))
+    if not (values[:, 0] > TOLD_APART).any():
+        alike = [name for name, share in zip(names, np.abs(vectors[0, :, 0]), strict=True) if share > 0.3]
         raise ValueError(f"parameters: no input tells {' and '.join(alike)} apart; learn one of them")
     return asked, seen
 
