@@ -1,4 +1,4 @@
-"""Figures of the paper's experiments: scores and θ_p against N (Figs. 3 and 5), methods ranked (Table 2), ablations."""
+"""Figures of the paper's experiments: scores against N (Figs. 3 and 5), methods ranked (Table 2), ablations."""
 
 import math
 from collections import defaultdict
@@ -13,20 +13,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments.paper.claims import THETA_TOLERANCE
-from experiments.paper.lanes import MODELS, THETA, Cell, adapted_sizes, by_domain, cells, gain, method_label, ranked
-from experiments.paper.tables import UNITS, value_label
+from experiments.paper.lanes import MODELS, Cell, adapted_sizes, by_domain, cells, gain, method_label, ranked
+from experiments.paper.tables import value_label
 from experiments.reporting import plots
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.plots import DRAWABLE, PAGE, STYLE, Line, colour, note, subplots
-from experiments.reporting.results import Column, Results, Row
+from experiments.reporting.results import Column, Results
 
 DASHES = {FINE_TUNED: "-", TARGET_ONLY: "--", SOURCE_ONLY: ":"}
 MARKERS = {FINE_TUNED: "o", TARGET_ONLY: "s", SOURCE_ONLY: ""}
 # What lies beyond these is marked at the edge of its panel, so that one failed run does not flatten the rest.
 LOWEST_RHO = -1.0
 DECADES = 6  # of error, from the smallest mean up
-LARGEST_BIAS = 100.0  # % of a parameter
 HOME, FLOOR = "hybrid before the change", "no model can do better"  # errors on source flights, and of every model
 
 
@@ -60,58 +58,24 @@ def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     right.axhline(0.0, color="0.4", linestyle=":")
     right.set(ylabel="gain ρ (1 is perfect, ▽: off the scale)")
     _draw(right, gains, max(LOWEST_RHO, min([*lows, 0.0])) - 0.1, 1.08, lost_at_top=False)
-    for axes in (left, right):
-        _name_sizes(axes, rows)
-    return _legend(figure, title, [*errors, *gains])
-
-
-def _name_sizes(axes: Axes, rows: Results) -> None:
     sizes = adapted_sizes(rows)
-    axes.set_xlabel("N, target trajectories trained on")
-    axes.set_xticks(sizes, [str(n) for n in sizes])
-
-
-def _legend(figure: Figure, title: str, drawn: Sequence[tuple[str, str]]) -> Figure:
-    """Colours of the models, then lines of the ways to train them."""
-    models, modes = (dict.fromkeys(key[i] for key in drawn) for i in (0, 1))
+    for axes in (left, right):
+        axes.set_xlabel("N, target trajectories trained on")
+        axes.set_xticks(sizes, [str(n) for n in sizes])
+    # Colours of the models, then lines of the ways to train them.
+    models, modes = (dict.fromkeys(key[i] for key in errors) for i in (0, 1))
     entries: dict[str, Artist] = {
         label(model).replace("θ_p", r"$\theta_p$"): Line2D([], [], color=colour(model), linewidth=4) for model in models
     }
     style = {"color": "0.2", "markersize": 4}
     entries |= {label(mode): Line2D([], [], ls=DASHES[mode], marker=MARKERS[mode], **style) for mode in modes}
     # Lines of no model: words beside them would lie on other lines.
-    others = {str(line.get_label()): line for axes in figure.axes for line in axes.get_lines()}
+    others = {str(line.get_label()): line for line in left.get_lines()}
     entries |= {name: others[name] for name in (HOME, FLOOR) if name in others}
     figure.suptitle(title)
-    figure.legend(
-        entries.values(), entries.keys(), loc="outside lower center", ncols=4, title="mean and std over seeds"
-    )
+    about = {"loc": "outside lower center", "ncols": 4, "title": "mean and std over seeds"}
+    figure.legend(entries.values(), entries.keys(), **about)
     return figure
-
-
-@mpl.rc_context(STYLE)
-def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
-    """Ix, Iy and k relative to the truth, none of them 0, against N; mean ± std over seeds."""
-    known = rows.where(lambda row: row["theta"] is not None, mode=(FINE_TUNED, TARGET_ONLY))
-    figure, (panels,) = subplots((PAGE, 3.2), 1, len(THETA))
-    tolerance, drawn = 100 * THETA_TOLERANCE, []
-    for axes, name in zip(panels, THETA, strict=True):
-
-        def bias(row: Row, name: str = name) -> float:
-            value = row["theta"][name]
-            return math.inf if value is None else 100 * (value / truth[name] - 1)
-
-        curves = _curves(known, bias)
-        drawn += curves
-        axes.axhspan(-tolerance, tolerance, color="0.92", zorder=0)
-        axes.axhline(0.0, color="black", linewidth=1)
-        ends = np.concatenate([np.abs(curve.mean) + curve.std for curve in curves.values()])
-        reach = 1.15 * max(min(LARGEST_BIAS, max(ends[np.isfinite(ends)], default=0.0)), tolerance)
-        _draw(axes, curves, -reach, reach)
-        axes.set(title=f"{name}, true value {truth[name]:.4g} {UNITS[name]}")
-        _name_sizes(axes, known)
-    panels[0].set_ylabel("recovered / true − 1  [%]")
-    return _legend(figure, "Physical parameters after training; grey: within 5 % of the truth", drawn)
 
 
 def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProxyType({})) -> Figure:

@@ -10,14 +10,14 @@ from rich.console import Console
 
 from experiments.paper.claims import COMPARISON, claims
 from experiments.paper.config import AdaptationConfig, Config
-from experiments.paper.figures import scores, theta
+from experiments.paper.figures import scores
 from experiments.paper.flight_figures import example_flight, predictions
 from experiments.paper.lanes import BANDS, BASELINES, bands, by_domain, save_models
 from experiments.paper.study import Study, study
 from experiments.paper.tables import altitudes, by_size, conclusion, meaning, parameters, ranking, run_notes
 from experiments.reporting import names
 from experiments.reporting.claims import verdict_table
-from experiments.reporting.names import FINE_TUNED, NO_PHYSICS, PHYSICS_ONLY, label
+from experiments.reporting.names import FINE_TUNED, PHYSICS_ONLY, label
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
@@ -37,12 +37,6 @@ FLIGHT_SECONDS = 11.0
 DRAWN_FLIGHTS = 200  # the test flights whose predictions are drawn
 FLOOR = "wind_sine_mse"  # the key of report.json for the share of L^T_MSE that is the wind's sine
 PAPER = "Osaka, Takeishi, Yairi, *Domain Adaptation with Hybrid Modeling for Learning Dynamical Systems*, ACML 2025"
-QUESTIONS = {
-    "param_shift": "A quadrotor's moments of inertia Ix and Iy have changed (Sec. 4.4 of the paper).",
-    "external_force": "A wind now pushes the quadrotor: a steady force and a slow sine (Sec. 4.5 of the paper).",
-    COMPARISON: "A quadrotor's moments of inertia have changed, or a wind pushes it; several methods adapt to each, "
-    "tested on windows of 0.1 s (Sec. 4.7 and Table 2 of the paper, and baselines that the paper does not have).",
-}
 RATE_NOTE = (
     "C8 and C10 depend on the rate of θ_p in fine-tuning, --rates.physics-fine-tuning, an option whose "
     "value in the paper we could not confirm. The mean error with N = 100 over that with 1000 is 1.22 with 1e-1, "
@@ -80,7 +74,7 @@ def adapt_and_report(experiment: str, domain: Domain, floor: float, config: Adap
         return
     out, truth, rows = config.out / experiment, nominal(domain.vehicle), found.rows
     save_models(out / "models", found.lanes, rows)
-    figures = save_figures(out, draw(domain, config, found, truth, floor))
+    figures = save_figures(out, draw(domain, config, found, floor))
     lowest = bands(found.target.splits["test"])
     counted = ", ".join(f"{np.sum(lowest == i)} {band}" for i, band in enumerate(BANDS.values()))
     notes = [*found.notes, f"Test windows by lowest altitude: {counted}."]
@@ -129,8 +123,8 @@ def introduction(experiment: str, rows: Results) -> str:
     baselines = ", or of the source-only hybrid for a method that adapts it" if seen & {*BASELINES} else ""
     parts = [
         f"# {experiment}",
-        f"{QUESTIONS.get(experiment, '')} How well can a model trained on flights from before the change predict "
-        f"flights after it, given a little new flight? Question and protocol are those of {PAPER}.",
+        "How well can a model trained on flights from before a quadrotor changed predict flights after it, given a "
+        f"little new flight? Question and protocol are those of {PAPER}.",
         f"{len(rows)} trained models: N of {sizes} target trajectories, {over_seeds(rows)} each{where}.",
         "\n".join(f"- **{label(name)}**: {about}" for name, about in ABOUT.items() if name in seen),
         "L^T_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² is the test MSE on flights from after the change, x̂ integrated from the "
@@ -140,10 +134,8 @@ def introduction(experiment: str, rows: Results) -> str:
     return "\n\n".join(parts)
 
 
-def draw(
-    domain: Domain, config: AdaptationConfig, found: Study, truth: dict[str, float], floor: float
-) -> dict[str, tuple[Figure, str]]:
-    """Figs. 2/4, 3/5, 7 and the recovered parameters, with captions, by name."""
+def draw(domain: Domain, config: AdaptationConfig, found: Study, floor: float) -> dict[str, tuple[Figure, str]]:
+    """Figs. 2/4, 3/5 and 7, with captions, by name."""
     title = label(domain.name).capitalize()
     flight = random_flights(domain, 1, FLIGHT_SECONDS, jax.random.key(config.data_seed))
     example = example_flight(np.asarray(flight.states[0]), np.asarray(flight.inputs[0]), DT)
@@ -152,8 +144,6 @@ def draw(
         "scores": (scores(found.rows, title, floor), f"Test error and gain against N (paper, Figs. 3, 5). {lines}"),
         "example_flight": (example, "A flight like those of the data (paper, Fig. 7)"),
     }
-    if {*config.models} - {NO_PHYSICS}:
-        figures["theta"] = theta(found.rows, truth), "Physical parameters after training, against the truth"
     if {*config.models} - {PHYSICS_ONLY}:
         figures["predictions"] = paths(title, found), "How predictions part from the truth (paper, Figs. 2, 4)"
     return figures

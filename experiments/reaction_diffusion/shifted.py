@@ -5,7 +5,6 @@ from itertools import product
 from typing import Any
 
 import jax
-import numpy as np
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import Config
@@ -15,7 +14,6 @@ from experiments.reaction_diffusion.systems import COARSE, A, B, K, fitzhugh_nag
 from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, NO_PHYSICS, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Row
 from experiments.runner.stages import Found, Kept, rows_of
-from hybrid_jax.dynamics.disturbance import physics_of, without_disturbance
 
 PART, AUTO = "shifted", "auto"
 SOURCE, TARGET, TEST = 20, 21, 22  # first numbers of the seeds of data
@@ -99,7 +97,7 @@ def targets(config: Config, shift: str, seed: int) -> hj.Trajectories:
 def adapted(config: Config, source, error_before: float, shift: str, model: str, n: int, seed: int) -> Found:
     """The rows of a source that is adapted to N trajectories in each way."""
     data, test = targets(config, shift, seed)[:n], tested(config, shift)
-    chosen = {}
+    chosen = dict[str, str | None]()
     fields = {
         FINE_TUNED: learned(source, data, min(TUNING, config.steps)),
         TARGET_ONLY: learned(untrained(model, config, seed), data, min(SCRATCH, config.steps)),
@@ -110,16 +108,10 @@ def adapted(config: Config, source, error_before: float, shift: str, model: str,
     errors = {mode: error(field, test, COARSE) for mode, field in fields.items()}
     return [
         _tags(shift, model, seed)
-        | {"mode": mode, "n": n, "mse": mse, "rho": 1 - mse / error_before}
-        | {"chosen": chosen.get(mode), "diffusivity": _diffusivity(fields[mode])}
+        | {"mode": mode, "n": n, "mse": mse, "rho": 1 - mse / error_before, "chosen": chosen.get(mode)}
         for mode, mse in errors.items()
     ], {}
 
 
 def _tags(shift: str, model: str, seed: int) -> dict[str, Any]:
     return {"part": PART, "shift": shift, "model": model, "seed": seed, "draw": 0}
-
-
-def _diffusivity(field) -> list[float] | None:
-    theta = getattr(physics_of(without_disturbance(field)), "theta", None)
-    return None if theta is None else np.asarray(theta()["diffusivity"]).tolist()

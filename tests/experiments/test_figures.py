@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from reports import ODD_ROWS, SIZES, TRUTH, changed, make_rows
+from reports import ODD_ROWS, SIZES, changed, make_rows
 from test_ranking import compared_rows, spoilt
 
-from experiments.paper.figures import ranking, scores, theta
+from experiments.paper.figures import ranking, scores
 from experiments.paper.flight_figures import example_flight, predictions, tilt
-from experiments.reporting.plots import COLOURS, LARGEST_RATIO, save_figures
+from experiments.reporting.plots import LARGEST_RATIO, save_figures
 
 
 def straight_flight(steps=10):
@@ -102,14 +102,6 @@ def test_failed_methods_are_marked_at_the_edge_of_the_ranking():
     assert words == ["3 of 3 beyond, mean 5e+06", "2 of 3 not finite", "3 of 3 not finite"]
 
 
-def test_theta_is_relative_to_the_truth_in_percent():
-    rows = make_rows(theta={"Ix": 0.0404, "Iy": 0.0196, "k": 8.5e-6})
-    for axes, bias in zip(theta(rows, TRUTH).axes, (1.0, -2.0, 0.0), strict=True):
-        curve = next(line for line in axes.lines if line.get_label() == "hybrid, fine-tuned")
-        assert curve.get_ydata() == pytest.approx([bias] * 3, abs=1e-9)
-        assert curve.get_color() == COLOURS["hybrid"]
-
-
 def test_predictions_show_quantiles_of_flights_and_one_flight_from_above():
     truth = np.stack([straight_flight()] * 5)
     near, off, lost = truth.copy(), truth.copy(), truth.copy()
@@ -137,10 +129,8 @@ def test_tilt_is_the_angle_of_roll_and_pitch_alone():
 def test_any_rows_are_drawn(rows, floor):
     compared = rows
     rows = rows.where(domain="parameter_shift")
-    known = rows.where(lambda row: row["theta"] and row["mode"] != "source_only")
     drawn = (
         (rows, lambda: scores(rows, "Scores", floor)),
-        (known, lambda: theta(rows, TRUTH)),
         (compared, lambda: ranking(compared, "Ranking", {"external_force": floor})),
     )
     for enough, draw in drawn:
