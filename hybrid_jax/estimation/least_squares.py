@@ -221,7 +221,8 @@ def fit_and_linearise(
     def linearised(theta: Theta):
         if weigh is None:
             return (_triangle if len(windows) > MANY else _linearised)(errors, theta, windows)
-        return jax.jacfwd(lambda theta: 2 * (weigh(jax.vmap(partial(errors, theta))(windows)),), has_aux=True)(theta)
+        own = weigh
+        return jax.jacfwd(lambda theta: 2 * (own(jax.vmap(partial(errors, theta))(windows)),), has_aux=True)(theta)
 
     def theta_at(z: Theta, unit: Theta) -> Theta:
         return (start + unit * z).astype(start.dtype)
