@@ -57,26 +57,20 @@ def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVector
     }
     guess = config.guess if config.perturbed_by is None else config.perturbed_by
     forced = config.residual_outputs in FORCED
-    return jax.device_get(_fresh_fields(model, vehicle, guess, forced, network, np.arange(config.seeds)))
+    hybrid = jax.device_get(_fresh_hybrids(vehicle, guess, forced, network, np.arange(config.seeds)))
+    return {"hybrid": hybrid, "no_physics": hybrid.residual, "physics_only": hybrid.physics}[model]
 
 
 @jit_with(FASTEST_COMPILE)
-def _fresh_fields(
-    model: str,
-    vehicle: Vehicle,
-    guess: tuple[float, float] | float,
-    forced: bool,
-    options: Mapping[str, Any],
-    seeds: Int[np.ndarray, " n"],
-) -> AbstractVectorField:
+def _fresh_hybrids(
+    vehicle: Vehicle, guess: tuple[float, float] | float, forced: bool, options: Mapping[str, Any], seeds: np.ndarray
+) -> Hybrid:
     def build(seed):
         if isinstance(guess, tuple):
             physics = perturbed(vehicle, _key(seed, PHYSICS), low=guess[0], high=guess[1])
         else:
             physics = perturbed_by(vehicle, _key(seed, PHYSICS), guess)
-        physics = replace(physics, wrench=forced)
-        network = make_residual(_key(seed, NETWORK), vehicle=vehicle, **options)
-        return {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
+        return Hybrid(replace(physics, wrench=forced), make_residual(_key(seed, NETWORK), vehicle=vehicle, **options))
 
     return eqx.filter_vmap(build)(seeds)
 
