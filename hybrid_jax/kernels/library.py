@@ -1,5 +1,8 @@
 """A library of C++ that XLA calls: compiled by GCC at first use, kept in the user's cache folder, checked and loaded.
 
+GCC works while XLA compiles what calls the library; the first call waits for it. So results do not depend on when it is
+there, and a run that is resumed goes on as it began.
+
 What is kept is code, so the folder must be the user's alone, and a library that is not as it was written is compiled
 anew. HYBRID_JAX_NATIVE=0 switches kernels off; `obstacle` tells what else does.
 """
@@ -7,6 +10,7 @@ anew. HYBRID_JAX_NATIVE=0 switches kernels off; `obstacle` tells what else does.
 import contextlib
 import ctypes
 import hashlib
+import itertools
 import os
 import shutil
 import stat
@@ -30,6 +34,7 @@ HANDLERS = "forward", "backward"
 # Errors and exceptions of the square root are not asked for: without them several are taken at once.
 OPTIONS = ["-std=c++17", "-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
 LONGEST = 300  # s to compile
+CHECKSUM = 32  # bytes
 
 Results = jax.ShapeDtypeStruct | Sequence[jax.ShapeDtypeStruct]
 _LOCK = threading.Lock()  # programs are traced in several threads
@@ -53,11 +58,7 @@ def obstacle() -> str | None:
 
 
 def compiled(source: str, needs_math: bool) -> str:
-    """What the names of XLA's targets begin with of a source, which is compiled and registered, if need be.
-
-    Raises:
-        Unusable: it could not be compiled, or not be kept.
-    """
+    """What the names of XLA's targets of a source begin with, once it is compiled and registered; else Unusable."""
     with _LOCK:
         return _registered(source, needs_math)
 
@@ -95,17 +96,46 @@ def _compiler() -> str | None:
 
 @cache
 def _registered(source: str, needs_math: bool) -> str:
-    digest = _digest(source)
-    begin = f"hybrid_jax_{digest}_"
+    """Registers the library if it is there, else doors to it, behind which it is compiled."""
+    begin = f"hybrid_jax_{_digest(source)}_"
+    handlers = HANDLERS if "#define TRAINING 1" in source else HANDLERS[:1]
     try:
-        library = ctypes.CDLL(str(_checked_library(digest, source, needs_math)))
+        doors, places = _doors(), [next(_PLACES) for _ in handlers]
+        whole = _is_whole(_folder() / f"{_digest(source)}.so") or not doors.door_at(places[-1])
+        found = _addresses(source, needs_math, handlers) if whole else [doors.door_at(place) for place in places]
     except OSError as error:
         raise Unusable(f"they could not be kept, or not be loaded: {error}") from error
-    for handler in HANDLERS:
-        if hasattr(library, handler):
-            target = jax.ffi.pycapsule(getattr(library, handler))
-            jax.ffi.register_ffi_target(begin + handler, target, platform="cpu")
+    for handler, address in zip(handlers, found, strict=True):
+        jax.ffi.register_ffi_target(begin + handler, jax.ffi.pycapsule(address), platform="cpu")
+    if not whole:
+        threading.Thread(target=_open, args=(doors, places, source, needs_math, handlers), daemon=True).start()
     return begin
+
+
+def _open(doors: ctypes.CDLL, places: Sequence[int], source: str, needs_math: bool, handlers: Sequence[str]) -> None:
+    behind = (ctypes.c_void_p * (places[-1] + 1)).in_dll(doors, "behind")
+    try:
+        found = _addresses(source, needs_math, handlers)
+    except (OSError, Unusable):  # then whoever waits must not wait on
+        found = [ctypes.cast(doors.refuse, ctypes.c_void_p).value for _ in handlers]
+    for place, address in zip(places, found, strict=True):
+        behind[place] = address
+
+
+def _addresses(source: str, needs_math: bool, handlers: Sequence[str]) -> list[int | None]:
+    library = ctypes.CDLL(str(_checked_library(_digest(source), source, needs_math)))
+    return [ctypes.cast(getattr(library, one), ctypes.c_void_p).value for one in handlers]
+
+
+@cache
+def _doors() -> ctypes.CDLL:
+    source = (SOURCES / "doors.cc").read_text()
+    doors = ctypes.CDLL(str(_checked_library(_digest(source), source, needs_math=False)))
+    doors.door_at.restype = ctypes.c_void_p
+    return doors
+
+
+_PLACES = itertools.count()
 
 
 def _digest(source: str) -> str:
@@ -137,55 +167,37 @@ def _checked_library(digest: str, source: str, needs_math: bool) -> Path:
     library = _folder() / f"{digest}.so"
     if not _is_whole(library):
         _compile(library, source, needs_math)
-    for path in (library, _checksum(library)):
-        path.touch()  # it was used
+    library.touch()  # it was used
     return library
 
 
 def _is_whole(library: Path) -> bool:
-    try:
-        return _checksum(library).read_text() == hashlib.sha256(library.read_bytes()).hexdigest()
-    except (OSError, UnicodeDecodeError):
-        return False
-
-
-def _checksum(library: Path) -> Path:
-    return library.with_suffix(".sha256")
+    """Whether the checksum at its end, which loaders do not read, is that of the rest."""
+    content = library.read_bytes() if library.exists() else b""
+    return content[-CHECKSUM:] == hashlib.sha256(content[:-CHECKSUM]).digest()
 
 
 def _compile(library: Path, source: str, needs_math: bool) -> None:
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         (text := Path(folder) / "field.cc").write_text(source)
         include = [f"-I{jax.ffi.include_dir()}", f"-I{SOURCES}"]
         linked = Path(folder) / library.name
         _run_compiler(["-shared", *include, str(text), *["-lmvec"] * needs_math, "-o", str(linked)])
-        content = linked.read_bytes()
-    _write(library, content)
-    _write(_checksum(library), hashlib.sha256(content).hexdigest().encode())
-    _delete_unused(library.parent)
+        with linked.open("r+b") as file:
+            file.write(hashlib.sha256(file.read()).digest())
+            file.flush()
+            os.fsync(file.fileno())  # there whole or not at all, also after a power cut
+        os.replace(linked, library)
+    for path in library.parent.glob("*"):  # of other sources or compilers, and what a kill left half written
+        with contextlib.suppress(FileNotFoundError):  # deleted by another process
+            if time.time() - path.stat().st_mtime > runtime.UNUSED:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _run_compiler(arguments: list[str]) -> None:
     command = [_compiler() or "g++", *OPTIONS, *arguments]
     try:
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=LONGEST)
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=LONGEST, start_new_session=True)
     except subprocess.SubprocessError as error:
         said = [line for line in (getattr(error, "stderr", None) or "").splitlines() if "error" in line]
         raise Unusable(f"it could not be compiled: {(said or [f'{command[0]} fails'])[0]}") from error
-
-
-def _write(path: Path, content: bytes) -> None:
-    """A file that is there whole or not at all, also after a power cut."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", suffix=".part", delete=False) as part:
-        part.write(content)
-        part.flush()
-        os.fsync(part.fileno())
-    os.replace(part.name, path)
-
-
-def _delete_unused(folder: Path) -> None:
-    """Delete libraries of other sources or compilers, and what a kill left half written."""
-    for path in folder.glob("*"):
-        with contextlib.suppress(FileNotFoundError):  # deleted by another process
-            if time.time() - path.stat().st_mtime > runtime.UNUSED:
-                path.unlink()
