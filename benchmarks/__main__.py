@@ -13,14 +13,14 @@ from rich.console import Console
 from benchmarks.timing import BAD_INPUT, Ratio, check_file, ratio_table
 from hybrid_jax.io.files import json_text, read_json, write_atomic
 
-Benchmark = Literal["training_step", "rollout", "sweep", "grids"]
+Benchmark = Literal["sweep", "grids"]
 PEERS = "training_peers"
 
 
 @dataclass(frozen=True)
 class Options:
     """Run every benchmark in its own process and print one table of ratios: a few minutes on two idle cores.
-    `python -m benchmarks.rollout --help` describes what a benchmark measures.
+    `python -m benchmarks.sweep --help` describes what a benchmark measures.
     """
 
     preset: Literal["full", "smoke"] = "full"
@@ -30,8 +30,8 @@ class Options:
     only: tuple[Benchmark, ...] = get_args(Benchmark)
     """Which benchmarks to run."""
     peers: bool = False
-    """Also run training_peers, which compares with PyTorch on one core: some five minutes more, mostly in
-    `torch.compile`. Libraries that are not installed are skipped: pip install -e '.[peers]'."""
+    """Also run training_peers, a gradient step beside plain JAX and PyTorch on one core: some five minutes more, mostly
+    in `torch.compile`. Libraries that are not installed are skipped: pip install -e '.[peers]'."""
 
 
 def measured(name: str, preset: str) -> dict[str, Any]:

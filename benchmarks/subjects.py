@@ -6,13 +6,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.grids import Grid, diffusion
 from hybrid_jax.dynamics.rigid_body import perturbed, rigid_body
+from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.networks.grids import grid_network
 from hybrid_jax.networks.mlp import InputScaling, residual_network
-from hybrid_jax.sweep.lanes import lane, stack
+from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config
 from hybrid_jax.training.loss import REGULARISERS
@@ -21,6 +25,7 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 Model = Literal["hybrid", "no_physics", "physics_only"]
+SUBJECTS = "paper", "vehicle", "pendulum", "car", "pde"
 DT = 0.01  # s
 BATCH = 100
 SETTINGS = Settings(BATCH, REGULARISERS["trajectory_correlation"])
@@ -49,9 +54,61 @@ def training_runs(
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(begin))(jnp.arange(runs))), stack([plan] * runs)
 
 
-def training_run(model: Model, windows: int, hidden: int = 64) -> tuple[FitState, RunConfig]:
-    """One of them."""
-    return lane(training_runs(model, 1, windows, hidden=hidden), 0)
+class Pendulum(AbstractVectorField):
+    """README's: x = (angle [rad], rate [rad/s]), u = (acceleration [rad/s²],)."""
+
+    log_length: Array
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1], u[0] - 9.81 / jnp.exp(self.log_length) * jnp.sin(x[0])])
+
+
+class Car(AbstractVectorField):
+    """A single-track car: x = (X, Y, yaw, v_x, v_y, yaw rate), u = (steering [rad], acceleration [m/s²])."""
+
+    log_front: Array  # of the cornering stiffness over the nominal one
+    log_rear: Array
+
+    def __call__(self, x, u):
+        _, _, yaw, v, side, rate = x
+        mass, inertia, front, rear, stiffness = 1500.0, 2500.0, 1.2, 1.6, 8e4
+        ahead = stiffness * jnp.exp(self.log_front) * (u[0] - jnp.arctan2(side + front * rate, v))
+        behind = -stiffness * jnp.exp(self.log_rear) * jnp.arctan2(side - rear * rate, v)
+        moving = [v * jnp.cos(yaw) - side * jnp.sin(yaw), v * jnp.sin(yaw) + side * jnp.cos(yaw), rate]
+        along = u[1] - ahead * jnp.sin(u[0]) / mass + side * rate
+        across = (ahead * jnp.cos(u[0]) + behind) / mass - v * rate
+        return jnp.stack([*moving, along, across, (front * ahead * jnp.cos(u[0]) - rear * behind) / inertia])
+
+
+def subject(name: str, windows: int, intervals: int) -> tuple[Any, Any, RunConfig, Trajectories]:
+    """The arguments of a gradient step of one of SUBJECTS: a hybrid, Adam's state, a plan and windows."""
+    rng, key, zero = np.random.default_rng(0), jax.random.key(0), jnp.zeros(())
+    x0, u = make_flights(windows, intervals)
+    if name == "pendulum":
+        physics, d, m, hidden = Pendulum(zero), 2, 1, 16
+        x0, u = rng.normal(size=(windows, d)), rng.normal(size=(windows, intervals, m))
+    elif name == "car":
+        physics, d, m, hidden = Car(zero, zero), 6, 2, 16
+        x0, u = rng.normal(size=(windows, d)), 0.1 * rng.normal(size=(windows, intervals, m))
+        x0[:, 3] += 15
+    else:
+        learn = ("Ix", "Iy", "k", "drag")  # as a vehicle file has by default, and drag
+        physics, d, m, hidden = rigid_body(IRIS, learn, Terms(drag=(0.3, 0.3, 0.2))), 13, 4, 32
+    scaling = SCALING if name == "vehicle" else InputScaling()
+    network = residual_network(d, m, key, hidden=hidden, norm="none", activation="tanh", scaling=scaling)
+    field: Any = Hybrid(physics, network)
+    if name == "paper":
+        field = untrained("hybrid")
+    elif name == "pde":
+        grid = Grid((32,), 1 / 32, 2)
+        field = Hybrid(diffusion(grid, (1e-3, 5e-3)), grid_network(grid, 0, key, kernel=3, hidden=8))
+        x0, u = rng.random((windows, grid.size)), np.zeros((windows, intervals, 0))
+    x0, u = x0.astype(np.float32), u.astype(np.float32)
+    x = np.asarray(jax.jit(rollout_batch)(field, x0, u, DT))
+    x = x + 0.01 * rng.normal(size=x.shape).astype(np.float32)
+    rates: Any = Hybrid(1e-2, 1e-4)  # pyright: ignore[reportArgumentType]
+    plan = make_run_config(rates, np.arange(windows), windows, 100, 20, 2000, 1e-3)
+    return field, fitting.start(field, key).adam, plan, Trajectories(x0, u, x, DT)
 
 
 def make_flights(count: int, steps: int) -> tuple[np.ndarray, np.ndarray]:

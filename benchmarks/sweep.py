@@ -1,9 +1,9 @@
-"""Which width of a chunk of lanes is best on this backend, and what do lanes cost that have stopped?
+"""Which width of a chunk of lanes is best on this backend?
 
 Lanes train as in `hybrid_jax.sweep`. Measured is an epoch of one lane, copies included, for chunks of several widths,
 for one lane up to all, on one device and on all; `hybrid_jax.sweep.lanes.WIDTH` should be the best width for all lanes
-on all devices. Then a few lanes train alone, and among others that have stopped. Results must agree. On a CPU a device
-is not one core: its larger operations use all cores; set one core with taskset.
+on all devices. Results must agree. On a CPU a device is not one core: its larger operations use all cores; set one core
+with taskset.
 """
 
 from collections.abc import Callable
@@ -12,19 +12,17 @@ from functools import partial
 from typing import Any
 
 import jax
-import numpy as np
 from rich.table import Table
 
 from benchmarks.subjects import SETTINGS, Model, make_windows, training_runs
 from benchmarks.timing import Findings, Ratio, Times, agree, in_turns, run, stopwatch
-from hybrid_jax.sweep.lanes import WIDTH, LaneMap, lane
+from hybrid_jax.sweep.lanes import WIDTH, LaneMap
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState
 
 # Losses after some steps of Adam, which divides by small numbers, in float32 with sums in another order.
 AGREEMENT = 1e-3
-# What to reach: the cost of a lane among many over that of a few; the gain by each device; a stopped lane's cost.
-FLAT, SHARED, STOPPED = 1.15, 0.9, 0.05
+FLAT, SHARED = 1.15, 0.9  # to reach: the cost of a lane among many over that of a few; the gain by each device
 CLOSE = 1.05  # the default width's cost over the best width's
 
 
@@ -36,29 +34,29 @@ class Preset:
     one_device: bool  # whether to measure on one device too, not only on all
     widths: tuple[int, ...]
     lanes: tuple[int, ...]  # how many train, in rising order; every program is made for the last
-    active: int  # how many train among stopped ones
     n_train: int
     validation: int
     turns: int
 
 
 PRESETS = {
-    "full": Preset("hybrid", True, (1, 2, 5, 10), (1, 2, 5, 10, 50), active=5, n_train=500, validation=1000, turns=10),
-    "smoke": Preset("no_physics", False, (1, 2), (1, 2), active=1, n_train=100, validation=10, turns=2),
+    "full": Preset("hybrid", True, (1, 2, 5, 10), (1, 2, 5, 10, 50), n_train=500, validation=1000, turns=10),
+    "smoke": Preset("no_physics", False, (1, 2), (1, 2), n_train=100, validation=10, turns=2),
 }
 Program = Callable[[int], FitState]
 Place = tuple[int, int]  # devices, width
 
 
-def make_program(preset: Preset, lanes: int, devices: int, width: int) -> Program:
-    """One epoch of the first so many of `lanes` lanes, as `hybrid_jax.sweep` runs a block of epochs."""
+def make_program(preset: Preset, devices: int, width: int) -> Program:
+    """One epoch of the first so many lanes, as `hybrid_jax.sweep` runs a block of epochs."""
 
     def epoch(lane, train, validation):
         state, plan = lane
         return fitting.run(state, plan, train, validation, SETTINGS, state.epoch + 1)[0]
 
     mapped = LaneMap(epoch, width, jax.local_devices()[:devices])
-    start = lane(training_runs(preset.model, preset.lanes[-1], preset.n_train), np.arange(lanes))
+    lanes = preset.lanes[-1]
+    start = training_runs(preset.model, lanes, preset.n_train)
     shared = make_windows(preset.n_train, 10), make_windows(preset.validation, 10)
     return lambda active: mapped(start, shared, [1.0] * lanes, range(active))
 
@@ -75,7 +73,7 @@ def make_programs(preset: Preset) -> tuple[dict[Place, Program], dict[Place, flo
     widths = sorted({*preset.widths, default_width(preset)})
     programs, seconds, first = {}, {}, None
     for place in ((number, width) for number in devices for width in widths):
-        program = programs[place] = make_program(preset, total, *place)
+        program = programs[place] = make_program(preset, *place)
         states, seconds[place] = stopwatch(lambda program=program: program(total))
         first = states if first is None else first
         agree(f"losses on {place[0]} devices in chunks of {place[1]}", losses(states), losses(first), AGREEMENT)
@@ -85,18 +83,6 @@ def make_programs(preset: Preset) -> tuple[dict[Place, Program], dict[Place, flo
 def default_width(preset: Preset) -> int:
     """The width that a sweep takes unasked: a backend without a measured one takes all lanes at once."""
     return WIDTH.get(jax.default_backend(), preset.lanes[-1])
-
-
-def measure_stopped(preset: Preset, among: Program) -> dict[str, Any]:
-    """What each stopped lane adds, as a share of what an active one costs, at the default width on all devices."""
-    alone = make_program(preset, preset.active, jax.local_device_count(), default_width(preset))
-    calls = {"alone": partial(alone, preset.active), "among_stopped": partial(among, preset.active)}
-    lone, crowded = (losses(call()) for call in calls.values())
-    agree("losses among stopped lanes and alone", crowded, lone, AGREEMENT)
-    times = in_turns(calls, 3 * preset.turns)
-    stopped = preset.lanes[-1] - preset.active
-    share = (times.ratio("among_stopped", "alone") - 1) * preset.active / stopped
-    return {"active": preset.active, "stopped": stopped, "seconds": times.medians(), "stopped_share": share}
 
 
 def table_of(rows: list[dict[str, Any]]) -> Table:
@@ -130,7 +116,7 @@ def ratios_of(preset: Preset, times: Times, width: int, best: int) -> list[Ratio
 
 
 def measure(preset: Preset) -> Findings:
-    """Widths, then stopped lanes."""
+    """All widths."""
     programs, compiling = make_programs(preset)
     calls = {(*place, lanes): partial(program, lanes) for place, program in programs.items() for lanes in preset.lanes}
     times = in_turns(calls, preset.turns)
@@ -144,15 +130,13 @@ def measure(preset: Preset) -> Findings:
         }
         for (devices, width, lanes), seconds in times.medians().items()
     ]
-    stopped = measure_stopped(preset, programs[jax.local_device_count(), default_width(preset)])
     last = [row for row in rows if (row["devices"], row["lanes"]) == (rows[-1]["devices"], rows[-1]["lanes"])]
     best = min(last, key=lambda row: row["seconds_per_lane_epoch"])["width"]
     choice = {"backend": jax.default_backend(), "best_width": best, "default_width": default_width(preset)}
     widths = Table("backend", "best width", "hybrid_jax.sweep.lanes.WIDTH", title="all lanes on all devices")
     widths.add_row(*map(str, choice.values()))
-    idle = Ratio("a stopped lane / an active one", stopped["stopped_share"], at_most=STOPPED)
-    ratios = [*ratios_of(preset, times, choice["default_width"], best), idle]
-    return Findings([*rows, stopped, choice], [table_of(rows), widths], ratios)
+    ratios = ratios_of(preset, times, choice["default_width"], best)
+    return Findings([*rows, choice], [table_of(rows), widths], ratios)
 
 
 if __name__ == "__main__":

@@ -151,9 +151,14 @@ def agree(what: str, ours: PyTree, theirs: PyTree, tolerance: float) -> float:
     return worst
 
 
-def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Callable[[Any], Findings]) -> None:
-    """The command line: measure a preset, print, write. Bad input ends in one line on stderr and exit code 2."""
-    options = tyro.cli(Options, prog=f"python -m benchmarks.{name}", description=about)
+def run(
+    name: str, about: str | None, presets: Mapping[str, Any], measure: Callable[..., Findings], kind: type = Options
+) -> None:
+    """The command line: measure a preset, print, write. Bad input ends in one line on stderr and exit code 2.
+
+    Options of a kind beyond `Options` go to `measure` by name.
+    """
+    options = tyro.cli(kind, prog=f"python -m benchmarks.{name}", description=about)
     try:
         if options.preset not in presets:
             raise ValueError(f"--preset must be one of {', '.join(presets)}, got {options.preset!r}")
@@ -166,7 +171,8 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
     with TemporaryDirectory() as cache:
         configure(Path(cache))
         try:
-            findings = measure(presets[options.preset])
+            more = {key: value for key, value in vars(options).items() if key not in ("preset", "out")}
+            findings = measure(presets[options.preset], **more)
         except Disagreement as error:
             _end(name, error, DISAGREEMENT)
     seconds, console = time.perf_counter() - began, Console()

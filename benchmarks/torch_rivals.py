@@ -19,8 +19,10 @@ from hybrid_jax.dynamics.composition import Hybrid as OurHybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.dynamics.rigid_body import RigidBody as OurRigidBody
 from hybrid_jax.networks.mlp import ResidualNetwork
-from hybrid_jax.networks.normalisation import BatchNorm, InputScaling
+from hybrid_jax.networks.normalisation import BatchNorm, Bias, InputScaling
 from hybrid_jax.trajectories import Trajectories
+
+CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0])
 
 
 class RigidBody(nn.Module):
@@ -39,6 +41,10 @@ class RigidBody(nn.Module):
         self.register_buffer("torque_coefficient", torch.tensor(vehicle.torque_coefficient))
         self.register_buffer("gravity", torch.tensor([0.0, 0.0, -vehicle.gravity]))
         self.mass = vehicle.mass
+        self.drag = None
+        if "drag" in field.deviations:
+            self.drag = nn.Parameter(tensor(field.deviations["drag"]))
+            self.register_buffer("nominal_drag", torch.tensor(field.terms.drag))
 
     def forward(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
         """ẋ (b, 13) for x (b, 13), u (b, 4)."""
@@ -47,6 +53,9 @@ class RigidBody(nn.Module):
         inertia = torch.stack([ix, iy, self.iz])
         wrench = (u * u) @ self.mixer * torch.stack([k, k, k, self.torque_coefficient])
         acceleration = wrench[:, :1] / self.mass * body_z(q) + self.gravity
+        if self.drag is not None:
+            force = (self.nominal_drag + self.drag * -self.mass * self.gravity[2]) * turned(q * CONJUGATE, v)
+            acceleration = acceleration - turned(q, force) / self.mass
         turning = (wrench[:, 1:] - torch.linalg.cross(omega, inertia * omega)) / inertia
         return torch.cat([v, quaternion_derivative(q, omega), acceleration, turning], dim=1)
 
@@ -57,6 +66,13 @@ def body_z(q: torch.Tensor) -> torch.Tensor:
     return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z], dim=1)
 
 
+def turned(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """Body vectors v (b, 3) in the world frame, by q (b, 4)."""
+    w, axis = q[:, :1], q[:, 1:]
+    along = 2 * axis * (axis * v).sum(dim=1, keepdim=True)
+    return (w * w - (axis * axis).sum(dim=1, keepdim=True)) * v + along + 2 * w * torch.linalg.cross(axis, v)
+
+
 def quaternion_derivative(q: torch.Tensor, omega: torch.Tensor) -> torch.Tensor:
     """½ q ⊗ [0, ω] (b, 4)."""
     w, axis = q[:, :1], q[:, 1:]
@@ -65,24 +81,26 @@ def quaternion_derivative(q: torch.Tensor, omega: torch.Tensor) -> torch.Tensor:
 
 
 class Network(nn.Module):
-    """f_d as in `hybrid_jax.networks.mlp`: linear, batch normalisation, ReLU, linear.
+    """f_d as in `hybrid_jax.networks.mlp`: linear, batch normalisation or a bias, activation, linear.
 
     Not `BatchNorm1d`, which would move its running statistics at each of the four stages of a step.
     """
 
     def __init__(self, field: ResidualNetwork):
         super().__init__()
-        norm = field.norm
-        assert isinstance(norm, BatchNorm)
+        norm, self.norms = field.norm, isinstance(field.norm, BatchNorm)
+        assert isinstance(norm, BatchNorm | Bias)
         assert isinstance(field.scaling, InputScaling)
-        self.weight_in, self.gain, self.shift, self.weight_out, self.bias_out = (
-            nn.Parameter(tensor(leaf))
-            for leaf in (field.weight_in, norm.gain, norm.shift, field.weight_out, field.bias_out)
+        self.weight_in, self.shift, self.weight_out, self.bias_out = (
+            nn.Parameter(tensor(leaf)) for leaf in (field.weight_in, norm.shift, field.weight_out, field.bias_out)
         )
-        self.register_buffer("running_mean", tensor(norm.running.mean))
-        self.register_buffer("running_variance", tensor(norm.running.variance))
         self.offset, self.scale = field.scaling.offset, field.scaling.scale
-        self.momentum, self.epsilon = norm.momentum, norm.epsilon
+        self.activation = {"relu": functional.relu, "tanh": torch.tanh}[str(field.activation)]
+        if isinstance(norm, BatchNorm):
+            self.gain = nn.Parameter(tensor(norm.gain))
+            self.register_buffer("running_mean", tensor(norm.running.mean))
+            self.register_buffer("running_variance", tensor(norm.running.variance))
+            self.momentum, self.epsilon = norm.momentum, norm.epsilon
 
     def hidden(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
         """The pre-activations (..., 64)."""
@@ -91,12 +109,17 @@ class Network(nn.Module):
     def forward(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
         """ẋ (b, 13), normalised by the minibatch, as in training."""
         hidden = self.hidden(x, u)
-        normal = functional.batch_norm(hidden, None, None, self.gain, self.shift, training=True, eps=self.epsilon)
-        return functional.linear(functional.relu(normal), self.weight_out, self.bias_out)
+        if self.norms:
+            hidden = functional.batch_norm(hidden, None, None, self.gain, self.shift, training=True, eps=self.epsilon)
+        else:
+            hidden = hidden + self.shift
+        return functional.linear(self.activation(hidden), self.weight_out, self.bias_out)
 
     @torch.no_grad()
     def observe(self, x0: torch.Tensor, u: torch.Tensor, predicted: torch.Tensor) -> None:
         """Move the running statistics towards those along the predicted trajectories (b, t, 13)."""
+        if not self.norms:
+            return
         starts = torch.cat([x0[:, None], predicted[:, :-1]], dim=1)
         variance, mean = torch.var_mean(self.hidden(starts, u), dim=(0, 1), correction=0)
         self.running_mean.lerp_(mean, self.momentum)
@@ -195,9 +218,8 @@ class Training:
         """What the last step came to: its loss, Adam's first moment by parameter, the running statistics."""
         # Copies: the next step changes these tensors in place.
         moment = {name: np.array(self.adam.state[value]["exp_avg"]) for name, value in self.field.named_parameters()}
-        network = self.field.network
-        mean, variance = np.array(network.running_mean), np.array(network.running_variance)
-        return {"loss": np.array(loss), "first_moment": moment, "mean": mean, "variance": variance}
+        statistics = [np.array(one) for name, one in self.field.network.named_buffers() if name.startswith("running")]
+        return {"loss": np.array(loss), "first_moment": moment, "statistics": statistics}
 
 
 def tensor(array) -> torch.Tensor:

@@ -1,11 +1,12 @@
-"""How long does a gradient step take, against the paper's stack and PyTorch written for speed, on one core?
+"""How long does a gradient step take, beside plain JAX, the paper's stack and PyTorch written for speed, on one core?
 
-The step is that of training_step.py. Rivals start from our parameters: PyTorch with torchdiffeq, one interval after
-another; PyTorch with an RK4 by hand; the same with its loss under `torch.compile`. Loss, gradient and running
-statistics must agree; torchdiffeq's rk4 is the 3/8 rule, so it is compared with our step by that rule. A turn is steps
-in a row, as in training, and as many before that are not timed: ours in one compiled loop, the rivals in a Python loop.
-The first call, in which PyTorch compiles, is apart. smoke: `torch.compile` generates no code. full: some five minutes,
-most of it compiling.
+A step is 100 windows of 10 intervals: RK4, batch normalisation, regulariser, gradient, Adam, running statistics. Beside
+ours: ours without the kernels of `hybrid_jax.kernels`; the same written plainly in JAX, one sample at a time under
+`vmap`; PyTorch with torchdiffeq, one interval after another; PyTorch with an RK4 by hand; the same with its loss under
+`torch.compile`. All start from our parameters; loss, gradient and running statistics must agree. torchdiffeq's rk4 is
+the 3/8 rule, so it is compared with our step by that rule. A turn is steps in a row, as in training, and as many before
+that are not timed: in JAX in one compiled loop, in PyTorch in a Python loop. The first call, in which PyTorch compiles,
+is apart. smoke: `torch.compile` generates no code. full: some five minutes, most of it compiling.
 """
 
 # PyTorch is of the extra `peers`.
@@ -13,30 +14,56 @@ most of it compiling.
 
 import os
 import shutil
-from collections.abc import Sequence
+import signal
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
+from unittest import mock
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from benchmarks.peers import installed, keep_to_one_core, skipped
-from benchmarks.subjects import SETTINGS, make_windows, training_run
-from benchmarks.timing import Call, Findings, Ratio, Times, agree, compiled, in_turns, run, stopwatch
-from benchmarks.training_step import AGREEMENT
+from benchmarks import plain
+from benchmarks.subjects import SETTINGS, subject
+from benchmarks.timing import Call, Findings, Options, Ratio, Times, agree, compiled, in_turns, run, stopwatch
+from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.dynamics.rigid_body import LEARNED
-from hybrid_jax.integrate import RK4
+from hybrid_jax.kernels import library
 from hybrid_jax.training.fitting import gradient_step
 
-OURS, TORCHDIFFEQ, BY_HAND, COMPILED = "ours", "PyTorch, torchdiffeq", "PyTorch by hand", "PyTorch, torch.compile"
+PEERS = "pip install -e '.[peers]'"
+# Sums of 100 windows × 40 evaluations in another order, in float32; and 1e-4 of a leaf's largest entry moves no rate.
+AGREEMENT = 1e-4
+OURS, BARE, PLAIN = "ours", "ours without kernels", "plain JAX"
+TORCHDIFFEQ, BY_HAND, COMPILED = "PyTorch, torchdiffeq", "PyTorch by hand", "PyTorch, torch.compile"
 RIVALS = TORCHDIFFEQ, BY_HAND, COMPILED
-REACH = {TORCHDIFFEQ: 50.0, COMPILED: 8.0}  # times our time
+OF_TORCH = "paper", "vehicle"  # models that are written in PyTorch
+REACH = {  # times our time
+    "paper": {PLAIN: 1.0, BARE: 1.1, TORCHDIFFEQ: 90.0, COMPILED: 15.0},
+    "vehicle": {TORCHDIFFEQ: 40.0, COMPILED: 8.0},
+    "pendulum": {BARE: 2.5},
+    "car": {BARE: 2.5},
+    "pde": {BARE: 1.0},
+}
+
+
+@dataclass(frozen=True)
+class PeerOptions(Options):
+    """Measure a gradient step of one model."""
+
+    model: Literal["paper", "vehicle", "pendulum", "car", "pde"] = "paper"
+    """paper: rigid body, 64 units, batch norm. vehicle: with drag, 32 tanh units, no norm. Others: plain JAX alone."""
+    most_seconds: int = 900
+    """A rival that takes longer to compile is skipped."""
 
 
 @dataclass(frozen=True)
@@ -80,81 +107,131 @@ class Steps:
     seconds: float  # of compiling; of PyTorch's first step, which compiles
 
 
-def missing(preset: Preset) -> list[dict[str, Any]]:
+def skipped(rival: str, remedy: str = PEERS) -> dict[str, Any]:
+    """The row of a rival that is not measured; `remedy` is what would change that."""
+    return {"rival": rival, "skipped": f"skipped: {remedy}"}
+
+
+def missing(preset: Preset, model: str) -> list[dict[str, Any]]:
     """A row for each rival that cannot be measured here."""
-    if not installed("torch"):
+    if model not in OF_TORCH:
+        return [skipped("PyTorch", f"{model} is not written in it")]
+    if not find_spec("torch"):
         return [skipped(rival) for rival in RIVALS]
     compiler = os.environ.get("CXX", "g++")
-    rows = [] if installed("torchdiffeq") else [skipped(TORCHDIFFEQ)]
+    rows = [] if find_spec("torchdiffeq") else [skipped(TORCHDIFFEQ)]
     if preset.backend == "inductor" and shutil.which(compiler) is None:
         rows.append(skipped(COMPILED, f"the C++ compiler {compiler}, or another that CXX names"))
     return rows
 
 
-def our_first(subject: tuple, solver: diffrax.AbstractSolver) -> dict[str, Any]:
-    """The result of our first step by some integrator."""
-    step = partial(gradient_step, settings=replace(SETTINGS, solver=solver))
-    field, adam, value = compiled(step, *subject)[0]()
-    physics, network, running = adam.mu.physics, adam.mu.residual, field.residual.norm.running
-    moment = {f"network.{name}": getattr(network, name) for name in ("weight_in", "weight_out", "bias_out")}
-    moment |= {f"network.{name}": getattr(network.norm, name) for name in ("gain", "shift")}
-    moment["physics.deviations"] = jnp.stack([physics.deviations[name] for name in LEARNED])
-    return {"loss": value, "first_moment": moment, "mean": running.mean, "variance": running.variance}
+def result_of(first: tuple) -> dict[str, Any]:
+    """Loss, Adam's first moment and running statistics of a step of ours, named as in PyTorch where that has them.
+
+    Not the parameters: Adam's first step is the gradient's sign, and at a gradient of zero that is rounding.
+    """
+    field, adam, value = first
+    statistics = eqx.filter(field, jax.tree.map(lambda learned: not learned, trainable(field)))
+    physics, network = adam.mu.physics, adam.mu.residual
+    moment: Any = adam.mu
+    if "k" in getattr(physics, "deviations", ()):
+        moment = {f"network.{name}": getattr(network, name) for name in ("weight_in", "weight_out", "bias_out")}
+        moment |= {f"network.{n}": getattr(network.norm, n) for n in ("gain", "shift") if hasattr(network.norm, n)}
+        moment["physics.deviations"] = jnp.stack([physics.deviations[name] for name in LEARNED])
+        if "drag" in physics.deviations:
+            moment["physics.drag"] = physics.deviations["drag"]
+    return {"loss": value, "first_moment": moment, "statistics": jax.tree.leaves(eqx.filter(statistics, eqx.is_array))}
 
 
-def our_steps(subject: tuple, in_a_row: int) -> Steps:
-    """Ours, in the loop of `training`."""
-    step = partial(gradient_step, settings=SETTINGS)
+def our_steps(step: Callable, arguments: tuple, in_a_row: int) -> Steps:
+    """Steps of a program of JAX, in the loop of `training`."""
 
     def loop(field, adam, plan, windows):
-        def body(_, learner):
-            field, adam = learner
-            return step(field, adam, plan, windows)[:2]
+        return jax.lax.fori_loop(0, in_a_row, lambda _, now: step(*now, plan, windows)[:2], (field, adam))
 
-        return jax.lax.fori_loop(0, in_a_row, body, (field, adam))
-
-    call, seconds = compiled(loop, *subject)
-    return Steps(call, our_first(subject, RK4()), seconds)
+    call, seconds = compiled(loop, *arguments)
+    return Steps(call, result_of(compiled(step, *arguments)[0]()), seconds)
 
 
-def rival_steps(subject: tuple, preset: Preset, names: Sequence[str]) -> dict[str, Steps]:
-    """The rivals' first steps from where we start too."""
+@contextmanager
+def without_kernels():
+    """JAX alone."""
+    jax.clear_caches()  # of what was traced with kernels
+    with mock.patch.object(library, "obstacle", return_value="switched off"):
+        yield
+    jax.clear_caches()
+
+
+def jax_steps(arguments: tuple, preset: Preset) -> dict[str, Steps]:
+    """Ours, and the same in JAX by other ways."""
+    ours = partial(gradient_step, settings=SETTINGS)
+    ways = {OURS: (ours, nullcontext), PLAIN: (plain.training_step, nullcontext), BARE: (ours, without_kernels)}
+    steps = {}
+    for name, (step, context) in ways.items():
+        with context():
+            steps[name] = our_steps(step, arguments, preset.in_a_row)
+    return steps
+
+
+def rival_steps(arguments: tuple, preset: Preset, name: str) -> Steps:
+    """A rival's first step from where we start too."""
     import torch
 
     from benchmarks import torch_rivals
 
     torch.set_num_threads(1)
-    field, _, plan, windows = subject
+    field, _, plan, windows = arguments
+    integrate = torch_rivals.by_torchdiffeq if name == TORCHDIFFEQ else torch_rivals.by_hand
+    backend, weight = preset.backend if name == COMPILED else None, float(plan.regulariser_weight)
+    training = torch_rivals.Training(field, plan.rates, weight, windows, integrate, backend)
+    value, seconds = stopwatch(training)
 
-    def in_a_row(step: Call) -> None:
+    def in_a_row() -> None:
         for _ in range(preset.in_a_row):
-            step()
+            training()
 
-    steps = {}
+    return Steps(in_a_row, training.result(value), seconds)
+
+
+@contextmanager
+def at_most(seconds: int):
+    """TimeoutError after so many seconds."""
+
+    def stop(*_):
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def prepare(preset: Preset, model: str, names: Sequence[str], most_seconds: int):
+    """The steps of all programs, each warm, how far each is from ours, and rows of those that took too long."""
+    arguments = subject(model, preset.windows, preset.intervals)
+    steps, late = jax_steps(arguments, preset), []
     for name in names:
-        integrate = torch_rivals.by_torchdiffeq if name == TORCHDIFFEQ else torch_rivals.by_hand
-        backend = preset.backend if name == COMPILED else None
-        training = torch_rivals.Training(field, plan.rates, float(plan.regulariser_weight), windows, integrate, backend)
-        value, seconds = stopwatch(training)
-        steps[name] = Steps(partial(in_a_row, training), training.result(value), seconds)
-    return steps
-
-
-def prepare(preset: Preset, names: Sequence[str]) -> tuple[dict[str, Steps], dict[str, float]]:
-    """Our steps and those of the rivals that are named, each warm, and by how much each rival differs from ours."""
-    state, plan = training_run("hybrid", preset.windows)
-    subject = state.field, state.adam, plan, make_windows(preset.windows, preset.intervals)
-    ours = our_steps(subject, preset.in_a_row)
-    rivals = rival_steps(subject, preset, names) if names else {}
-    alike = {TORCHDIFFEQ: our_first(subject, ThreeEighths())} if TORCHDIFFEQ in names else {}
+        try:
+            with at_most(most_seconds):
+                steps[name] = rival_steps(arguments, preset, name)
+        except TimeoutError:
+            late.append(skipped(name, f"not compiled in {most_seconds} s; --most-seconds allows more"))
+    alike = {}
+    if TORCHDIFFEQ in steps:
+        step = partial(gradient_step, settings=replace(SETTINGS, solver=ThreeEighths()))
+        alike[TORCHDIFFEQ] = result_of(compiled(step, *arguments)[0]())
+    ours = steps[OURS].result
     differences = {
-        name: agree(f"steps of {name} and ours", alike.get(name, ours.result), rival.result, AGREEMENT)
-        for name, rival in rivals.items()
+        name: agree(f"steps of {name} and ours", alike.get(name, ours), program.result, AGREEMENT)
+        for name, program in steps.items()
+        if name != OURS
     }
-    steps = {OURS: ours, **rivals}
     for program in steps.values():
         program.call()
-    return steps, differences
+    return steps, differences, late
 
 
 def row_of(name: str, steps: Steps, differences: dict[str, float], times: Times, preset: Preset) -> dict[str, Any]:
@@ -172,8 +249,9 @@ def row_of(name: str, steps: Steps, differences: dict[str, float], times: Times,
     }
 
 
-def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
-    table = Table("", "ms", "windows/s", "× ours", r"compile \[s]", "differs by", title="a gradient step, one core")
+def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]], model: str) -> Table:
+    heads = "", "ms", "windows/s", "× ours", r"compile \[s]", "differs by"
+    table = Table(*heads, title=f"a gradient step of {model}, one core")
     for row in rows:
         speed = f"{1e3 * row['seconds']:.2f}", f"{row['windows_per_second']:,.0f}", f"{row['times_ours']:.2f}"
         difference = "" if row["difference"] is None else f"{row['difference']:.0e}"
@@ -183,23 +261,24 @@ def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
     return table
 
 
-def measure(preset: Preset) -> Findings:
+def measure(preset: Preset, model: str, most_seconds: int) -> Findings:
     """Ours against every rival that is here."""
-    absent = missing(preset)
-    names = [rival for rival in RIVALS if rival not in {row["rival"] for row in absent}]
+    absent = missing(preset, model)
+    names = [one for one in RIVALS if model in OF_TORCH and one not in {row["rival"] for row in absent}]
     with TemporaryDirectory() as cache:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache  # empty, so that compilation is timed
-        programs, differences = prepare(preset, names)
+        programs, differences, late = prepare(preset, model, names, most_seconds)
         times = in_turns({name: steps.call for name, steps in programs.items()}, preset.turns, warm=True)
-    rows = [row_of(name, steps, differences, times, preset) for name, steps in programs.items()]
+    rows, absent = [row_of(name, one, differences, times, preset) for name, one in programs.items()], [*absent, *late]
     ratios = [
-        Ratio(f"{row['program']} / ours, one core", row["times_ours"], at_least=REACH.get(row["program"]))
+        Ratio(f"{row['program']} / ours", row["times_ours"], at_least=REACH[model].get(row["program"]))
         for row in rows
         if row["program"] != OURS
     ]
-    return Findings([*rows, *absent], [table_of(rows, absent)], ratios)
+    return Findings([*rows, *absent], [table_of(rows, absent, model)], ratios)
 
 
 if __name__ == "__main__":
-    keep_to_one_core()
-    run("training_peers", __doc__, PRESETS, measure)
+    if hasattr(os, "sched_setaffinity"):  # core for core, with all threads from now on; the report says how many
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    run("training_peers", __doc__, PRESETS, measure, PeerOptions)
