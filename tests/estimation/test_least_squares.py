@@ -19,6 +19,7 @@ from hybrid_jax.estimation.least_squares import fit_least_squares, ravel_paramet
 from hybrid_jax.estimation.uncertainty import covariance_of
 from hybrid_jax.integrate import RK4, rollout_batch
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
@@ -158,6 +159,8 @@ def test_a_parameter_without_effect_stays_where_it_is():
     found = fit_least_squares(First(Push(jnp.array([1.0, 1.0]))), still)
     assert found.converged
     assert found.field.push.gains[1] == 1.0
+    dark = eqx.tree_at(lambda w: w.u, windows, 0 * windows.u)
+    assert fit_least_squares(First(Push(jnp.array([1.0, 1.0]))), dark).status == Status.STALLED  # it has seen nothing
 
 
 class Drift(AbstractVectorField):
