@@ -74,7 +74,7 @@ class AblationConfig(Config):
 PRESETS = {
     "paper": AblationConfig(),
     "quick": preset_like(AblationConfig, QUICK, over=("residual",)),
-    "smoke": preset_like(AblationConfig, SMOKE, over=("weight", "noise"), sizes=(20,), pool=20),
+    "smoke": preset_like(AblationConfig, SMOKE, over=("noise",), sizes=(20,), pool=20),
 }
 
 
