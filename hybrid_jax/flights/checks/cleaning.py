@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy  # not scipy.signal, which takes a second: it is imported where it is first used
@@ -54,17 +53,15 @@ def clean(log: FlightLog, cleaning: Cleaning) -> tuple[FlightLog, list[str]]:
     Raises:
         ValueError: the log, the field of `cleaning` and why it is impossible, in one line.
     """
-    steps: dict[str, tuple[Any, Callable[[FlightLog, Any], tuple[FlightLog, str]]]] = {
-        "in_flight": (cleaning.in_flight, lambda log, _: in_flight(log)),
-        "resample": (cleaning.resample, lambda log, dt: resample(log, dt, cleaning.longest_gap)),
-        "delay": (cleaning.delay, delay_motors),
+    changes: dict[str, Callable[[FlightLog], tuple[FlightLog, str]]] = {
+        "in_flight": in_flight,
+        "resample": lambda log: resample(log, cleaning.resample or log.dt, cleaning.longest_gap),
+        "delay": lambda log: delay_motors(log, cleaning.delay),
     }
     done: list[str] = []
-    for name, (value, change) in steps.items():
-        if not value:
-            continue
+    for name in (name for name in changes if getattr(cleaning, name)):
         try:
-            log, line = change(log, value)
+            log, line = changes[name](log)
         except ValueError as error:
             raise ValueError(f"{log.name}: {name}: {str(error).removeprefix(f'{log.name}: ')}") from error
         done.append(line)
