@@ -140,7 +140,7 @@ def main() -> None:
     gusts, keys = jnp.array([0.0, 1.0]), jax.random.split(jax.random.key(7))
     print("filter, noise, world, gusts | error of v, ω over the first model's | v after a wind | found after [s] |")
     print("largest change of Ix, Iy, k [%] | their intervals hold the truth [%] | inconsistent [%]")
-    for named, noise, world in product((False, True), (1.0, 0.1), WORLDS):
+    for named, noise, world in product((False, True), (0.1, 1.0), WORLDS):
         found = Hovered(*map(np.asarray, hover(adaptation_of(world, noise, named), world, noise, blocks, gusts, keys)))
         for i, gust in enumerate(gusts.tolist()):
             own = Hovered(*(leaf[i] for leaf in found))

@@ -101,7 +101,7 @@ def _found(rows: Results) -> list[Table]:
 def _coverage(rows: Results) -> list[Table]:
     lines = []
     for change, own in rows.where(agent="online").group("change").items():
-        inside = np.mean([[row["inside"][name] for name in NAMES] for row in own], axis=0)
+        inside = np.array([[row["inside"][name] for name in NAMES] for row in own], float).mean(axis=0)
         lines.append((CHANGE_NAMES[change], *(f"{100 * share:.0f}" for share in inside)))
     title = f"Share of 95 % intervals that contain the true value [%], from {LEARNED:g} s after the change on"
     return [Table(title, ("change", *NAMES), lines)] if lines else []

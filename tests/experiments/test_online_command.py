@@ -89,6 +89,13 @@ def test_each_claim_fails_where_it_should(change, fails):
     assert {each.header[0] for each in tables(rows(**change))} >= {"change"}
 
 
+def test_a_flight_that_ends_early_has_no_coverage():
+    short = rows(inside=None)
+    assert {*tables(short)[-1].lines[0][1:]} == {"nan"}
+    evidence = Evidence(short, step_ms=0.1, seconds=1.0, processor_seconds=1.0, flights=18)
+    assert {each.id: each.holds for each in evaluate(claims(["wind", "nothing"]), evidence)}["O4"] is None
+
+
 def test_slow_is_said():
     evidence = Evidence(rows(), step_ms=0.3, seconds=600.0, processor_seconds=100.0, flights=18)
     found = {each.id: each.holds for each in evaluate(claims(["wind", "nothing"]), evidence)}

@@ -83,6 +83,20 @@ def test_gusts_are_followed_and_not_taken_for_another_gain(noise):
     assert adaptation.flags(states).inconsistent.mean() < 0.1
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("gusts", [0.0, 1.0])
+def test_a_million_steps_leave_the_covariance_positive_and_the_gain_where_it_was(gusts):
+    """Nearly three hours, in single precision."""
+    adaptation = filter_of(NOISE)
+    states, _ = hovering(adaptation, NOISE, jax.random.key(1), 10**6, gusts=gusts)
+    sizes = np.linalg.svd(np.asarray(states.root[::100], float), compute_uv=False)
+    assert sizes.min() > 0
+    theta, deviation = gains(adaptation, states)
+    assert (np.abs(theta) < 2 * deviation).mean() > 0.95
+    assert np.abs(theta).max() < 1
+    assert states.restarts[-1] == 0
+
+
 def test_a_change_is_found_within_a_second_as_far_as_samples_tell_it():
     after = 13 * SECOND
     hover, _ = hovering(filter_of(NOISE), NOISE, jax.random.key(0), 24 * SECOND, change=0.2)
