@@ -31,7 +31,7 @@ from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate, extended
 from hybrid_jax.adaptation.expectation import expected_errors
-from hybrid_jax.adaptation.selection import BLOCKS, blocks_of, geometric_mean, predict_block
+from hybrid_jax.adaptation.selection import BLOCKS, alike, blocks_of, errors_at_ends
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.io.datasets import Dataset
@@ -54,9 +54,9 @@ L2_SP = FineTune(l2_sp=1e-2)
 HEAD = f"""# {NAME}
 
 A hybrid that was trained on source flight adapts to a changed vehicle with the first N windows of 0.1 s of **one**
-flight and nothing else. `adapt(method="auto")` fits all candidates, predicts blocks of a second that it left out of the
-fit, and takes the simplest candidate whose error is within one standard error, or a tenth, of the smallest. Regret: the
-test error of the candidate that was taken over that of the best one in hindsight. ρ: the share of the source's test
+flight and nothing else. `adapt(method="auto")` takes one of several candidates if these windows make it at least twenty
+times as probable as no change, where the source's own errors are counted in. Regret: the test error of the candidate
+that was taken over that of the best one in hindsight. ρ: the share of the source's test
 error that is gone. Test error: L^T_MSE over 1 s of other flights.
 
 - **source**: not adapted. **theta**: Ix, Iy and k by least squares
@@ -102,7 +102,7 @@ def experiment(config: ChangesConfig, console: Console) -> None:
     fields = pretrained(HYBRID, IRIS, config, stages, source).fields
     chosen = [domain for domain in CHANGES if domain.name in config.changes]
     rows = Results(
-        [row for domain in chosen for row in adapted(domain, fields, config, stages)],
+        [row for domain in chosen for row in adapted(domain, fields, source.splits["train"], config, stages)],
         ("domain", "candidate", "draw", "seed"),
     )
     if hosts.is_main_process():
@@ -134,7 +134,9 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
     return {"errors": (error_figure(rows), errors)}
 
 
-def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, stages: Stages) -> list[Row]:
+def adapted(
+    domain: Domain, fields: AbstractVectorField, learned_from: Trajectories, config: ChangesConfig, stages: Stages
+) -> list[Row]:
     """The rows of a domain: every candidate, and the methods to compare with, for every draw and seed."""
     target = flown(domain, target_splits(config), config, stages)
     pool, test, drawn = target.splits["train"], target.splits["test"], windows_of(Auto(), config.sizes[0], config)[0]
@@ -143,13 +145,13 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, 
 
     def of_draw(draw: int) -> Found:
         own = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
-        found = jax.device_get(_candidates(fields, own, flights, test, settings(config)))
+        found = jax.device_get(_candidates(fields, own, flights, test, settings(config), alike(learned_from, own[0])))
         inside = [_share_inside(found.ends[seed], np.delete(found.flown[seed], draw, 0)) for seed in seeds]
 
         def row(seed: int, i: int) -> Row:
             taken = bool(found.taken[seed] == i)
             tags = {"domain": domain.name, "candidate": found.names[i], "draw": draw, "seed": seed, "taken": taken}
-            numbers = {"test_mse": found.test_mse[seed, i], "left_out": found.left_out[seed, i]}
+            numbers = {"test_mse": found.test_mse[seed, i], "probability": found.probability[seed, i]}
             return tags | numbers | {INSIDE: inside[seed] if taken else None}
 
         return [row(seed, i) for seed in seeds for i in range(len(found.names))], {}
@@ -171,7 +173,7 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
     rows = []
     for name in config.compared:
         errors = evaluate(fits[name]().fields, target.splits["test"], EVERY, settings(config), config.runs())
-        tags = {"domain": target.config["domain"], "candidate": name, "left_out": None, "taken": False}
+        tags = {"domain": target.config["domain"], "candidate": name, "probability": None, "taken": False}
         cases = [divmod(i, config.seeds) for i in range(len(errors))]
         rows += [
             {**tags, INSIDE: None, "draw": d, "seed": s, "test_mse": float(errors[i])} for i, (d, s) in enumerate(cases)
@@ -184,7 +186,7 @@ class Tested(eqx.Module):
 
     Attributes:
         names: of the candidates.
-        left_out: their errors on left-out blocks (s, c).
+        probability: of each that it is what changed; of the network, beside the one taken before (s, c).
         test_mse: their test errors (s, c).
         taken: the index of the candidate that was taken (s,).
         ends: of that one the mean squared errors at the ends of windows, and of those that touch, of the blocks that
@@ -193,7 +195,7 @@ class Tested(eqx.Module):
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
-    left_out: Array
+    probability: Array
     test_mse: Array
     taken: Array
     ends: Array
@@ -201,13 +203,15 @@ class Tested(eqx.Module):
 
 
 @jit_with(FAST_COMPILE)
-def _candidates(fields: Any, windows: Trajectories, flights: Trajectories, test: Trajectories, shared: Settings):
+def _candidates(
+    fields: Any, windows: Trajectories, flights: Trajectories, test: Trajectories, shared: Settings, known: Trajectories
+):
     """Each seed's candidates on its windows."""
     places = blocks_of(windows.x0.shape[1], BLOCKS)
 
     def one(run) -> Tested:
         field, windows = run
-        choice = Auto().solve(field, windows, windows, shared).choice
+        choice = Auto().solve(field, windows, windows, shared, known).choice
         larger = extended(field, STATE_SIZE)
 
         def error(index):
@@ -216,17 +220,17 @@ def _candidates(fields: Any, windows: Trajectories, flights: Trajectories, test:
         adapted = candidate(larger, choice, choice.taken)
         return Tested(
             choice.names,
-            left_out=geometric_mean(choice.errors.mse),
+            probability=choice.probability,
             test_mse=jax.lax.map(error, jnp.arange(len(choice.names))),
             taken=choice.taken,
-            ends=choice.errors.ends[choice.taken],
+            ends=choice.ends,
             flown=jax.lax.map(partial(of_flight, adapted), flights),
         )
 
     def of_flight(field, flight):
         blocks = jax.tree.map(lambda leaf: leaf[places[0]], flight), jnp.asarray(places[1])
         return jnp.mean(
-            jax.lax.map(lambda block: predict_block(field, block[0], None, block[1], shared.solver).ends, blocks),
+            jax.lax.map(lambda block: errors_at_ends(field, *block, shared.solver), blocks),
             axis=0,
         )
 

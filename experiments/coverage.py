@@ -30,7 +30,7 @@ from experiments.runner.run_record import environment
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.pooling import SOURCES, combined
-from hybrid_jax.adaptation.selection import CLUSTERS, blocks_of
+from hybrid_jax.adaptation.selection import CLUSTERS, alike, blocks_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.estimation.uncertainty import covariance_of
@@ -102,7 +102,7 @@ def experiment(config: CoverageConfig, console: Console) -> None:
             for domain in CHANGES
             if domain.name in config.changes
             for noise, label in levels.items()
-            for row in adapted(domain, fields, replace(config, noise=noise), stages)
+            for row in adapted(domain, fields, source.splits["train"], replace(config, noise=noise), stages)
         ],
         ("domain", "noise", "draw", "parameter"),
     )
@@ -127,7 +127,9 @@ def experiment(config: CoverageConfig, console: Console) -> None:
     write_report(config.out / NAME, report, Console())
 
 
-def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig, stages: Stages) -> list[Row]:
+def adapted(
+    domain: Domain, fields: AbstractVectorField, learned_from: Trajectories, config: CoverageConfig, stages: Stages
+) -> list[Row]:
     """A row for each flight and parameter: whether the pooled interval, and single ones, contain the true value."""
     splits = {"train": target_splits(config)["train"]}
     flights = flown(domain, splits, config, stages)
@@ -136,7 +138,7 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig,
 
     def of_draw(draw: int) -> Found:
         windows = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
-        logs, stds = jax.device_get(_fits(fields, windows, settings(config)))
+        logs, stds = jax.device_get(_fits(fields, windows, settings(config), alike(learned_from, windows[0])))
         tags = {"domain": domain.name, "draw": draw}
         rows = [
             {**tags, "parameter": name, **_compared(logs[:, i], stds[:, i], np.log(truth[name] / nominal(IRIS)[name]))}
@@ -150,13 +152,13 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig,
 
 
 @jit_with(FAST_COMPILE)
-def _fits(fields: Any, windows: Trajectories, shared: Settings):
+def _fits(fields: Any, windows: Trajectories, shared: Settings, known: Trajectories):
     """θ_p of each source as the physics holds them, logarithms, and their standard errors; NaN where not fitted."""
     cluster = blocks_of(windows.x0.shape[1], CLUSTERS)[0].shape[1]  # windows of one flight are correlated
 
     def one(run):
         field, windows = run
-        found = METHOD.solve(field, windows, windows, shared)
+        found = METHOD.solve(field, windows, windows, shared, known)
         free, theta = (each[found.choice.taken] for each in (found.choice.free, found.choice.theta))
         covariance = covariance_of(found.field, windows, solver=shared.solver, free=free, cluster=cluster)
         stds = jnp.where(free, jnp.sqrt(jnp.diagonal(covariance)), jnp.nan)

@@ -3,6 +3,7 @@
 Source: Solà, "Quaternion kinematics for the error-state Kalman filter", 2017 (Hamilton convention).
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -109,7 +110,8 @@ def canonicalize_quaternion(q: Quaternion) -> Quaternion:
 
 def tilt(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
     """The angle [rad] of the body's z axis from the vertical, of unit quaternions."""
-    return np.arccos(np.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1))
+    of = jnp if isinstance(q, jax.Array) else np
+    return of.arccos(of.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1))
 
 
 def heading(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch"]:

@@ -18,6 +18,7 @@ WORSE = 1.02  # times the source's error
 MEAN_RHO, WORST_RHO = 0.93, 0.85
 HELD = 0.7, 0.9  # share of errors in their 80 % interval
 AUTO = "auto"  # the candidate that was taken
+COMPARED = "fine_tune", "fine_tune_offset", "l2_sp"  # no candidates
 SHOWN = {  # method → label, colour and marker
     AUTO: ("hj.adapt", METHODS["adapted"], "o"),
     "fine_tune": ("fine-tuned (Adam)", METHODS["fine-tuned"], "^"),
@@ -37,7 +38,7 @@ def of_each_case(rows: Results, name: str) -> np.ndarray:
 
 def best_of_each_case(rows: Results) -> np.ndarray:
     """The smallest test error of all candidates, for each domain, draw and seed."""
-    candidates = rows.where(lambda row: row["left_out"] is not None or row["taken"])
+    candidates = rows.where(lambda row: row["candidate"] not in COMPARED)
     return np.array([case.spread("test_mse").smallest for case in candidates.group("domain", "draw", "seed").values()])
 
 

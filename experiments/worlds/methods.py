@@ -14,8 +14,7 @@ import hybrid_jax as hj
 from experiments.paper.conditions import Noise
 from experiments.worlds.world import DT, World
 from hybrid_jax.adaptation.adapting import Adaptation, Parameter
-from hybrid_jax.adaptation.methods import FineTune
-from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.adaptation.methods import FineTune, Method
 
 WHITE_BOX = "Ix", "Iy", "k", "drag"  # what physics without a network learns
 CHANGING = 1.0  # m/s² and rad/s²: the filter's prior of a disturbance
@@ -49,26 +48,16 @@ class Model(NamedTuple):
     result: Adaptation | None = None
 
 
-def auto(task: Task) -> Model:
-    """`hj.adapt`, with what the source learned from."""
-    return _of(hj.adapt(task.source, task.windows, learned_from=task.learned))
-
-
-def source(task: Task) -> Model:
-    """Not adapted."""
-    return Model(task.source, {name: Parameter(float(value)) for name, value in named_parameters(task.source).items()})
-
-
-def fine_tuned(method: FineTune, task: Task) -> Model:
-    """By Adam on the one flight; its last fifth tells when to stop."""
-    return _of(hj.adapt(task.source, task.windows, method=method))
+def adapted(method: Method | str, task: Task) -> Model:
+    """By `hj.adapt`, of the one flight; where a method needs some, its last fifth tells when to stop."""
+    learned = task.learned if method == AUTO else None
+    return _of(hj.adapt(task.source, task.windows, method=method, learned_from=learned))
 
 
 def as_in_the_paper(task: Task) -> Model:
     """By Adam on windows of many flights, with others to stop by, all without noise."""
     assert task.many is not None
-    train, validation = task.many
-    return _of(hj.adapt(task.source, train, method=FineTune(), validation=validation))
+    return _of(hj.adapt(task.source, task.many[0], method=FineTune(), validation=task.many[1]))
 
 
 def white_box(task: Task) -> Model:
@@ -78,16 +67,12 @@ def white_box(task: Task) -> Model:
 
 def kalman_filter(task: Task) -> Model:
     """An extended Kalman filter of the same parameters, sample by sample."""
-    size = asdict(Noise())
-    noise = np.repeat([task.noise * each for each in size.values()], [3, 4, 3, 3]).tolist()
+    noise = task.noise * np.repeat([*asdict(Noise()).values()], [3, 4, 3, 3])
     physics = hj.rigid_body(task.world.vehicle, WHITE_BOX)
-    online = hj.OnlineAdaptation(physics, DT, tuple(noise), disturbance=CHANGING)
+    online = hj.OnlineAdaptation(physics, DT, tuple(noise.tolist()), disturbance=CHANGING)
     x, u = (jnp.asarray(part).reshape(-1, part.shape[-1]) for part in (task.windows.x, task.windows.u))
     state = _filtered(online, jnp.asarray(task.windows.x0[0]), x, u)
-    found = {
-        name: Parameter(float(v), float(low), float(high)) for name, (v, low, high) in online.intervals(state).items()
-    }
-    return Model(online.model(state), found)
+    return Model(online.model(state), {name: Parameter(*map(float, v)) for name, v in online.intervals(state).items()})
 
 
 @eqx.filter_jit
@@ -101,11 +86,11 @@ def _of(result: Adaptation) -> Model:
 
 AUTO, SOURCE = "auto", "source"
 METHODS: dict[str, Callable[[Task], Model]] = {
-    AUTO: auto,
-    SOURCE: source,
+    AUTO: partial(adapted, AUTO),
+    SOURCE: partial(adapted, SOURCE),
     "fine_tune_paper": as_in_the_paper,
-    "fine_tune": partial(fine_tuned, FineTune()),
-    "l2_sp": partial(fine_tuned, FineTune(l2_sp=1e-2)),
+    "fine_tune": partial(adapted, FineTune()),
+    "l2_sp": partial(adapted, FineTune(l2_sp=1e-2)),
     "white_box": white_box,
     "kalman_filter": kalman_filter,
 }

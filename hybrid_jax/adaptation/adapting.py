@@ -18,7 +18,7 @@ from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.auto import NETWORK, Auto, Choice, has_network
 from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
-from hybrid_jax.adaptation.selection import correlated, geometric_mean, longest_chain, overlap
+from hybrid_jax.adaptation.selection import correlated, longest_chain, overlap
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
@@ -43,6 +43,7 @@ from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories, check_like
 
 HELD_OUT = 5  # one in so many windows validates
+SHOWN = 0.01  # less probable candidates are not reported
 NAMED = 50  # physics with more parameters is a network, and its weights are not listed
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; are dt and all units right?"
@@ -108,9 +109,10 @@ class Adaptation:
         without_intervals: why there are no intervals; None if there are.
         covariance: of the parameters as the physics holds them; None without intervals.
         degrees: degrees of freedom of the covariance, one less than the clusters of windows that touch, or None.
-        candidates: of "auto": the error on left-out windows, without unit, by name.
+        candidates: of "auto": by name how probable each change is, 0 to 1; of the network beside the one taken.
         chosen: of "auto": the name of the candidate that was taken.
-        refused: of "auto": candidates that explain no more than the source may err where nothing has changed.
+        refused: of "auto": candidates that would be more probable than the chosen one if the source made no errors.
+        alone: of "auto": whether physics, fitted to the source's own motion, took the place of physics and network.
         expected: of "auto": errors on a flight that was not seen, by horizon and quantity: value, low, high.
         units: of the quantities in `expected`.
         outside: by quantity the share of samples, 0 to 1, unlike those that the source learned from.
@@ -132,6 +134,7 @@ class Adaptation:
     candidates: dict[str, float] = attribute(default_factory=dict)
     chosen: str | None = None
     refused: tuple[str, ...] = ()
+    alone: bool = False
     expected: Expected = attribute(default_factory=dict)
     units: dict[str, str] = attribute(default_factory=dict)
     outside: dict[str, float] = attribute(default_factory=dict)
@@ -149,16 +152,14 @@ class Adaptation:
             f"Mean squared prediction error: {self.mse_before:.3g} before, {self.mse_after:.3g} after.",
         ]
         if self.chosen is not None:
-            known = {
-                name: f"{error:.3g}" if np.isfinite(error) else "undetermined"
-                for name, error in self.candidates.items()
-            }
-            others = ", ".join(f"{name} {error}" for name, error in known.items() if name != self.chosen)
-            chosen = f"{self.chosen} {self.candidates[self.chosen]:.3g}"
-            lines.append(f"Chosen by the error on left-out windows: {chosen} (others: {others}).")
-        better = [name for name in self.refused if self.candidates[name] < self.candidates[str(self.chosen)]]
-        if better:
-            lines.append(f"Refused: {', '.join(better)}: the source may err as much where nothing has changed.")
+            known = sorted(self.candidates.items(), key=lambda one: -one[1])
+            found = ", ".join(f"{name} {share:.2g}" for name, share in known if share >= SHOWN)
+            lines.append(f"Chosen: {self.chosen}. Probability of each change: {found}.")
+        if self.alone:
+            lines.append("Physics without the network predicts the source's own motion better and takes its place.")
+        if self.refused:
+            names = ", ".join(self.refused)
+            lines.append(f"Refused: {names}: the source may err as much where nothing has changed.")
         if self.expected:
             lines.append("RMSE to expect on a flight not seen (80% intervals, from blocks left out of these windows):")
             lines += lines_of(self.expected, self.units)
@@ -293,13 +294,13 @@ _mse = jit_with(FAST_COMPILE)(rollout_mse)
 def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[str, Any]:
     """The attributes of `Adaptation` that say what was chosen, and the errors to expect of it."""
     seconds = windows.horizon * windows.dt
-    chain = seconds * longest_chain(windows, choice.errors.mse.shape[1])
-    ends = np.asarray(choice.errors.ends)[choice.taken]
+    chain = seconds * longest_chain(windows, len(choice.ends))
     return {
-        "candidates": dict(zip(choice.names, geometric_mean(choice.errors.mse).tolist(), strict=True)),
+        "candidates": dict(zip(choice.names, np.asarray(choice.probability).tolist(), strict=True)),
         "chosen": choice.names[int(choice.taken)],
-        "refused": tuple(name for name, one in zip(choice.names, np.asarray(choice.supported), strict=True) if not one),
-        "expected": expected_errors(ends, (round(seconds, 9), round(chain, 9)), space),
+        "alone": bool(choice.alone),
+        "refused": tuple(name for name, one in zip(choice.names, np.asarray(choice.refused), strict=True) if one),
+        "expected": expected_errors(np.asarray(choice.ends), (round(seconds, 9), round(chain, 9)), space),
         "units": {one.name: one.unit for one in space.quantities},
     }
 

@@ -1,9 +1,9 @@
 """Adapt a network by few windows without losing what it knows: a ridge Gauss-Newton step from where it is.
 
 The step minimises Σ ‖r + J δ‖² + penalty ‖δ‖² over changes δ of the network's weights in the subspace that changes the
-predictions most (the range of Jᵀ, from random combinations of its columns and from Jᵀr: Halko, Martinsson and Tropp,
-SIAM Review 2011). The penalty holds the weights at the source's, as L2-SP does (Li, Grandvalet and Davoine,
-2018). The network as it is stays among the candidates (`auto`).
+predictions most (the range of Jᵀ, from random combinations of its columns: Halko, Martinsson and Tropp, SIAM Review
+2011). The penalty holds the weights at the source's, as L2-SP does (Li, Grandvalet and Davoine, 2018), and is the one
+that makes the windows most probable.
 """
 
 from collections.abc import Callable
@@ -15,11 +15,12 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, left_out_steps, predict_block
+from hybrid_jax.adaptation.selection import TINY, left_out_steps
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
-from hybrid_jax.estimation.starts import Starts, from_starts
+from hybrid_jax.estimation.normal_equations import NormalEquations
+from hybrid_jax.estimation.starts import from_starts, smoothed
 from hybrid_jax.trajectories import Trajectories
 
 RANK = 32  # dimensions of the subspace
@@ -28,34 +29,32 @@ TOGETHER = 8  # directions evaluated at a time
 
 
 class Anchored(NamedTuple):
-    """For each of c penalties the change of the weights, and how well blocks that are left out are predicted.
+    """The step with the best of some penalties.
 
     Attributes:
-        changes: of the network's weights.
-        errors: on each of b blocks (c, b).
-        removed: of the mean square of all errors, to first order.
-        fitted: how many directions the penalty leaves free.
+        change: of the network's weights.
+        left_out: the same from all blocks of windows but one, for each of them (b, w).
+        odds: how much more probable the windows are with the best of the steps than with none.
+        naive: the same, if the source made no errors.
     """
 
-    changes: Float[Array, "c w"]
-    errors: BlockErrors
-    removed: Float[Array, " c"]
-    fitted: Float[Array, " c"]
+    change: Float[Array, " w"]
+    left_out: Float[Array, "b w"]
+    odds: Float[Array, ""]
+    naive: Float[Array, ""]
 
 
 def fit_anchored(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    solver: Solver = None,
-    scale: Scale = None,
-    penalties: tuple[float, ...] = PENALTIES,
-    blocks: int = BLOCKS,
-    starts: Starts | None = None,
+    field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, error: Float[Array, ""], blocks
 ) -> Anchored:
-    """The steps of all penalties; windows, blocks and starts as for `fit_candidates`."""
+    """The step for all penalties, and the best.
+
+    Args:
+        error: sum of squares that the source may err where nothing has changed, see `Unchanged`.
+        blocks: of windows, see `blocks_of`.
+    """
     weights, _ = weights_of(field)
-    places, counted = blocks_of(len(windows), blocks)
-    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[places], (windows, starts))
+    starts, noise = smoothed(field, windows, solver, scale)
     smooth, weigh = from_starts(windows, starts)
 
     def errors(change: Float[Array, " w"]) -> Float[Array, "n e"]:
@@ -71,26 +70,36 @@ def fit_anchored(
     if weights.size <= RANK:  # all directions
         basis = jnp.eye(weights.size, dtype=weights.dtype)
     else:
-        images = jax.lax.map(seen, jax.random.split(jax.random.key(0), RANK - 1), batch_size=TOGETHER)
-        basis = jnp.linalg.qr(jnp.concatenate([images, *(part[None] for part in pull(residuals))]).T)[0].T
+        images = jax.lax.map(seen, jax.random.split(jax.random.key(0), RANK), batch_size=TOGETHER)
+        basis = jnp.linalg.qr(images.T)[0].T
     effects = jnp.moveaxis(jax.lax.map(push, basis, batch_size=TOGETHER), 0, -1)
     gram, score = jnp.einsum("ner,nes->nrs", effects, effects), jnp.einsum("ner,ne->nr", effects, residuals)
-    all_gram, all_score = jnp.sum(gram, axis=0), jnp.sum(score, axis=0)
-    values = jnp.maximum(jnp.linalg.eigvalsh(all_gram), 0.0)
+    values, vectors = jnp.linalg.eigh(jnp.sum(gram, axis=0))
+    values = jnp.maximum(values, TINY)
+    along = score @ vectors  # of each window
+    places, counted = blocks
+    of_blocks = jnp.sum(along[places] * counted[..., None], axis=1)
+    away, counts = of_blocks - jnp.mean(of_blocks, axis=0), values > 1e-6 * values[-1]
+    variance = jnp.sum(jnp.where(counts, jnp.square(away) / values, 0.0)) / jnp.sum(counts)
+    variance = jnp.maximum(variance * len(places) / max(len(places) - 1, 1), jnp.maximum(noise, TINY))
+    information, told = values / variance, jnp.sum(along, axis=0) / variance
 
-    def of_penalty(penalty):
-        held = penalty * values[-1] * jnp.eye(len(basis), dtype=gram.dtype)
-        step = -jnp.linalg.solve(all_gram + held, all_score)
-        without = left_out_steps(gram, score, places, counted, held) @ basis
-        removed = -(2 * all_score + all_gram @ step) @ step * windows.x0.shape[1] / residuals.size
-        fitted = jnp.sum(values / (values + penalty * values[-1]))
-        return step @ basis, jax.lax.map(error, (without, *own, counted)), removed, fitted
+    def evidence(size: Float[Array, " r"]) -> Float[Array, ""]:
+        spread = 1 + size * information
+        return 0.5 * jnp.sum(size * jnp.square(told) / spread - jnp.log(spread))
 
-    def error(block):
-        change, windows, starts, counted = block
-        return predict_block(with_change(field, change), windows, starts, counted, solver, scale)
-
-    return Anchored(*jax.lax.map(of_penalty, jnp.asarray(penalties, gram.dtype)))
+    penalties = jnp.asarray(PENALTIES, gram.dtype)
+    sizes = jnp.broadcast_to(1 / (penalties * information[-1]), (len(values), len(penalties))).T
+    apparent = error / values  # any of the directions may be all of it
+    with_both, naive = jax.vmap(evidence)(sizes + apparent), jax.vmap(evidence)(sizes)
+    best = jnp.argmax(with_both)
+    held, share = penalties[best] * values[-1], sizes[best] / (sizes[best] + apparent)
+    step = -vectors @ (share * jnp.sum(along, axis=0) / (values + held))
+    held = held * jnp.eye(len(basis), dtype=gram.dtype)
+    without = left_out_steps(NormalEquations(gram, score, score[:, 0]), held, jnp.zeros_like(step), blocks)
+    without = (without @ vectors * share) @ vectors.T
+    odds, naive = jnp.exp(jnp.minimum(jnp.stack([with_both[best] - evidence(apparent), jnp.max(naive)]), 80.0))
+    return Anchored(step @ basis, without @ basis, odds, naive)
 
 
 def with_change(field: AbstractVectorField, change: Float[Array, " w"]) -> AbstractVectorField:

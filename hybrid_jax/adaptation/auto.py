@@ -2,25 +2,40 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation.anchored import fit_anchored, with_change
+from hybrid_jax.adaptation.anchored import fit_anchored, weights_of, with_change
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, groups_of
-from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, fit_candidates, simplest
-from hybrid_jax.adaptation.support import Errors, Unchanged, alike, errors_of, unchanged
+from hybrid_jax.adaptation.selection import (
+    BLOCKS,
+    STRONG,
+    Fit,
+    Posterior,
+    alike,
+    blocks_of,
+    errors_at_ends,
+    fit_each,
+    left_out_steps,
+    posterior,
+    unchanged,
+)
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
-from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
+from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors, ravel_parameters
+from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.status import ended
 from hybrid_jax.training.objective import Settings
@@ -50,36 +65,44 @@ class Choice(NamedTuple):
 
     Attributes:
         names: of the candidates.
-        errors: of each candidate on each of b blocks that were left out (c, b).
+        probability: of each candidate that it is what changed; of the network, over that of the one taken before (c,).
+        refused: which would be more probable than the one taken if the source made no errors (c,).
         taken: the index of the candidate that was taken.
-        supported: which candidates explain more than an error of the source would let them, see `support` (c,).
+        alone: whether physics without the network took the source's place.
         parameters: names of the p parameters of the extended physics, see `extended`.
         free: which of these each candidate fitted (c, p).
-        theta: their values in each candidate, in the physics' own parametrisation (c, p).
+        theta: their values in each candidate, in the physics' own parametrisation; of those that were not taken to
+            first order (c, p).
+        equations: of each window at those that were taken.
         change: of the network's weights in each candidate (c, w); None if the network may not change, or there is none.
+        ends: errors of blocks that were left out, see `errors_at_ends` (b, 2, d).
     """
 
     names: tuple[str, ...]
-    errors: BlockErrors
+    probability: Float[Array, " c"]
+    refused: Bool[Array, " c"]
     taken: Int[Array, ""]
-    supported: Bool[Array, " c"]
+    alone: Bool[Array, ""]
     parameters: tuple[str, ...]
     free: Bool[Array, "c p"]
     theta: Float[Array, "c p"]
+    equations: NormalEquations
     change: Float[Array, "c w"] | None
+    ends: Float[Array, "b 2 d"]
 
 
 @dataclass(frozen=True)
 class Auto(Method):
-    """The simplest of several methods that predicts left-out windows as well as the best; see `selection`.
+    """The change that the windows make most probable, of several that a system may undergo; see `selection`.
 
-    Of a rigid body: the source as it is; θ_p; with them steady forces and torques, drag and the rotors' efficiencies.
-    Of another system: the source, θ_p, θ_p and a constant disturbance. Then, starting from the one that was taken, the
-    network, held at the source's weights.
+    Of a rigid body: none; of θ_p; with these of steady forces and torques, drag and the rotors' efficiencies.
+    Of another system: none, of θ_p, of θ_p and a constant disturbance. Then, with the one that was taken, of the
+    network, held at the source's weights. Where physics without the network predicts the source's own motion better,
+    it takes the source's place.
 
     Attributes:
         networks: whether the network may change.
-        blocks: how many blocks of windows are left out in turn.
+        blocks: how many blocks of windows are left out in turn, for the errors to expect.
         max_steps: the most steps of each fit.
         plausible: how far the changed system plausibly is from the source.
     """
@@ -96,47 +119,116 @@ class Auto(Method):
         """See `Method.solve`.
 
         Args:
-            learned_from: windows that the source was trained on; without any, or if traced, nothing is refused.
+            learned_from: windows that the source was trained on, by default those that it keeps; without any, its
+                errors are not known, and all that these windows show counts as a change.
         """
         jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))  # then the outer program has the options
+        fits, judge, conclude = (fit_each, _judge, _conclude) if traced else (_fit_each, _judged, _concluded)
         # Of the settings these alone matter; as an array, another scale asks for no other program.
         scale, solver = scale_of(settings.objective, train.x0.shape[-1]), settings.solver
-        found = (errors_of if traced else _errors_of)(field, train, solver, scale)
-        expected = Unchanged(-jnp.ones(()), jnp.ones(()))  # supports everything
-        if learned_from is not None and not traced:
-            own = _errors_of(field, alike(learned_from, train), solver, scale)
-            expected = unchanged(field, train, found, own, learned_from)
-        return (Auto._solution if traced else _compiled)(self, field, train, solver, scale, found, expected)
-
-    def _solution(
-        self, field, train: Trajectories, solver: Solver, scale: Scale, found: Errors, expected: Unchanged
-    ) -> Solution:
-        n, d = train.x0.shape
-        starts, noise = found.starts, found.noise
-        larger = extended(field, d)
-        fitted = free_parameters(larger)
-        left = n - blocks_of(n, self.blocks)[0].shape[1]  # windows that fit a block's prediction
-        fitted = {name: free for name, free in fitted.items() if name == "source" or free.sum() < left}
-        free, sizes = np.stack([*fitted.values()]), np.array([each.sum() for each in fitted.values()])
-        held = jnp.sqrt(noise) / self.plausible.sizes(larger, train)
-        fits = fit_candidates(larger, train, free, solver, self.max_steps, scale, self.blocks, starts, held)
-        supported = expected.supports(fits.mse[0] - fits.mse, sizes).at[0].set(True)
-        own = taken_of(fits.errors, supported, sizes)
-        parameters = (*named_parameters(larger),)
-        choice = Choice((*fitted,), fits.errors, own, supported, parameters, jnp.asarray(free), fits.theta, None)
-        if self.networks and has_network(larger):
-            choice = _with_network(larger, choice, sizes, train, solver, scale, self.blocks, starts, expected)
-        status = ended(fits.converged[own], fits.converged[own] | jnp.isfinite(fits.errors.mse[own]).all())
-        return Solution(candidate(larger, choice, choice.taken), fits.steps[own], status, choice)
+        larger = extended(field, train.x0.shape[1])
+        options = self.plausible.sizes(larger, train), solver, scale, self.max_steps
+        free = np.stack([*free_parameters(larger).values()])
+        none, every = np.zeros_like(free[0]), np.ones_like(free[0])
+        own, alone = None, jnp.array(False)
+        learned_from = motion_of(field) if learned_from is None else learned_from
+        if learned_from is not None:
+            learned_from = alike(learned_from, train)
+            own = at(fits(larger, learned_from, np.stack([none, none]), *options), 0)
+            if self.networks and has_network(larger):
+                physics = without_network(larger)
+                rival = at(fits(physics, learned_from, np.stack([none, every]), *options), 1)
+                alone = rival.surely_better(own)
+                physics = ravel_parameters(physics)[1](rival.theta)
+                larger, own = (_where(alone, *pair) for pair in ((physics, larger), (rival, own)))
+        found = fits(larger, train, np.stack([none, every]), *options)
+        chosen, error = judge(larger, train, found, own, learned_from, *options[:3])
+        found = at(fits(larger, train, jnp.stack([jnp.asarray(free)[chosen.taken], none]), *options), 0)
+        return conclude(self, field, larger, train, found, chosen, error, alone, *options[:3])
 
 
-_compiled, _errors_of = jit_with(FASTEST_COMPILE)(Auto._solution), jit_with(FASTEST_COMPILE)(errors_of)
+def _judge(
+    larger: AbstractVectorField, train: Trajectories, found: Fit, own: Fit | None, learned_from, sizes, solver, scale
+) -> tuple[Posterior, Float[Array, ""]]:
+    """The candidates' probabilities, from fits of nothing and of everything, and how much the source may err."""
+    start, free = ravel_parameters(larger)[0], np.stack([*free_parameters(larger).values()])
+    source, every = at(found, 0), at(found, 1)
+    if own is None:
+        gram = jnp.mean(source.equations.gram, axis=0)
+        return posterior(source, every, start, free, sizes, jnp.zeros_like(start), gram), jnp.zeros(())
+    added = network_effect(larger, train, solver, scale) if has_network(larger) else 0.0
+    apparent, error = unchanged(own, source, added, larger, learned_from, train)
+    gram = jnp.mean(own.equations.gram, axis=0)
+    return posterior(source, every, start, free, sizes, apparent, gram), error
 
 
-def taken_of(errors: BlockErrors, supported: Bool[Array, " c"], sizes: np.ndarray) -> Int[Array, ""]:
-    """The simplest candidate near the best, of those that are supported."""
-    return simplest(jnp.where(supported[:, None], errors.mse, jnp.inf), sizes)
+def _conclude(
+    method: Auto, field, larger, train: Trajectories, found: Fit, chosen: Posterior, error, alone, sizes, solver, scale
+) -> Solution:
+    """From the fit of the candidate that was taken: a change of the network, and errors of blocks left out."""
+    start, unravel = ravel_parameters(larger)
+    names, free = zip(*free_parameters(larger).items(), strict=True)
+    free, taken, change = jnp.stack(free), chosen.taken, None
+    theta, blocks = chosen.theta.at[taken].set(found.theta), blocks_of(len(train), method.blocks)
+    probability, refused = chosen.probability, chosen.naive > chosen.naive[taken]
+    equations = masked(found.equations, free[taken] & found.seen)
+    held = jnp.diag(jnp.where(free[taken] & found.seen, found.noise / jnp.square(sizes), 0.0))
+    left_out = found.theta + left_out_steps(equations, held, held @ (found.theta - start), blocks)
+    changes = jnp.zeros((len(left_out), 0))
+    if method.networks and has_network(larger):
+        removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, where physics stands alone
+        step = fit_anchored(unravel(found.theta), train, solver, scale, error, blocks)
+        odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
+        better = odds > STRONG
+        changes, change = jnp.where(better, step.left_out, 0.0), jnp.tile(removed, (len(names) + 1, 1))
+        change = change.at[-1].add(step.change)
+        probability = jnp.append(probability, odds / (1 + odds))
+        refused = jnp.append(refused, (naive > STRONG) & ~better)
+        free, theta = (jnp.concatenate([each, each[taken][None]]) for each in (free, theta))
+        names, taken = (*names, NETWORK), jnp.where(better, len(names), taken)
+
+    def at_ends(block):
+        theta, change, windows, counted = block
+        field = unravel(theta)
+        return errors_at_ends(with_change(field, change) if change.size else field, windows, counted, solver)
+
+    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[blocks[0]], train)
+    ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(blocks[1])))
+    parameters = (*named_parameters(larger),)
+    choice = Choice(names, probability, refused, taken, alone, parameters, free, theta, equations, change, ends)
+    status = ended(found.converged, found.converged | jnp.isfinite(ends).all())
+    return Solution(candidate(extended(field, train.x0.shape[1]), choice, taken), found.steps, status, choice)
+
+
+_compiled = jit_with(FASTEST_COMPILE)
+_fit_each, _judged, _concluded = _compiled(fit_each), _compiled(_judge), _compiled(_conclude)
+
+
+def at(fits: Fit, index: Int[Array, ""] | int) -> Fit:
+    """One of several fits."""
+    return jax.tree.map(lambda leaf: leaf[index], fits)
+
+
+def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
+    """The one of two trees of the same structure."""
+    arrays, rest = eqx.partition(other, eqx.is_array)
+    return eqx.combine(jax.tree.map(partial(jnp.where, which), eqx.filter(one, eqx.is_array), arrays), rest)
+
+
+def network_effect(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> Float[Array, ""]:
+    """The sum of squares of what its network adds to the predictions, over scale."""
+    fields = field, without_network(field)
+    errors = [
+        jax.lax.map(lambda w, f=f: prediction_errors(f, w, solver, scale), windows, batch_size=64) for f in fields
+    ]
+    return jnp.sum(jnp.square(errors[0] - errors[1]))
+
+
+def without_network(field: AbstractVectorField) -> AbstractVectorField:
+    """The field with a network that adds nothing, of the same structure."""
+    weights, unravel = weights_of(field)
+    return eqx.tree_at(lambda hybrid: hybrid.residual, field, unravel(jnp.zeros_like(weights)))
 
 
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:
@@ -167,31 +259,4 @@ def has_network(field: AbstractVectorField) -> bool:
     """Whether a field is a hybrid whose residual is not a disturbance, and can be trained."""
     return (
         isinstance(field, Hybrid) and physics_of(field) is not field and any(jax.tree.leaves(trainable(field.residual)))
-    )
-
-
-def _with_network(
-    larger, choice: Choice, sizes: np.ndarray, windows, solver, scale, blocks, starts, expected: Unchanged
-) -> Choice:
-    """The choice with one more candidate: the one taken so far with its network changed."""
-    steps = fit_anchored(candidate(larger, choice, choice.taken), windows, solver, scale, blocks=blocks, starts=starts)
-    # Penalties are in the order of their strength, so that the first of several as good changes least.
-    best = simplest(steps.errors.mse, np.arange(len(steps.removed)))
-    steps = jax.tree.map(lambda leaf: leaf[best][None], steps)
-    errors = jax.tree.map(lambda *both: jnp.concatenate(both), choice.errors, steps.errors)
-    supported = jnp.concatenate([choice.supported, expected.supports(steps.removed, steps.fitted)])
-    zeros = jnp.zeros((len(choice.names), steps.changes.shape[1]), steps.changes.dtype)
-
-    def repeated(values):
-        return jnp.concatenate([values, values[choice.taken][None]])
-
-    return Choice(
-        (*choice.names, NETWORK),
-        errors,
-        taken_of(errors, supported, np.append(sizes, sizes.max() + 1)),
-        supported,
-        choice.parameters,
-        repeated(choice.free),
-        repeated(choice.theta),
-        jnp.concatenate([zeros, steps.changes]),
     )

@@ -1,110 +1,217 @@
-"""Choose what to adapt by the prediction of windows that were left out.
+"""Choose what to adapt by how probable each change is, where a source may err although nothing has changed.
 
-More parameters always fit the same windows better. So the windows are cut into blocks, each block is predicted by a fit
-to all others, and the simplest candidate is taken whose error is within one standard error, or a tenth, of the smallest
-(Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984, Sec. 3.4.3). Errors are compared as
-ratios: a block with large errors must not decide alone. Windows that touch are predicted as one, since a model that is
-good for 0.1 s can be bad after 1 s.
+Around one fit of everything the squared errors are quadratic in the parameters, so that what every candidate fits, and
+how probable the windows are if it is right, are known in closed form (Kass and Raftery, Bayes factors, 1995). A
+candidate lets its parameters change by a plausible size, see `Plausible`. Beside that every parameter seems to move by
+as much as windows of the source's own motion make it seem: a source is not exact, and windows of one kind of motion,
+such as hover, show its error as steadily as a change. Of the candidates for which the evidence is
+strong that one is taken from whose prediction of the source's own motion the others, weighted by their probability,
+differ least.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.estimation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters
-from hybrid_jax.estimation.normal_equations import equations_of, has_effect, masked, steps_without
-from hybrid_jax.estimation.starts import Starts, Sums, from_starts, unknown_starts
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.estimation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters, rounding
+from hybrid_jax.estimation.normal_equations import (
+    NormalEquations,
+    equations_of,
+    has_effect,
+    inverse,
+    masked,
+    steps_without,
+)
+from hybrid_jax.estimation.starts import from_starts, smoothed
+from hybrid_jax.extrapolation import RANGE
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.trajectories import Trajectories
 
 BLOCKS = 10
 CLUSTERS = 5  # of windows of one flight, for intervals: in gusts, errors a second apart are still correlated
-TOLERANCE = 0.1  # relative difference of errors that does not count
 FEW = 10  # windows, of which no order is seen
 SHIFTS = 20  # other windows that each is compared with
+SURELY = 2.0  # standard errors by which physics alone predicts the source's motion better, where it takes its place
+STRONG = 20.0  # odds against no change from which one is believed (Kass and Raftery 1995)
 JOINED = 10  # windows that touch, at most so many, are predicted as one
+TINY = float(np.finfo(np.float32).tiny)
 
 
-class BlockErrors(NamedTuple):
-    """Of one block, or of several, with windows that touch predicted as one.
+class Fit(NamedTuple):
+    """A fit to n windows, and the quadratic form of the squared errors around it.
 
     Attributes:
-        mse: mean over the windows of the squared error at each step.
-        ends: mean squared error of each state at the end of a window, and of those that touch (2, d).
+        theta: the p parameters, in the order of `ravel_parameters`.
+        equations: of each window, there.
+        noise: variance of one error over scale, from differences of successive errors.
+        seen: which parameters change the predictions by more than rounding.
+        steps: evaluations of the Jacobian.
+        converged: whether it stopped before the most steps, at a finite error.
     """
 
-    mse: Float[Array, "*b"]
-    ends: Float[Array, "*b 2 d"]
+    theta: Float[Array, " p"]
+    equations: NormalEquations
+    noise: Float[Array, ""]
+    seen: Bool[Array, " p"]
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+    def at(self, theta: Float[Array, " p"]) -> NormalEquations:
+        """The equations at other parameters."""
+        (gram, score, square), move = self.equations, theta - self.theta
+        return NormalEquations(gram, score + gram @ move, square + (2 * score + gram @ move) @ move)
+
+    def surely_better(self, other: "Fit") -> Bool[Array, ""]:
+        """Whether it predicts the same windows better, by so many standard errors that it is no chance."""
+        gain = other.equations.square - self.equations.square
+        return jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / jnp.sqrt(len(gain))
 
 
-class Fits(NamedTuple):
-    """Least squares for each of c candidates, and how well it predicts each of b blocks that were left out.
+def fit_each(
+    field: AbstractVectorField, windows: Trajectories, free, sizes, solver: Solver, scale: Scale, max_steps: int
+) -> Fit:
+    """Fits of what each of c candidates leaves free; a distance from the field over its plausible size is an error."""
+    starts, noise = smoothed(field, windows, solver, scale)
+    smooth, weigh = from_starts(windows, starts)
+    noise = jnp.maximum(noise, jnp.square(rounding(windows, scale)) / windows.x.size)
+
+    def one(free: Bool[Array, " p"]) -> Fit:
+        held = jnp.sqrt(noise) / sizes
+        found, jacobian, r = fit_and_linearise(field, smooth, solver, max_steps, scale, free, weigh, held)
+        equations = jax.vmap(equations_of)(jacobian, r)
+        seen = has_effect(equations, windows, scale)
+        theta = ravel_parameters(found.field)[0]
+        return Fit(theta, masked(equations, seen), noise, seen, found.steps, found.converged)
+
+    return jax.lax.map(one, jnp.asarray(free))
+
+
+class Unchanged(NamedTuple):
+    """What windows show where nothing has changed.
 
     Attributes:
-        theta: the parameters of each candidate, in the order of `ravel_parameters` (c, p).
-        errors: of each candidate on each block (c, b).
-        mse: of each candidate on all windows, over scale.
-        steps: evaluations of the Jacobian of each fit.
-        converged: whether each fit stopped before the most steps, at a finite error.
+        apparent: variance of the change of each parameter that they seem to ask for (p,).
+        error: sum over the windows of squared errors of the source, over scale, that they may have in common.
+    """
+
+    apparent: Float[Array, " p"]
+    error: Float[Array, ""]
+
+
+def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, field, learned_from, windows) -> Unchanged:
+    """From the source on its own motion: what each window asks for beyond noise (DerSimonian and Laird 1986).
+
+    Over windows that differ as those do it has its mean. Where they are unlike those, a network may err by as much as
+    it adds to the predictions.
+    """
+    outside, missed = (shares_outside(field, *pair) for pair in ((learned_from, windows), (windows, learned_from)))
+    places = jnp.maximum(1.0, (1 - missed) * len(windows))
+    known, information = (jnp.diagonal(each.equations.gram, axis1=1, axis2=2) for each in (own, found))
+    beyond = jnp.sum(jnp.square(own.equations.score) - own.noise * known, axis=0)
+    apparent = jnp.maximum(beyond, 0.0) / jnp.maximum(jnp.sum(jnp.square(known), axis=0), TINY)
+    unknown = outside * missed * added
+    total = jnp.maximum(jnp.sum(own.equations.square) - own.noise * windows.x.size, 0.0)
+    return Unchanged(
+        apparent / places + unknown / jnp.maximum(jnp.sum(information, axis=0), TINY), total / places + unknown
+    )
+
+
+def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:
+    """As many windows of the source's motion as there are others, and no longer ones, so that one program serves."""
+    places, t = np.linspace(0, len(learned_from) - 1, len(windows)).astype(int), windows.horizon
+    own = Trajectories(learned_from.x0, learned_from.u[:, :t], learned_from.x[:, :t], learned_from.dt)
+    return jax.tree.map(lambda leaf, other: jnp.asarray(leaf[places], other.dtype), own, windows)
+
+
+class Posterior(NamedTuple):
+    """Of each of c candidates.
+
+    Attributes:
+        theta: the parameters, to first order (c, p).
+        probability: that it is what changed (c,).
+        naive: the same, of a source that makes no errors.
+        taken: the index of the candidate that was taken.
     """
 
     theta: Float[Array, "c p"]
-    errors: BlockErrors
-    mse: Float[Array, " c"]
-    steps: Int[Array, " c"]
-    converged: Bool[Array, " c"]
+    probability: Float[Array, " c"]
+    naive: Float[Array, " c"]
+    taken: Int[Array, ""]
 
 
-@eqx.filter_jit
-def fit_candidates(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    free: Bool[np.ndarray, "c p"],
-    solver: Solver = None,
-    max_steps: int = 100,
-    scale: Scale = None,
-    blocks: int = BLOCKS,
-    starts: Starts | None = None,
-    held: Float[Array, " p"] | float = 0.0,
-) -> Fits:
-    """Fit the parameters that each candidate leaves free; the others stay as they are.
-
-    A block is predicted with the parameters of one Gauss-Newton step, from the fit to all windows, on the other blocks.
+def posterior(
+    source: Fit, every: Fit, start, free, sizes, apparent: Float[Array, " p"], gram: Float[Array, "p p"]
+) -> Posterior:
+    """Compare candidates by the squared errors around the source.
 
     Args:
-        free: for each candidate which of the parameters, in the order of `ravel_parameters`, are fitted.
-        windows: in the order of time.
-        starts: of the windows, see `smoothed`; by default as they were measured.
-        held: what a parameter's distance from the field's counts as, see `fit_and_linearise`.
+        source: a fit of nothing.
+        every: a fit of everything.
+        start: the source's parameters (p,).
+        free: which of them each candidate changes (c, p).
+        sizes: plausible changes; infinite for one of which nothing is known, which may change as one window says.
+        apparent: variance of the changes that these windows show where nothing has changed.
+        gram: of the predictions of the source's motion.
     """
-    start, at = ravel_parameters(field)
-    smooth, weigh = from_starts(windows, starts)
-    held = jnp.broadcast_to(jnp.asarray(held, start.dtype), start.shape)
-    places, counted = blocks_of(len(windows), blocks)
-    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[places], (windows, starts))
+    variance = dispersion(every, sizes)  # what remains where everything may change
+    information = jnp.sum(source.equations.gram, axis=0) / variance
+    pull = -jnp.sum(source.equations.score, axis=0) / variance
+    one_window = len(source.equations.score) / jnp.maximum(jnp.diagonal(information), TINY)
+    plausible = jnp.where(jnp.isfinite(sizes), jnp.square(sizes), one_window)
 
-    def one(free: Bool[Array, " p"]):
-        found, jacobian, r = fit_and_linearise(field, smooth, solver, max_steps, scale, free, weigh, held)
-        theta = ravel_parameters(found.field)[0]
-        equations = jax.vmap(equations_of)(jacobian, r)
-        equations = masked(equations, free & has_effect(equations, windows, scale))
-        prior = jnp.diag(jnp.square(held)) * (free & free[:, None])
-        pull = prior @ (theta - start)
-        without = theta + left_out_steps(equations.gram, equations.score, places, counted, prior, pull)
+    def of_candidate(prior: tuple[Float[Array, " p"], Float[Array, " p"]]):
+        change, wide = prior[0], prior[0] + prior[1]
+        root = jnp.sqrt(wide)
+        values, vectors = jnp.linalg.eigh(root[:, None] * information * root)
+        values, along = jnp.maximum(values, 0.0), vectors.T @ (root * pull)
+        evidence = 0.5 * jnp.sum(jnp.square(along) / (1 + values) - jnp.log1p(values))
+        mean = change / jnp.sqrt(jnp.maximum(wide, TINY)) * (vectors @ (along / (1 + values)))
+        return mean, evidence
 
-        def error(left_out):
-            theta, windows, starts, counted = left_out
-            return predict_block(at(theta), windows, starts, counted, solver, scale)
+    changes = jnp.where(jnp.asarray(free) & source.seen, plausible, 0.0)
+    move, evidence = jax.lax.map(of_candidate, (changes, jnp.broadcast_to(apparent, changes.shape)))
+    _, naive = jax.lax.map(of_candidate, (changes, jnp.zeros_like(changes)))
+    evidence, naive = (jnp.where(jnp.isfinite(each), each, -jnp.inf).at[0].max(-1e30) for each in (evidence, naive))
+    probability = jax.nn.softmax(evidence)
+    move = jnp.where(jnp.isfinite(move), move, 0.0)
+    differ = move[:, None] - move
+    risk = jnp.einsum("c,acp,pq,acq->a", probability, differ, gram, differ)
+    strong = (evidence > evidence[0] + np.log(STRONG)).at[0].set(True)
+    taken = jnp.argmin(jnp.where(strong & jnp.isfinite(risk), risk, jnp.inf))
+    return Posterior(start + move, probability, jax.nn.softmax(naive), taken)
 
-        errors = jax.lax.map(error, (without, *own, counted))
-        return theta, errors, found.mse, found.steps, found.converged
 
-    return Fits(*jax.lax.map(one, jnp.asarray(free)))
+def dispersion(found: Fit, sizes) -> Float[Array, ""]:
+    """The variance of an error by what blocks of windows ask the parameters for: at least that of noise.
+
+    Errors that are correlated within a block say less than as many independent ones (Wedderburn 1974).
+    """
+    places, counted = blocks_of(len(found.equations.score), BLOCKS)
+    score = jnp.sum(found.equations.score[places] * counted[..., None], axis=1)
+    total = jnp.sum(found.equations.gram, axis=0)
+    # A parameter of unit effect; what no window tells apart is held at the source.
+    unit = 1 / jnp.sqrt(jnp.diagonal(total) + found.noise / jnp.square(sizes))
+    held = unit[:, None] * (total + jnp.diag(found.noise / jnp.square(sizes))) * unit
+    matrix = inverse(held).matrix
+    spread = jnp.einsum("bp,pq,bq->", score * unit, matrix, score * unit) * len(places) / max(len(places) - 1, 1)
+    return jnp.maximum(spread / jnp.maximum(jnp.sum(matrix * unit[:, None] * total * unit), TINY), found.noise)
+
+
+def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Trajectories) -> Float[Array, ""]:
+    """The largest share over quantities of samples outside of the 1 to 99 % range of the known ones; it compiles."""
+    space, t = state_space(field, known.x0.shape[-1]), min(known.horizon, asked.horizon)
+
+    def features(windows: Trajectories) -> dict[str, Any]:
+        parts: Any = (jnp.asarray(each)[:, :t] for each in (windows.x, windows.u))
+        return space.features(*(each.reshape(-1, each.shape[-1]) for each in parts))
+
+    ends = {name: jnp.quantile(values, jnp.asarray(RANGE)) for name, values in features(known).items()}
+    outside = [(values < ends[name][0]) | (values > ends[name][1]) for name, values in features(asked).items()]
+    return jnp.max(jnp.stack([jnp.mean(each) for each in outside]))
 
 
 def blocks_of(windows: int, blocks: int) -> tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]:
@@ -115,53 +222,33 @@ def blocks_of(windows: int, blocks: int) -> tuple[Int[np.ndarray, "b m"], Bool[n
 
 
 def left_out_steps(
-    gram: Float[Array, "n p p"],
-    score: Float[Array, "n p"],
-    places: Int[np.ndarray, "b m"],
-    counted: Bool[np.ndarray, "b m"],
-    held: Float[Array, "p p"] | float = 0.0,
-    pull: Float[Array, " p"] | float = 0.0,
+    equations: NormalEquations, held: Float[Array, "p p"], pull: Float[Array, " p"], blocks
 ) -> Float[Array, "b p"]:
-    """The Gauss-Newton step on all blocks but one, for each block; `held` is the matrix of a penalty, `pull` its half
-    slope."""
-    weight = counted[..., None]
-    gram = jnp.sum(gram[places] * weight[..., None], axis=1)
-    score = jnp.sum(score[places] * weight, axis=1)
+    """The Gauss–Newton step on all blocks but one, for each block, with the matrix of a penalty and its half slope."""
+    places, counted = blocks
+    gram = jnp.sum(equations.gram[places] * counted[..., None, None], axis=1)
+    score = jnp.sum(equations.score[places] * counted[..., None], axis=1)
     return steps_without(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0) + pull, gram, score)
 
 
-def predict_block(
-    field: AbstractVectorField,
-    block: Trajectories,
-    starts: Starts | None,
-    counted: Bool[Array, " m"],
-    solver: Solver = None,
-    scale: Scale = None,
-) -> BlockErrors:
-    """The errors of a field on the windows of a block that count, without what other starts would change."""
-    free = starts is not None
-    starts = unknown_starts(block) if starts is None else starts
+def errors_at_ends(
+    field: AbstractVectorField, block: Trajectories, counted: Bool[Array, " m"], solver: Solver = None
+) -> Float[Array, "2 d"]:
+    """Mean squared error of each state at the end of a window, and of windows that touch, predicted as one."""
 
     def one(carry, item):
-        (end, smooth_end), recorded, sums = carry
-        window, start, counted, i = item
+        end, recorded = carry
+        window, counted, i = item
         touches = counted & jnp.all(window.x0 == recorded) & (i % JOINED > 0)
-        begin = jnp.stack([window.x0, jnp.where(touches, end, window.x0), jnp.where(touches, smooth_end, start.x0)])
-        alone, predicted, smooth = jax.vmap(lambda x0: rollout(field, x0, window.u, block.dt, compact(solver)))(begin)
-        difference = window.x - smooth if scale is None else (window.x - smooth) / scale
-        sums = jax.tree.map(lambda one, new: jnp.where(touches, one, new), sums, Sums.of(start.jump, start.trust))
-        sums = sums.and_those(difference, start.effect)
-        error = sums.unexplained() if free else sums.square
-        ends = jnp.square(jnp.stack([alone[-1], predicted[-1]]) - window.x[-1])
-        return ((predicted[-1], smooth[-1]), window.x[-1], sums), (jnp.where(counted, error, 0.0), ends, touches)
+        begin = jnp.stack([window.x0, jnp.where(touches, end, window.x0)])
+        alone, joined = jax.vmap(lambda x0: rollout(field, x0, window.u, block.dt, compact(solver))[-1])(begin)
+        return (joined, window.x[-1]), (jnp.square(jnp.stack([alone, joined]) - window.x[-1]), touches)
 
     nowhere = jnp.full_like(block.x0[0], jnp.nan)  # touches nothing
-    begin = (nowhere, nowhere), nowhere, Sums.of(starts.jump[0], starts.trust[0])
-    _, (errors, ends, touches) = jax.lax.scan(one, begin, (block, starts, counted, jnp.arange(len(counted))))
+    _, (ends, touches) = jax.lax.scan(one, (nowhere, nowhere), (block, counted, jnp.arange(len(counted))))
     last = counted & ~jnp.roll(touches, -1).at[-1].set(False)  # windows after which no other goes on
     weights = jnp.stack([counted / jnp.sum(counted), last / jnp.sum(last)], axis=1)
-    mse = jnp.sum(jnp.where(last, errors, 0.0)) / (jnp.sum(counted) * block.x.shape[1])
-    return BlockErrors(mse, jnp.einsum("mh,mhd->hd", weights, ends))
+    return jnp.einsum("mh,mhd->hd", weights, ends)
 
 
 def correlated(windows: Trajectories) -> int:
@@ -199,27 +286,3 @@ def longest_chain(windows: Trajectories, blocks: int) -> int:
             length = length + 1 if touch and i % JOINED else 1
             longest = max(longest, length)
     return longest
-
-
-def simplest(errors: Float[Array, "c b"], sizes: Int[np.ndarray, " c"]) -> Int[Array, ""]:
-    """The candidate of the smallest size whose log error is within one standard error, or a tenth, of the best.
-
-    Of several of this size, the best. A candidate with an error that is not finite is not taken; 0 if all are.
-    """
-    logs = _logarithm(errors)
-    mean = jnp.where(jnp.isfinite(logs).all(axis=1), jnp.mean(logs, axis=1), jnp.inf)
-    worse = logs - logs[jnp.argmin(mean)]
-    margin = jnp.std(worse, axis=1, ddof=1) / jnp.sqrt(errors.shape[1])
-    near = jnp.isfinite(mean) & (jnp.mean(worse, axis=1) <= jnp.maximum(margin, TOLERANCE))
-    order = np.asarray(sizes) * len(sizes) + jnp.argsort(jnp.argsort(mean))
-    return jnp.argmin(jnp.where(near, order, np.iinfo(np.int32).max))
-
-
-@jax.jit  # as one small program, not four
-def geometric_mean(errors: Float[Array, "c b"]) -> Float[Array, " c"]:
-    """Over the blocks."""
-    return jnp.exp(jnp.mean(_logarithm(errors), axis=1))
-
-
-def _logarithm(errors: Float[Array, "c b"]) -> Float[Array, "c b"]:
-    return jnp.log(jnp.maximum(errors, jnp.finfo(errors.dtype).tiny))  # an exact prediction has none

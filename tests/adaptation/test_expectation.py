@@ -10,7 +10,7 @@ from test_auto import flown, hybrid
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation.expectation import expected_errors, lines_of
-from hybrid_jax.adaptation.selection import longest_chain, predict_block
+from hybrid_jax.adaptation.selection import errors_at_ends, longest_chain
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.state_space import StateSpace
@@ -59,14 +59,14 @@ def test_errors_after_windows_that_touch_are_those_of_one_long_prediction():
              for x0, at in zip((whole.x0, whole.x[:, 7], whole.x[:, 15]), (0, 8, 16), strict=True)]  # fmt: skip
     chained = hj.Trajectories(*(jnp.concatenate([getattr(p, n) for p in parts]) for n in ("x0", "u", "x")), whole.dt)
     field = pendulum(0.8)
-    found = predict_block(field, chained, None, jnp.ones(3, bool)).ends
+    found = errors_at_ends(field, chained, jnp.ones(3, bool))
     alone = hj.rollout_batch(field, chained.x0, chained.u, whole.dt)[:, -1] - chained.x[:, -1]
     long = hj.rollout_batch(field, whole.x0, whole.u, whole.dt)[:, -1] - whole.x[:, -1]
     np.testing.assert_allclose(found[0], np.square(alone).mean(axis=0), rtol=1e-4)
     np.testing.assert_allclose(found[1], np.square(long).mean(axis=0), rtol=1e-4)
     assert longest_chain(chained, 1) == 3
     assert longest_chain(chained, 3) == 1  # blocks of one window
-    padded = predict_block(field, chained[np.array([0, 1, 2, 2])], None, jnp.array([True, True, True, False])).ends
+    padded = errors_at_ends(field, chained[np.array([0, 1, 2, 2])], jnp.array([True, True, True, False]))
     np.testing.assert_allclose(padded, found, rtol=1e-5)
 
 

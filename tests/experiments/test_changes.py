@@ -21,8 +21,7 @@ def rows(taken="theta", theta=0.05, force=0.06, fine_tune=0.5, inside=0.8):
         for draw, seed in np.ndindex(4, 9):
             errors = {"source": 1.0, "theta": theta, "force": force, "fine_tune": fine_tune}
             for name, error in errors.items():
-                candidate = {"left_out": None if name == "fine_tune" else error, "taken": name == taken}
-                candidate |= {"expected_inside": inside if name == taken else None}
+                candidate = {"taken": name == taken, "expected_inside": inside if name == taken else None}
                 tags = {"domain": domain, "candidate": name, "draw": draw, "seed": seed, "test_mse": error}
                 found.append(tags | candidate)
     return Results(found, TAGS)
