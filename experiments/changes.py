@@ -31,7 +31,8 @@ from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate, extended
 from hybrid_jax.adaptation.expectation import expected_errors
-from hybrid_jax.adaptation.selection import BLOCKS, alike, blocks_of, errors_at_ends
+from hybrid_jax.adaptation.methods import scale_of
+from hybrid_jax.adaptation.selection import BLOCKS, alike, blocks_of, errors_at_ends, fit_each
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.io.datasets import Dataset
@@ -49,7 +50,7 @@ from hybrid_jax.vehicle import IRIS
 NAME = "changes"
 INSIDE = "expected_inside"  # column: see `_share_inside`
 Compared = Literal["fine_tune", "fine_tune_offset", "l2_sp"]
-OFFSET = 0.3
+METHOD, OFFSET = Auto(), 0.3
 L2_SP = FineTune(l2_sp=1e-2)
 HEAD = f"""# {NAME}
 
@@ -139,7 +140,7 @@ def adapted(
 ) -> list[Row]:
     """The rows of a domain: every candidate, and the methods to compare with, for every draw and seed."""
     target = flown(domain, target_splits(config), config, stages)
-    pool, test, drawn = target.splits["train"], target.splits["test"], windows_of(Auto(), config.sizes[0], config)[0]
+    pool, test, drawn = target.splits["train"], target.splits["test"], windows_of(METHOD, config.sizes[0], config)[0]
 
     flights, seeds = pool[drawn[:: config.seeds]], range(config.seeds)
 
@@ -211,8 +212,12 @@ def _candidates(
 
     def one(run) -> Tested:
         field, windows = run
-        choice = Auto().solve(field, windows, windows, shared, known).choice
+        choice = METHOD.solve(field, windows, windows, shared, known).choice
         larger = extended(field, STATE_SIZE)
+        # Of candidates that were not taken `choice` knows the parameters to first order alone.
+        options = METHOD.plausible.sizes(larger, windows), shared.solver, scale_of(shared.objective, STATE_SIZE)
+        fits, _ = fit_each(candidate(larger, choice, 0), windows, choice.free, *options, METHOD.max_steps)
+        choice = choice._replace(theta=fits.theta)
 
         def error(index):
             return rollout_mse(candidate(larger, choice, index), test, EVERY, shared.solver)
@@ -230,7 +235,7 @@ def _candidates(
     def of_flight(field, flight):
         blocks = jax.tree.map(lambda leaf: leaf[places[0]], flight), jnp.asarray(places[1])
         return jnp.mean(
-            jax.lax.map(lambda block: errors_at_ends(field, *block, shared.solver), blocks),
+            jax.lax.map(lambda block: errors_at_ends(field, block[0], block[1], shared.solver), blocks),
             axis=0,
         )
 

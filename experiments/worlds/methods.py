@@ -72,7 +72,8 @@ def kalman_filter(task: Task) -> Model:
     online = hj.OnlineAdaptation(physics, DT, tuple(noise.tolist()), disturbance=CHANGING)
     x, u = (jnp.asarray(part).reshape(-1, part.shape[-1]) for part in (task.windows.x, task.windows.u))
     state = _filtered(online, jnp.asarray(task.windows.x0[0]), x, u)
-    return Model(online.model(state), {name: Parameter(*map(float, v)) for name, v in online.intervals(state).items()})
+    found = {name: Parameter(float(v[0]), float(v[1]), float(v[2])) for name, v in online.intervals(state).items()}
+    return Model(online.model(state), found)
 
 
 @eqx.filter_jit

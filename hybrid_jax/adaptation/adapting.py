@@ -10,6 +10,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -28,7 +29,7 @@ from hybrid_jax.dynamics.disturbance import (
     without_zeros,
 )
 from hybrid_jax.dynamics.rigid_body import uncorrected
-from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters
+from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters, sandwich
 from hybrid_jax.extrapolation import WARN, features_of, shares_outside
 from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.files import json_value
@@ -268,7 +269,6 @@ def adapt(
     status = Status(int(solution.status))
     without = None if exact and choice.get("chosen") != NETWORK else NOT_LEAST_SQUARES
     without = NOT_FINITE if status == Status.DIVERGED else without
-    free = None if solution.choice is None else _fitted(solution.choice, adapted)
     found = disturbance_of(adapted)
     return Adaptation(
         field=adapted,
@@ -284,7 +284,7 @@ def adapt(
         if learned_from is None
         else shares_outside(*(features_of(w, space) for w in (learned_from, windows))),
         **choice,
-        **_parameters(adapted, train, settings, level, without, free),
+        **_parameters(adapted, train, settings, level, without, solution.choice),
     )
 
 
@@ -303,12 +303,6 @@ def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[st
         "expected": expected_errors(np.asarray(choice.ends), (round(seconds, 9), round(chain, 9)), space),
         "units": {one.name: one.unit for one in space.quantities},
     }
-
-
-def _fitted(choice: Choice, adapted: AbstractVectorField) -> np.ndarray:
-    """Which parameters of the adapted field were fitted (p,)."""
-    free = dict(zip(choice.parameters, np.asarray(choice.free)[choice.taken].tolist(), strict=True))
-    return np.array([free[name] for name in named_parameters(adapted)])
 
 
 def _named(method: str | Method) -> tuple[str, Method]:
@@ -338,7 +332,12 @@ def _size(field: AbstractVectorField) -> int:
 
 
 def _parameters(
-    field: AbstractVectorField, windows: Trajectories, settings: Settings, level: float, without: str | None, free
+    field: AbstractVectorField,
+    windows: Trajectories,
+    settings: Settings,
+    level: float,
+    without: str | None,
+    choice: Choice | None,
 ) -> dict[str, Any]:
     """The attributes of `Adaptation` about the parameters: why there are no intervals, if there are none."""
     if not 0 < _size(field) <= NAMED:
@@ -348,17 +347,31 @@ def _parameters(
     values = named_parameters(field)
     units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
     alone = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
+    free = np.ones(len(values), bool)
+    if choice is not None:
+        places = [choice.parameters.index(name) for name in values]
+        free = np.asarray(choice.free)[choice.taken][places]
+    if without is None and not free.any():
+        without = NOT_FITTED
+    if without is None and len(windows) <= free.sum():
+        without = FEW.format(len(windows), free.sum())
     if without is not None:
         return {"parameters": alone, "without_intervals": without}
-    if free is not None and not free.any():
-        return {"parameters": alone, "without_intervals": NOT_FITTED}
-    scale, cluster = scale_of(settings.objective, windows.x0.shape[-1]), correlated(windows)
+    cluster = correlated(windows)
     degrees = None if cluster == 1 else -(-len(windows) // cluster) - 1
-    covariance = covariance_of(field, windows, solver=settings.solver, scale=scale, free=free, cluster=cluster)
+    if choice is None:
+        scale = scale_of(settings.objective, windows.x0.shape[-1])
+        covariance = np.asarray(covariance_of(field, windows, solver=settings.solver, scale=scale, cluster=cluster))
+    else:
+        unseen = free & (np.asarray(choice.equations.score) == 0).all(axis=0)[places]
+        covariance = np.asarray(sandwich(choice.equations, int(free.sum()), cluster))[np.ix_(places, places)]
+        covariance = covariance + np.diag(np.where(unseen, np.inf, 0.0))
     if np.isnan(covariance).any():
         return {"parameters": alone, "without_intervals": NOT_FINITE}
-    found = intervals(field, covariance, level, degrees)
-    fitted = [*values] if free is None else [name for name, one in zip(values, free, strict=True) if one]
-    bounded = {name: Parameter(*map(float, found[name]), unit=units[name]) for name in fitted}
-    result = {"parameters": alone | bounded, "without_intervals": None}
-    return result | {"covariance": np.asarray(covariance), "degrees": degrees}
+    found = intervals(field, jnp.asarray(covariance), level, degrees)
+    bounded = {
+        name: Parameter(*map(float, found[name]), unit=units[name])
+        for name, one in zip(values, free, strict=True)
+        if one
+    }
+    return {"parameters": alone | bounded, "without_intervals": None, "covariance": covariance, "degrees": degrees}

@@ -20,7 +20,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
 from hybrid_jax.estimation.normal_equations import NormalEquations
-from hybrid_jax.estimation.starts import from_starts, smoothed
+from hybrid_jax.estimation.starts import Starts, from_starts
 from hybrid_jax.trajectories import Trajectories
 
 RANK = 32  # dimensions of the subspace
@@ -45,16 +45,23 @@ class Anchored(NamedTuple):
 
 
 def fit_anchored(
-    field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, error: Float[Array, ""], blocks
+    field: AbstractVectorField,
+    windows: Trajectories,
+    starts: Starts | None,
+    noise: Float[Array, ""],
+    solver: Solver,
+    scale: Scale,
+    error: Float[Array, ""],
+    blocks,
 ) -> Anchored:
     """The step for all penalties, and the best.
 
     Args:
+        starts: of the windows, see `smoothed`, and the variance of one error from noise.
         error: sum of squares that the source may err where nothing has changed, see `Unchanged`.
         blocks: of windows, see `blocks_of`.
     """
     weights, _ = weights_of(field)
-    starts, noise = smoothed(field, windows, solver, scale)
     smooth, weigh = from_starts(windows, starts)
 
     def errors(change: Float[Array, " w"]) -> Float[Array, "n e"]:
@@ -75,11 +82,11 @@ def fit_anchored(
     effects = jnp.moveaxis(jax.lax.map(push, basis, batch_size=TOGETHER), 0, -1)
     gram, score = jnp.einsum("ner,nes->nrs", effects, effects), jnp.einsum("ner,ne->nr", effects, residuals)
     values, vectors = jnp.linalg.eigh(jnp.sum(gram, axis=0))
-    values = jnp.maximum(values, TINY)
+    values = jnp.maximum(values, jnp.maximum(1e-6 * values[-1], TINY))
     along = score @ vectors  # of each window
     places, counted = blocks
     of_blocks = jnp.sum(along[places] * counted[..., None], axis=1)
-    away, counts = of_blocks - jnp.mean(of_blocks, axis=0), values > 1e-6 * values[-1]
+    away, counts = of_blocks - jnp.mean(of_blocks, axis=0), values > 2e-6 * values[-1]
     variance = jnp.sum(jnp.where(counts, jnp.square(away) / values, 0.0)) / jnp.sum(counts)
     variance = jnp.maximum(variance * len(places) / max(len(places) - 1, 1), jnp.maximum(noise, TINY))
     information, told = values / variance, jnp.sum(along, axis=0) / variance

@@ -56,6 +56,7 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "all": ("theta", "force", "torque", "drag", "efficiency"),
 }
 PLAUSIBLE = Plausible()
+ROUNDS = 2  # the second one around what the first has taken: squared errors are not quadratic over large changes
 NETWORK = "network"  # the candidate that changes the network
 CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
@@ -130,44 +131,43 @@ class Auto(Method):
         larger = extended(field, train.x0.shape[1])
         options = self.plausible.sizes(larger, train), solver, scale, self.max_steps
         free = np.stack([*free_parameters(larger).values()])
-        none, every = np.zeros_like(free[0]), np.ones_like(free[0])
+        none, all_of_them = np.zeros_like(free[0]), np.ones_like(free[0])
         own, alone = None, jnp.array(False)
         learned_from = motion_of(field) if learned_from is None else learned_from
         if learned_from is not None:
             learned_from = alike(learned_from, train)
-            own = at(fits(larger, learned_from, np.stack([none, none]), *options), 0)
+            own = at(fits(larger, learned_from, np.stack([none, none]), *options)[0], 0)
             if self.networks and has_network(larger):
                 physics = without_network(larger)
-                rival = at(fits(physics, learned_from, np.stack([none, every]), *options), 1)
+                rival = at(fits(physics, learned_from, np.stack([none, all_of_them]), *options)[0], 1)
                 alone = rival.surely_better(own)
                 physics = ravel_parameters(physics)[1](rival.theta)
                 larger, own = (_where(alone, *pair) for pair in ((physics, larger), (rival, own)))
-        found = fits(larger, train, np.stack([none, every]), *options)
-        chosen, error = judge(larger, train, found, own, learned_from, *options[:3])
-        found = at(fits(larger, train, jnp.stack([jnp.asarray(free)[chosen.taken], none]), *options), 0)
-        return conclude(self, field, larger, train, found, chosen, error, alone, *options[:3])
+        found, starts = fits(larger, train, np.stack([none, all_of_them]), *options)
+        found, every = (at(found, i) for i in (0, 1))
+        for _ in range(ROUNDS):
+            chosen, error = judge(larger, train, found, every, own, learned_from, *options[:3])
+            found = at(fits(larger, train, jnp.stack([jnp.asarray(free)[chosen.taken], none]), *options)[0], 0)
+        return conclude(self, field, larger, train, starts, found, chosen, error, alone, options[:3])
 
 
 def _judge(
-    larger: AbstractVectorField, train: Trajectories, found: Fit, own: Fit | None, learned_from, sizes, solver, scale
+    larger, train: Trajectories, around: Fit, every: Fit, own: Fit | None, learned_from, sizes, solver, scale
 ) -> tuple[Posterior, Float[Array, ""]]:
-    """The candidates' probabilities, from fits of nothing and of everything, and how much the source may err."""
+    """The candidates' probabilities, around one fit and by one of everything, and how much the source may err."""
     start, free = ravel_parameters(larger)[0], np.stack([*free_parameters(larger).values()])
-    source, every = at(found, 0), at(found, 1)
     if own is None:
-        gram = jnp.mean(source.equations.gram, axis=0)
-        return posterior(source, every, start, free, sizes, jnp.zeros_like(start), gram), jnp.zeros(())
+        return posterior(around, every, start, free, sizes, jnp.zeros_like(start)), jnp.zeros(())
     added = network_effect(larger, train, solver, scale) if has_network(larger) else 0.0
-    apparent, error = unchanged(own, source, added, larger, learned_from, train)
-    gram = jnp.mean(own.equations.gram, axis=0)
-    return posterior(source, every, start, free, sizes, apparent, gram), error
+    apparent, error = unchanged(own, around, added, larger, learned_from, train)
+    return posterior(around, every, start, free, sizes, apparent), error
 
 
 def _conclude(
-    method: Auto, field, larger, train: Trajectories, found: Fit, chosen: Posterior, error, alone, sizes, solver, scale
+    method: Auto, field, larger, train: Trajectories, starts, found: Fit, chosen: Posterior, error, alone, options
 ) -> Solution:
     """From the fit of the candidate that was taken: a change of the network, and errors of blocks left out."""
-    start, unravel = ravel_parameters(larger)
+    (sizes, solver, scale), (start, unravel) = options, ravel_parameters(larger)
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
     theta, blocks = chosen.theta.at[taken].set(found.theta), blocks_of(len(train), method.blocks)
@@ -178,7 +178,7 @@ def _conclude(
     changes = jnp.zeros((len(left_out), 0))
     if method.networks and has_network(larger):
         removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, where physics stands alone
-        step = fit_anchored(unravel(found.theta), train, solver, scale, error, blocks)
+        step = fit_anchored(unravel(found.theta), train, starts, found.noise, solver, scale, error, blocks)
         odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
         better = odds > STRONG
         changes, change = jnp.where(better, step.left_out, 0.0), jnp.tile(removed, (len(names) + 1, 1))

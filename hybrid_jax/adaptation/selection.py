@@ -4,9 +4,8 @@ Around one fit of everything the squared errors are quadratic in the parameters,
 how probable the windows are if it is right, are known in closed form (Kass and Raftery, Bayes factors, 1995). A
 candidate lets its parameters change by a plausible size, see `Plausible`. Beside that every parameter seems to move by
 as much as windows of the source's own motion make it seem: a source is not exact, and windows of one kind of motion,
-such as hover, show its error as steadily as a change. Of the candidates for which the evidence is
-strong that one is taken from whose prediction of the source's own motion the others, weighted by their probability,
-differ least.
+such as hover, show its error as steadily as a change. The most probable candidate is taken if the
+evidence against no change is strong.
 """
 
 from typing import Any, NamedTuple
@@ -26,7 +25,7 @@ from hybrid_jax.estimation.normal_equations import (
     masked,
     steps_without,
 )
-from hybrid_jax.estimation.starts import from_starts, smoothed
+from hybrid_jax.estimation.starts import Starts, from_starts, smoothed
 from hybrid_jax.extrapolation import RANGE
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.trajectories import Trajectories
@@ -73,8 +72,11 @@ class Fit(NamedTuple):
 
 def fit_each(
     field: AbstractVectorField, windows: Trajectories, free, sizes, solver: Solver, scale: Scale, max_steps: int
-) -> Fit:
-    """Fits of what each of c candidates leaves free; a distance from the field over its plausible size is an error."""
+) -> tuple[Fit, Starts | None]:
+    """Fits of what each of c candidates leaves free; a distance from the field over its plausible size is an error.
+
+    Also the starts of the windows that they take, see `smoothed`.
+    """
     starts, noise = smoothed(field, windows, solver, scale)
     smooth, weigh = from_starts(windows, starts)
     noise = jnp.maximum(noise, jnp.square(rounding(windows, scale)) / windows.x.size)
@@ -87,7 +89,7 @@ def fit_each(
         theta = ravel_parameters(found.field)[0]
         return Fit(theta, masked(equations, seen), noise, seen, found.steps, found.converged)
 
-    return jax.lax.map(one, jnp.asarray(free))
+    return jax.lax.map(one, jnp.asarray(free)), starts
 
 
 class Unchanged(NamedTuple):
@@ -106,14 +108,14 @@ def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, field, lear
     """From the source on its own motion: what each window asks for beyond noise (DerSimonian and Laird 1986).
 
     Over windows that differ as those do it has its mean. Where they are unlike those, a network may err by as much as
-    it adds to the predictions.
+    it adds to the predictions: errors of a share of the windows move a parameter by no more than this share.
     """
     outside, missed = (shares_outside(field, *pair) for pair in ((learned_from, windows), (windows, learned_from)))
     places = jnp.maximum(1.0, (1 - missed) * len(windows))
     known, information = (jnp.diagonal(each.equations.gram, axis1=1, axis2=2) for each in (own, found))
     beyond = jnp.sum(jnp.square(own.equations.score) - own.noise * known, axis=0)
     apparent = jnp.maximum(beyond, 0.0) / jnp.maximum(jnp.sum(jnp.square(known), axis=0), TINY)
-    unknown = outside * missed * added
+    unknown = jnp.square(outside * missed) * added
     total = jnp.maximum(jnp.sum(own.equations.square) - own.noise * windows.x.size, 0.0)
     return Unchanged(
         apparent / places + unknown / jnp.maximum(jnp.sum(information, axis=0), TINY), total / places + unknown
@@ -143,24 +145,21 @@ class Posterior(NamedTuple):
     taken: Int[Array, ""]
 
 
-def posterior(
-    source: Fit, every: Fit, start, free, sizes, apparent: Float[Array, " p"], gram: Float[Array, "p p"]
-) -> Posterior:
-    """Compare candidates by the squared errors around the source.
+def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array, " p"]) -> Posterior:
+    """Compare candidates by the squared errors around one of them.
 
     Args:
-        source: a fit of nothing.
+        around: its fit.
         every: a fit of everything.
         start: the source's parameters (p,).
         free: which of them each candidate changes (c, p).
         sizes: plausible changes; infinite for one of which nothing is known, which may change as one window says.
         apparent: variance of the changes that these windows show where nothing has changed.
-        gram: of the predictions of the source's motion.
     """
     variance = dispersion(every, sizes)  # what remains where everything may change
-    information = jnp.sum(source.equations.gram, axis=0) / variance
-    pull = -jnp.sum(source.equations.score, axis=0) / variance
-    one_window = len(source.equations.score) / jnp.maximum(jnp.diagonal(information), TINY)
+    information = jnp.sum(around.equations.gram, axis=0) / variance
+    pull = -jnp.sum(around.at(start).score, axis=0) / variance
+    one_window = len(around.equations.score) / jnp.maximum(jnp.diagonal(information), TINY)
     plausible = jnp.where(jnp.isfinite(sizes), jnp.square(sizes), one_window)
 
     def of_candidate(prior: tuple[Float[Array, " p"], Float[Array, " p"]]):
@@ -172,17 +171,12 @@ def posterior(
         mean = change / jnp.sqrt(jnp.maximum(wide, TINY)) * (vectors @ (along / (1 + values)))
         return mean, evidence
 
-    changes = jnp.where(jnp.asarray(free) & source.seen, plausible, 0.0)
+    changes = jnp.where(jnp.asarray(free) & around.seen, plausible, 0.0)
     move, evidence = jax.lax.map(of_candidate, (changes, jnp.broadcast_to(apparent, changes.shape)))
     _, naive = jax.lax.map(of_candidate, (changes, jnp.zeros_like(changes)))
     evidence, naive = (jnp.where(jnp.isfinite(each), each, -jnp.inf).at[0].max(-1e30) for each in (evidence, naive))
-    probability = jax.nn.softmax(evidence)
-    move = jnp.where(jnp.isfinite(move), move, 0.0)
-    differ = move[:, None] - move
-    risk = jnp.einsum("c,acp,pq,acq->a", probability, differ, gram, differ)
-    strong = (evidence > evidence[0] + np.log(STRONG)).at[0].set(True)
-    taken = jnp.argmin(jnp.where(strong & jnp.isfinite(risk), risk, jnp.inf))
-    return Posterior(start + move, probability, jax.nn.softmax(naive), taken)
+    taken = jnp.where(jnp.max(evidence) > evidence[0] + np.log(STRONG), jnp.argmax(evidence), 0)
+    return Posterior(start + jnp.nan_to_num(move), jax.nn.softmax(evidence), jax.nn.softmax(naive), taken)
 
 
 def dispersion(found: Fit, sizes) -> Float[Array, ""]:
