@@ -80,6 +80,7 @@ def test_logs_of_six_rotors_are_read_and_motors_in_another_order_found(flown, tm
     assert "6 motors" in refusal(lambda: check_log(read, IRIS))
 
 
+@pytest.mark.slow
 def test_controller_and_export_take_the_number_from_the_vehicle():
     controller = Controller(HEXA)
     assert controller.begin().variables.shape[1] == 6

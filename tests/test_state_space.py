@@ -99,6 +99,7 @@ def test_a_quaternion_may_change_its_sign():
     np.testing.assert_array_equal(joined.x, data.x)
 
 
+@pytest.mark.slow
 def test_a_pendulum_that_whirls_is_learned_from_angles_that_jump():
     jumping = [wrap(CIRCLE, whirls(count)) for count in (60, 20)]
     assert rollout_mse(whirling(), jumping[0]) < 1e-10 < 1 < rollout_mse(pendulum(), jumping[0])

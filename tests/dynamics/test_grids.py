@@ -110,6 +110,7 @@ def test_scaling_is_by_component_and_fields_need_no_input():
     assert len(scaled_loss(hybrid(), decays()).channels) == 2
 
 
+@pytest.mark.slow
 def test_every_method_adapts_a_field_without_inputs():
     source, windows = hj.with_scaling(hybrid(), decays()), decays(extra=1.2)
     quick = {"min_epochs": 1, "max_epochs": 2}

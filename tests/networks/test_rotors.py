@@ -46,6 +46,7 @@ def samples(count=6):
     return jnp.asarray(x), jnp.asarray(rng.uniform(500, 800, (4, count)))
 
 
+@eqx.filter_jit
 def deployed(field, x, u):
     return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
 
@@ -86,7 +87,7 @@ def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, 
     (x, u), field = samples(), make_residual(KEY, outputs=outputs, **known)
     alone = make_residual(KEY, outputs="accelerations", **known)
     np.testing.assert_array_equal(deployed(field, x, u), deployed(alone, x, u))
-    slope = eqx.filter_grad(lambda residual: jnp.sum(residual.train_batch(x, u)))(field)
+    slope = eqx.filter_jit(eqx.filter_grad(lambda residual: jnp.sum(residual.train_batch(x, u))))(field)
     assert (slope.physics.field.weight_out != 0).any()
     moved = Hybrid(rigid_body(IRIS), jax.tree.map(lambda leaf: leaf + 0.1, field))
     save(tmp_path / "model.npz", moved)

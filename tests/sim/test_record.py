@@ -90,6 +90,7 @@ def test_a_hundred_windows_identify_the_shifted_inertia_and_the_thrust_coefficie
     assert (lift * up * thrusts.sum(-1)).sum() / ((up * thrusts.sum(-1)) ** 2).sum() == pytest.approx(1, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_pilot_stays_in_bounds_in_wind_it_does_not_know():
     flights = random_flights(EXTERNAL_FORCE, 64, recording.SECONDS, jax.random.key(1))
     assert not gone_wrong(flights.states).any()
