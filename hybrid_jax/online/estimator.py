@@ -41,6 +41,7 @@ from hybrid_jax.runtime import entry
 
 EAGER = 6.0  # squared test, χ² of one degree, from which a disturbance walks faster
 RISE, FALL = 10.0, 0.2  # of the logarithm of how much faster [1/s]
+BREEZE = 0.15  # of a disturbance: walk, in its prior [1/√s], beyond whose effects a parameter must be told
 TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a parameter explains
 
 
@@ -278,8 +279,11 @@ class OnlineAdaptation(AbstractEstimator):
         belief, correction = kalman.correct(predicted, sample, model)
         told, gains = state.excitation, correction.gains[:, d:]
         if tuning.excitation:
-            share = jnp.asarray(np.where(self._varies(), TAKEN, 1.0), ones.dtype)
-            told = excitation.after_sample(told, slope, correction, sample, walk, share, self.dt / tuning.pace, tuning)
+            varies = jnp.asarray(np.where(self._varies(), 1.0, 0.0), ones.dtype)
+            hidden, share = jnp.maximum(walk, BREEZE * varies), 1 + (TAKEN - 1) * varies
+            told = excitation.after_sample(
+                told, slope, correction, sample, hidden, share, self.dt / tuning.pace, tuning
+            )
             belief, gains = excitation.consider(predicted, belief, correction, told, share)
         return kalman.triangular(belief, d), told, correction, gains
 

@@ -62,7 +62,7 @@ def flight():
     """Sample, input and periods of each step, while a controller lets the speed swing."""
     rng, v, rows = np.random.default_rng(0), 0.0, []
     for i in range(STEPS):
-        u = HOVER - 4 * (v + NOISE * rng.normal() - 0.5 * np.sin(5 * DT * i))
+        u = HOVER - 4 * (v + NOISE * rng.normal() - np.sin(5 * DT * i))
         v += DT * (u - HOVER)
         rows.append((v + NOISE * rng.normal(), u, 1.0))
     return np.array(rows, np.float32)
