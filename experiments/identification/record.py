@@ -88,7 +88,7 @@ def run(benchmark: Benchmark, options: Options, console: Console) -> None:
             fits[label] = fit(benchmark, *candidate(), record)
         own = factor * float(fits[label].errors[benchmark.columns[1]][0])
         table.add_row(label, ", ".join(f"{error:.3g}" for error in scores[label]), f"{own:.3g}")
-    chosen = min(scores, key=lambda label: np.mean(scores[label]))
+    chosen = min(scores, key=lambda label: np.mean(np.square(scores[label])))
     console.print(table)
     console.print(f"RMSE of free runs in {unit}. Left out: the last third, and the first, each by a fit to the others.")
     console.print(f"Chosen: {chosen}, fitted in {time.perf_counter() - began:.0f} s with all candidates.")

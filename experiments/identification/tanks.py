@@ -14,7 +14,8 @@ from experiments.identification.record import Benchmark, main
 from hybrid_jax.networks.mlp import ResidualNetwork, residual_network
 from hybrid_jax.networks.normalisation import ChannelScaling
 
-FULL, EDGE, LEVEL = 10.0, 0.03, 0.02  # V at which the sensor saturates; widths of smooth corners [V]
+FULL, HALF = 10.0, 5.0  # V, at which the sensor saturates, and at half of it
+EDGE, LEVEL = 0.03, 0.02  # widths of smooth corners [V]
 WEIR = 0.1
 MIDDLE, SIZE = np.array([6.0, 6.0, 3.0]), np.array([2.5, 2.5, 1.0])  # of levels and pump [V]
 RATE = 0.02  # V/s, the size of what the residual adds
@@ -35,6 +36,7 @@ class Tanks(hj.AbstractVectorField):
         edge: of each tank [V] (2,).
         log_weir: ln of the flow over each edge, per V (2,).
         caught: the share of it that the lower tank catches, as a logit.
+        shape: how the cross-section of each tank changes with its level, linear and square (2, 2); None if it does not.
     """
 
     log_flow: jax.Array
@@ -44,6 +46,7 @@ class Tanks(hj.AbstractVectorField):
     edge: jax.Array
     log_weir: jax.Array
     caught: jax.Array
+    shape: jax.Array | None = None
 
     def __call__(self, x, u):
         upper, lower, pump = jnp.exp(self.log_flow)
@@ -51,7 +54,11 @@ class Tanks(hj.AbstractVectorField):
         height = [_positive(x[i] + self.offset[i], LEVEL) + 1e-6 for i in range(2)]
         out = [upper * height[0] ** self.power[0], lower * height[1] ** self.power[1]]
         falls = jnp.exp(self.log_ratio) * (out[0] + jax.nn.sigmoid(self.caught) * over[0])
-        return jnp.stack([pump * u[0] - out[0] - over[0], falls - out[1] - over[1]])
+        flows = jnp.stack([pump * u[0] - out[0] - over[0], falls - out[1] - over[1]])
+        if self.shape is None:
+            return flows
+        height = x / HALF - 1
+        return flows / (1 + self.shape[:, 0] * height + self.shape[:, 1] * height**2)
 
 
 def residual(hidden: int) -> ResidualNetwork:
@@ -61,11 +68,12 @@ def residual(hidden: int) -> ResidualNetwork:
     return eqx.tree_at(lambda made: (made.weight_out, made.bias_out), made, (jnp.zeros((2, hidden)), jnp.zeros(2)))
 
 
-def physics() -> Tanks:
+def physics(shaped: bool = False) -> Tanks:
     """The start of the search."""
     flow, half = jnp.log(jnp.array([0.05, 0.05, 0.04])), jnp.full(2, 0.5)
     edge = jnp.array([9.0, 10.0])
-    return Tanks(flow, jnp.zeros(()), half, jnp.full(2, 0.1), edge, jnp.log(half * 0.4), jnp.zeros(()))
+    shape = jnp.zeros((2, 2)) if shaped else None
+    return Tanks(flow, jnp.zeros(()), half, jnp.full(2, 0.1), edge, jnp.log(half * 0.4), jnp.zeros(()), shape)
 
 
 def level(x, u):
@@ -78,12 +86,18 @@ def model(field) -> hj.StateSpaceModel:
     return hj.StateSpaceModel(field, ("u",), {"y": level}, start=(4.0, 5.2), spread=(5.0, 0.3))
 
 
-def candidate(size: float | None, hidden: int = 6):
-    """Physics, or with a residual whose outer weights are about that large."""
-    near = {"offset": 0.3, "edge": 0.7, "log_weir": 0.7, "caught": 1.5, "power": 0.1}
-    if size is None:
-        return model(physics()), {f"field.{name}": value for name, value in near.items()}
-    prior = {f"field.physics.{name}": value for name, value in near.items()}
+NEAR = {"offset": 0.3, "edge": 0.7, "log_weir": 0.7, "caught": 1.5, "power": 0.1}
+
+
+def white(shaped: bool):
+    """Physics, with straight walls or not."""
+    near = NEAR | ({"shape": 0.2} if shaped else {})
+    return model(physics(shaped)), {f"field.{name}": value for name, value in near.items()}
+
+
+def hybrid(size: float = 0.1, hidden: int = 6):
+    """Physics, with a residual whose outer weights are about that large."""
+    prior = {f"field.physics.{name}": value for name, value in NEAR.items()}
     prior |= {"field.residual": 0.7, "field.residual.weight_out": size, "field.residual.bias_out": size}
     return model(hj.Hybrid(physics(), residual(hidden))), prior
 
@@ -93,11 +107,11 @@ BENCHMARK = Benchmark(
     columns=("u", "y"),
     unit=("V", 1.0),
     candidates={
-        "physics": lambda: candidate(None),
-        "physics and a small residual": lambda: candidate(0.1),
-        "physics and a residual": lambda: candidate(0.4),
+        "physics, straight walls": lambda: white(False),
+        "physics, walls that are not straight": lambda: white(True),
+        "physics and a residual": hybrid,
     },
-    options={"dt": 4.0, "substeps": 2, "rounds": 1, "max_steps": 30, "noise": {"y": 0.2}},
+    options={"dt": 4.0, "substeps": 2, "rounds": 1, "max_steps": 60, "noise": {"y": 0.2}},
     # The upper level at the start is the same in both records.
     start=lambda y, fitted: (fitted.start[0], y),
     hidden=(5.0, 0.3),
