@@ -42,7 +42,9 @@ COMPOSED: dict[str, Callable[..., Operation]] = {
     "square": lambda a: Operation("mul", (a, a)),
     "rsqrt": lambda a: Operation("div", (1, Operation("sqrt", (a,)))),
     "logistic": lambda a: Operation("div", (1, Operation("add", (1, Operation("exp", (Operation("neg", (a,)),)))))),
-    "sign": lambda a: _real(Operation("sub", (Operation("gt", (a, 0)), Operation("lt", (a, 0))))),
+    "sign": lambda a: Operation(
+        "convert_element_type", (Operation("sub", (Operation("gt", (a, 0)), Operation("lt", (a, 0)))),)
+    ),
 }
 _NUMBERS: dict[str, Callable] = {
     "add": lambda a, b: a + b,
@@ -159,7 +161,7 @@ class CTranslation(Translation[np.ndarray]):
     def matrix_product(self, left, right, sizes):
         m, k, n = sizes
         a, b = left.reshape(m, k), right.reshape(k, n)
-        rows, columns = [i for i in range(m) if not _zero(a[i])], [j for j in range(n) if not _zero(b[:, j])]
+        rows, columns = [i for i in range(m) if not is_zero(a[i])], [j for j in range(n) if not is_zero(b[:, j])]
         both = (a != 0.0).astype(int) @ (b != 0.0).astype(int)
         if both.sum() <= PRODUCTS:
             return column(self._dot(one, other) for one in a for other in b.T)
@@ -276,10 +278,6 @@ def _operation(name: str, operands: Sequence[Expression]) -> Operation:
     return COMPOSED[name](*operands) if name in COMPOSED else Operation(name, tuple(operands))
 
 
-def _real(logical: Expression) -> Operation:
-    return Operation("convert_element_type", (logical,))
-
-
 def column(entries: Iterable[Any]) -> np.ndarray:
     """An array of objects."""
     listed = list(entries)
@@ -288,5 +286,6 @@ def column(entries: Iterable[Any]) -> np.ndarray:
     return made
 
 
-def _zero(entries: np.ndarray) -> bool:
+def is_zero(entries: np.ndarray) -> bool:
+    """Whether these are numbers, and all 0."""
     return all(isinstance(one, float) and one == 0 for one in entries)

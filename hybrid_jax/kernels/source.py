@@ -10,7 +10,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from hybrid_jax.codegen import loops, nodes
 from hybrid_jax.codegen.nodes import Address, Assign, Call, Element, Entry, Expression, Operation, Statement, arranged
-from hybrid_jax.codegen.operations import LOGICAL, CTranslation, column
+from hybrid_jax.codegen.operations import LOGICAL, CTranslation, column, is_zero
 from hybrid_jax.codegen.printer import MATH, CPrinter
 from hybrid_jax.codegen.tables import Tables
 from hybrid_jax.codegen.translation import Entries
@@ -183,7 +183,7 @@ class Source:
         ]
         translation = SampleTranslation(self.tables)
         pairs = zip(outputs, translation.run(program, arguments), strict=True)
-        written = [(*out, one) for out, one in pairs if len(one) and not (out[0] == "s" and _is_zero(one))]
+        written = [(*out, one) for out, one in pairs if len(one) and not (out[0] == "s" and is_zero(one))]
         outs, begins, results = zip(*written, strict=True) if written else ((), (), ())
         body = translation.body(results, outs, begins)
         held = sum(one.size for one in nodes.walk(body) if isinstance(one, nodes.Array))
@@ -206,10 +206,6 @@ class Source:
         """Whether functions of glibc's library of vectors are called."""
         every = (one for one in nodes.walk(tuple(self.bodies)) if isinstance(one, Operation))
         return any(one.name in MATH and one.name not in ("floor", "ceil", "sqrt", "abs", "rem") for one in every)
-
-
-def _is_zero(entries: np.ndarray) -> bool:
-    return all(isinstance(one, float) and one == 0.0 for one in entries)
 
 
 def _places(shapes: Sequence[Shape]) -> list[int]:
