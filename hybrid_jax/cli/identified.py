@@ -22,10 +22,14 @@ from hybrid_jax.cli.identify import (
 )
 from hybrid_jax.cli.logs import require_unseen
 from hybrid_jax.dynamics.actuators import Actuated
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.identification.fitting import Identified
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import Model, save
 
 ALIKE = 0.02  # by which flights of one vehicle differ, of which an interval of one flight knows nothing
+REACH, SURE = 1.96, 1.5  # standard errors of an interval; half-widths that a change is at least
 HEADER = ("parameter", "before", "after", "from", "to", "unit")
 
 
@@ -34,23 +38,27 @@ def adapt(options: Any, model: Model) -> int:
     read, layout = _like(options, options.after, model), layout_of(model.about["identified"])
     found, logs = identified(read, layout), [*read.logs.values()]
     before, after = model.about["parameters"], values_of(found)
-    changed = [name for name, one in after.items() if _apart(one, before[name])]
+    changed = _changed(model, found)
     if changed:
         learned_from = {**model.about["learned_from"], **read.contents}
-        about = {**model.about, "parameters": after, "learned_from": learned_from}
+        about = {**model.about, "parameters": after, "learned_from": learned_from, "covariance": found.covariance}
         save(options.output, found.field, json_value(about))
     lines = [
         (name, f"{before[name]['value']:.4g}", *(f"{after[name][end]:.4g}" for end in ENDS), after[name]["unit"])
         for name in dict.fromkeys([*changed, *after])
     ]
-    told = "; ".join(f"{name} from {old} to {new}" for name, old, new, *_ in lines[: min(3, len(changed))])
+    alone = [
+        f"{name} alone, from {before[name]['value']:.4g} to {value:.4g} ({low:.4g} to {high:.4g}), would explain "
+        f"{share:.0%} of how these logs differ."
+        for name, (share, value, low, high) in changed.items()
+    ]
     todo = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     shown = page.Page(
         f"What changed, by {len(logs)} logs of {options.after}, {found.seconds:.0f} s?",
-        f"Changed: {told}." if changed else "Nothing changed that these logs can tell.",
+        f"Changed: {alone[0]}" if changed else "Nothing changed that these logs can tell.",
         page.Table("Before, and after with 95 % intervals", HEADER, lines[:LINES]),
         [("Errors of predictions of the adapted model", figure(found.field, logs, layout))],
-        warned(read, found),
+        [*warned(read, found), *alone[1:]],
         [todo if changed else "Keep the model; if something did change, fly what excites the vehicle more."],
         [
             page.Table("All parameters", HEADER, lines),
@@ -59,7 +67,8 @@ def adapt(options: Any, model: Model) -> int:
         ],
         [*read.said, *read.failed],
     )
-    page.write(options.out, "adapt", shown, {"parameters": after, "model": options.output if changed else None})
+    told = {"parameters": after, "changed": changed, "model": options.output if changed else None}
+    page.write(options.out, "adapt", shown, told)
     return 0 if changed else NOTHING_CHANGED
 
 
@@ -98,10 +107,25 @@ def _like(options: Any, folder: Path, model: Model) -> Read:
     return read
 
 
-def _apart(one: Any, other: Any) -> bool:
-    """Whether a parameter changed: intervals do not touch, and values differ by more than flights of one vehicle do."""
-    # An end that is not finite is None in a file.
-    low, high = (other[end] if other[end] is not None else sign * np.inf for end, sign in (("low", -1), ("high", 1)))
-    return bool(one["low"] > high or one["high"] < low) and abs(one["value"] - other["value"]) > ALIKE * abs(
-        other["value"]
-    )
+def _changed(model: Model, found: Identified) -> dict[str, tuple[float, float, float, float]]:
+    """Of each parameter that alone would explain the change: the share that it explains, its value, and both ends.
+
+    Several are often told together alone, such as what two rotors give, of which a turn about z tells the difference.
+    A change of one, at these covariances, is what fits the difference of all estimates best, by generalised least
+    squares. The first explains most.
+    """
+    before, restored = ravel_parameters(model.field)
+    difference = np.asarray(ravel_parameters(found.field)[0]) - np.asarray(before)
+    covariance = np.array(model.about["covariance"], float) + np.asarray(found.covariance)
+    told = np.flatnonzero(np.isfinite(np.diagonal(covariance)))
+    weight = np.linalg.pinv(covariance[np.ix_(told, told)])
+    pulls, names = weight @ difference[told], [*named_parameters(model.field)]
+    shares = pulls**2 / np.diagonal(weight) / max(pulls @ difference[told], 1e-30)
+    changed = {}
+    for place in np.argsort(-shares):
+        shift, half = pulls[place] / weight[place, place], REACH / weight[place, place] ** 0.5
+        moves = [np.eye(len(before))[told[place]] * each for each in (0.0, shift, shift - half, shift + half)]
+        old, *new = (float(named_parameters(restored(before + move))[names[told[place]]]) for move in moves)
+        if abs(shift) > SURE * half and abs(new[0] - old) > ALIKE * abs(old):
+            changed[names[told[place]]] = (float(shares[place]), *new)
+    return changed

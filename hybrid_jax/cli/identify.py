@@ -102,7 +102,7 @@ def run(options: Options) -> int:
     read = checked(options)
     found = identified(read, layout_of(vars(options)))
     about = {"dt": options.dt, "learned_from": read.contents, "parameters": values_of(found)}
-    about |= {"identified": {name: getattr(options, name) for name in FITS}}
+    about |= {"identified": {name: getattr(options, name) for name in FITS}, "covariance": found.covariance}
     save(options.output, found.field, json_value(about))
     shown = _page(options, found, read)
     page.write(options.out, "identify", shown, {"parameters": about["parameters"], "model": options.output})
