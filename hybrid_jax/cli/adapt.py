@@ -20,6 +20,7 @@ from hybrid_jax.io.models import load, save
 
 __all__ = ["LISTS", "Options", "run"]
 Change = tuple[str, float, Parameter]  # a name, its value before, and after
+BETTER = 0.7  # share of the squared error on windows left out, below which the vehicle is another one
 SHOWN = 5  # parameters beside the answer
 LACKED = (
     "Effects that the model lacked explain these flights as well: {}. Flights before may have had them: name those "
@@ -56,13 +57,14 @@ def run(options: Options) -> int:
         found = adapted(known.field, flights.logs)
         told(f"{found.windows} windows, chose {found.chosen}")
     changed = _changed(known, found)
-    if changed:
+    different = bool(changed) or found.candidates[str(found.chosen)] < BETTER * found.candidates["source"]
+    if different:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
         save(options.output, found.field, json_value(about))
-    told = found.to_dict() | {"model": options.output if changed else None}
-    page.write(options.out, "adapt", _page(options, known, flights, found, changed), told)
-    return 0 if changed else NOTHING_CHANGED
+    told = found.to_dict() | {"model": options.output if different else None}
+    page.write(options.out, "adapt", _page(options, known, flights, found, changed, different), told)
+    return 0 if different else NOTHING_CHANGED
 
 
 def _changed(known: Known, found: Adaptation) -> list[Change]:
@@ -76,7 +78,9 @@ def _changed(known: Known, found: Adaptation) -> list[Change]:
     return sorted(changed, key=lambda each: -abs(each[2].value - each[1]) / max(each[2].high - each[2].low, 1e-30))
 
 
-def _page(options: Options, known: Known, flights: Flights, found: Adaptation, changed: Sequence[Change]) -> page.Page:
+def _page(
+    options: Options, known: Known, flights: Flights, found: Adaptation, changed: Sequence[Change], different: bool
+) -> page.Page:
     learned = named_parameters(known.field)
     own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
     curves = {
@@ -85,9 +89,9 @@ def _page(options: Options, known: Known, flights: Flights, found: Adaptation, c
     }
     seconds, (old, new) = known.steps * known.dt, (errors.texts(each.mean(axis=0)[-1]) for each in curves.values())
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
-    told = f"Changed: {what}." if own else "These flights differ from the model, and no parameter of its own says how."
+    told = f"Changed: {what}." if own else "These flights differ from the model; no parameter of its own says how."
     todo = [f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."]
-    if not changed:
+    if not different:
         told = "Nothing changed that these flights can tell."
         todo = ["Keep the model; if something did change, fly what excites the vehicle more."]
     rows = [(name, f"{value:.4g}", str(one)) for name, value, one in [*own, *lacked][:SHOWN]]

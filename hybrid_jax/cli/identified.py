@@ -28,7 +28,10 @@ from hybrid_jax.identification.fitting import Identified
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import Model, save
 
-ALIKE = 0.02  # by which flights of one vehicle differ, of which an interval of one flight knows nothing
+ALIKE, LEAST = (
+    0.03,
+    0.2,
+)  # share of a value by which flights of one vehicle differ, and that a parameter explains at least
 REACH, SURE = 1.96, 1.5  # standard errors of an interval; half-widths that a change is at least
 HEADER = ("parameter", "before", "after", "from", "to", "unit")
 
@@ -124,8 +127,9 @@ def _changed(model: Model, found: Identified) -> dict[str, tuple[float, float, f
     changed = {}
     for place in np.argsort(-shares):
         shift, half = pulls[place] / weight[place, place], REACH / weight[place, place] ** 0.5
-        moves = [np.eye(len(before))[told[place]] * each for each in (0.0, shift, shift - half, shift + half)]
+        shifts = (0.0, shift, shift - half, shift + half)
+        moves = [np.eye(len(before), dtype=np.float32)[told[place]] * np.float32(each) for each in shifts]
         old, *new = (float(named_parameters(restored(before + move))[names[told[place]]]) for move in moves)
-        if abs(shift) > SURE * half and abs(new[0] - old) > ALIKE * abs(old):
+        if shares[place] > LEAST and abs(shift) > SURE * half and abs(new[0] - old) > ALIKE * abs(old):
             changed[names[told[place]]] = (float(shares[place]), *new)
     return changed
