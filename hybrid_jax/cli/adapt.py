@@ -20,7 +20,7 @@ from hybrid_jax.io.models import load, save
 
 __all__ = ["LISTS", "Options", "run"]
 Change = tuple[str, float, Parameter]  # a name, its value before, and after
-BETTER = 0.7  # share of the squared error on windows left out, below which the vehicle is another one
+UNLIKELY = 0.05  # probability that nothing changed, below which the vehicle is another one
 SHOWN = 5  # parameters beside the answer
 LACKED = (
     "Effects that the model lacked explain these flights as well: {}. Flights before may have had them: name those "
@@ -57,7 +57,7 @@ def run(options: Options) -> int:
         found = adapted(known.field, flights.logs)
         told(f"{found.windows} windows, chose {found.chosen}")
     changed = _changed(known, found)
-    different = bool(changed) or found.candidates[str(found.chosen)] < BETTER * found.candidates["source"]
+    different = bool(changed) or found.candidates["source"] < UNLIKELY
     if different:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}

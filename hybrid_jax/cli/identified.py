@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any, cast
 
+import jax
 import numpy as np
 
 from hybrid_jax.cli import page
@@ -41,7 +42,8 @@ def adapt(options: Any, model: Model) -> int:
     read, layout = _like(options, options.after, model), layout_of(model.about["identified"])
     found, logs = identified(read, layout), [*read.logs.values()]
     before, after = model.about["parameters"], values_of(found)
-    changed = _changed(model, found)
+    with jax.enable_x64(True):  # in which it was identified
+        changed = _changed(model, found)
     if changed:
         learned_from = {**model.about["learned_from"], **read.contents}
         about = {**model.about, "parameters": after, "learned_from": learned_from, "covariance": found.covariance}
@@ -128,7 +130,7 @@ def _changed(model: Model, found: Identified) -> dict[str, tuple[float, float, f
     for place in np.argsort(-shares):
         shift, half = pulls[place] / weight[place, place], REACH / weight[place, place] ** 0.5
         shifts = (0.0, shift, shift - half, shift + half)
-        moves = [np.eye(len(before), dtype=np.float32)[told[place]] * np.float32(each) for each in shifts]
+        moves = [np.eye(len(before))[told[place]] * each for each in shifts]
         old, *new = (float(named_parameters(restored(before + move))[names[told[place]]]) for move in moves)
         if shares[place] > LEAST and abs(shift) > SURE * half and abs(new[0] - old) > ALIKE * abs(old):
             changed[names[told[place]]] = (float(shares[place]), *new)
