@@ -81,7 +81,7 @@ def test_a_folder_of_commands_becomes_a_page_and_a_model(files, called):
     table["az"] *= 0.8
     np.savetxt(folder / "weak.csv", table, "%.9g", ",", header="t,ax,ay,az,c0,c1,c2,c3", comments="")
     code, said, _ = called("adapt", folder / "model.npz", folder / "weak.csv", "-o", folder / "after.npz", *options)
-    assert (code, "Changed: k from " in said) == (0, True)
+    assert (code, "Changed: k alone, from " in said) == (0, True)
     found = json.loads((folder / "out" / "report.json").read_text())["parameters"]["k"]["value"]
     np.testing.assert_allclose(found, 0.8 * 1.1 * IRIS.thrust_coefficient, rtol=0.01)
 
