@@ -146,19 +146,20 @@ class Auto(Method):
         found, starts = fits(larger, train, np.stack([none, all_of_them]), *options)
         found, every = (at(found, i) for i in (0, 1))
         for _ in range(ROUNDS):
-            chosen, error = judge(larger, train, found, every, own, learned_from, *options[:3])
+            chosen, error = judge(field, larger, train, found, every, own, learned_from, *options[:3])
             found = at(fits(larger, train, jnp.stack([jnp.asarray(free)[chosen.taken], none]), *options)[0], 0)
         return conclude(self, field, larger, train, starts, found, chosen, error, alone, options[:3])
 
 
 def _judge(
-    larger, train: Trajectories, around: Fit, every: Fit, own: Fit | None, learned_from, sizes, solver, scale
+    field, larger, train: Trajectories, around: Fit, every: Fit, own: Fit | None, learned_from, sizes, solver, scale
 ) -> tuple[Posterior, Float[Array, ""]]:
     """The candidates' probabilities, around one fit and by one of everything, and how much the source may err."""
     start, free = ravel_parameters(larger)[0], np.stack([*free_parameters(larger).values()])
     if own is None:
         return posterior(around, every, start, free, sizes, jnp.zeros_like(start)), jnp.zeros(())
-    added = network_effect(larger, train, solver, scale) if has_network(larger) else 0.0
+    # Also where physics alone took its place: by so much two models of the same source differ.
+    added = network_effect(field, train, solver, scale) if has_network(field) else 0.0
     apparent, error = unchanged(own, around, added, larger, learned_from, train)
     return posterior(around, every, start, free, sizes, apparent), error
 
