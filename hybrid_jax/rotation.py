@@ -111,7 +111,7 @@ def canonicalize_quaternion(q: Quaternion) -> Quaternion:
 def tilt(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
     """The angle [rad] of the body's z axis from the vertical, of unit quaternions."""
     of = jnp if isinstance(q, jax.Array) else np
-    return of.arccos(of.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1))
+    return of.arccos(of.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1))  # pyright: ignore[reportReturnType]
 
 
 def heading(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch"]:

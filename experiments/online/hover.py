@@ -54,7 +54,7 @@ def _hummingbird(speeds, x: State, seen: State, push: Float[Array, "3"]):
     """A period of RotorPy's, in a wind that moves it about as much."""
     still = Reference(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(()))
     command = jnp.clip(decide(HUMMINGBIRD, seen, still), 0.0, HUMMINGBIRD.fastest)
-    (x, speeds), mean = advance(HUMMINGBIRD._replace(wind=1.5 * push), x, speeds, command, 0.0)
+    (x, speeds), mean = advance(HUMMINGBIRD._replace(wind=1.5 * push), x, speeds, command, jnp.zeros(()))
     return speeds, x, mean
 
 

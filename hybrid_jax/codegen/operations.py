@@ -126,7 +126,7 @@ class CTranslation(Translation[np.ndarray]):
 
         whole = self._filled(int(starts[-1]), fill)
         parts = zip(np.split(whole, starts[1:-1]), equation.outvars, strict=True)
-        return [Entries(part, one.aval.shape) for part, one in parts]
+        return [Entries(part, one.aval.shape) for part, one in parts]  # pyright: ignore[reportAttributeAccessIssue]
 
     def _passed(self, value: Value, shape: tuple[int, ...], stride: int) -> "_Passed":
         """How a value, or an array of this shape in it, comes into a function that is called for each of these."""
