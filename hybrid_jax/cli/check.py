@@ -51,8 +51,8 @@ def run(options: Options) -> int:
         told(f"{sum(map(len, each))} windows")
     places = {"short": known.steps - 1, "long": -1}
     ends = {name: {end: found[:, at] for end, at in places.items()} for name, found in curves.items()}
-    for each in ends.values():  # over all flights
-        each["mean"] = errors.rmse(each["short"])
+    for end in ends.values():  # over all flights
+        end["mean"] = errors.rmse(end["short"])
     shown = _page(options, known, flights, curves, each)
     page.write(options.out, "check", shown, {"flights": list(flights.contents), "units": errors.UNITS, "rmse": ends})
     return 0
