@@ -22,6 +22,7 @@ __all__ = ["LISTS", "Options", "run"]
 Change = tuple[str, float, Parameter]  # a name, its value before, and after
 UNLIKELY = 0.05  # probability that nothing changed, below which the vehicle is another one
 SHOWN = 5  # parameters beside the answer
+ALONE = "physics alone predicts the flights before better than with the network, and is the adapted model."
 LACKED = (
     "Effects that the model lacked explain these flights as well: {}. Flights before may have had them: name those "
     "that the vehicle always has, such as drag, in `learn` of the vehicle file, and fit again."
@@ -32,7 +33,7 @@ LACKED = (
 class Options(FlightOptions):
     """Adapt a model to logs after a change: ten seconds of flight or more.
 
-    Ends with exit code 4, and writes no model, if nothing changed that these flights can tell.
+    Ends with exit code 4, and writes no model, if nothing changed that these flights can tell, and the network stays.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -57,7 +58,7 @@ def run(options: Options) -> int:
         found = adapted(known.field, flights.logs)
         told(f"{found.windows} windows, chose {found.chosen}")
     changed = _changed(known, found)
-    different = bool(changed) or found.candidates["source"] < UNLIKELY
+    different = bool(changed) or found.alone or found.candidates["source"] < UNLIKELY
     if different:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
@@ -90,6 +91,8 @@ def _page(
     seconds, (old, new) = known.steps * known.dt, (errors.texts(each.mean(axis=0)[-1]) for each in curves.values())
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
     told = f"Changed: {what}." if own else "These flights differ from the model; no parameter of its own says how."
+    if not changed and found.candidates["source"] >= UNLIKELY:
+        told = f"Nothing changed that these flights can tell; {ALONE}"
     todo = [f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."]
     if not different:
         told = "Nothing changed that these flights can tell."
@@ -108,6 +111,7 @@ def _page(
         [("RMSE on these flights, to which the model was adapted", errors.figure(curves, known.dt))],
         [
             f"Velocity after {seconds:g} s was off by {old[1]}, and is by {new[1]}, on these flights.",
+            *([f"Of the model before, {ALONE}"] if found.alone else []),
             *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
             *errors.unknown(found),
             *unlike(known, flights),

@@ -20,13 +20,17 @@ from PIL import Image
 from smoke import ROOT
 
 from experiments.real_flight.simulated import csv_of, vehicle_toml
+from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.cli import main
 from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED, VERBS
 from hybrid_jax.cli.export import PARTS
+from hybrid_jax.cli.logs import Flights
 from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.io.models import load, save
 from hybrid_jax.sim import PARAMETER_SHIFT, SOURCE, random_flights
 from hybrid_jax.state import SENSOR_NOISE
+from hybrid_jax.status import Status
 from hybrid_jax.vehicle import IRIS, load_vehicle
 
 
@@ -70,6 +74,24 @@ def written(folder, domain, flights, seed, seconds=11.0):
         x, u = np.asarray(flown.states[i, :-1]), np.asarray(flown.inputs[i])
         (folder / f"flight{i}.csv.gz").write_bytes(csv_of(0.01 * np.arange(len(u)), x, u))
     return folder
+
+
+def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_changed(tmp_path, monkeypatch, called):
+    body, n = rigid_body(IRIS), 30
+    save(tmp_path / "m.npz", body, {"dt": 0.01, "steps": 10, "learned_from": {}, "motion": {}})
+    x = np.tile([0, 0, 1.5, 1, *[0.0] * 9], (n, 1)) + np.arange(n)[:, None] * np.eye(13)[0]  # none is a repeated sample
+    flown = FlightLog(0.01 * np.arange(n), x, np.full((n, 4), 500.0))
+    none = dict.fromkeys(("disturbance", "without_intervals"))
+    numbers = {"mse_before": 1.0, "mse_after": 1.0, "windows": 2, "steps": 0, "level": 0.95}
+    taken = {"chosen": "source", "candidates": {"source": 1.0}, "alone": True}
+    found = Adaptation(body, "auto", {}, status=Status.OK, **none, **numbers, **taken)
+    monkeypatch.setattr("hybrid_jax.cli.adapt.flights_for", lambda *_, **__: Flights([flown], {}, []))
+    monkeypatch.setattr("hybrid_jax.cli.adapt.adapted", lambda *_: found)
+    files = ["-o", tmp_path / "adapted.npz", "--out", tmp_path]
+    code, said, _ = called("adapt", tmp_path / "m.npz", tmp_path, *files)
+    assert code == 0
+    assert "Nothing changed that these flights can tell; physics alone predicts" in said
+    assert (tmp_path / "adapted.npz").exists()
 
 
 @pytest.fixture(scope="module")
