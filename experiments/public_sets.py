@@ -4,12 +4,17 @@ import json
 import resource
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from hybrid_jax.cli.errors import rmse
+
 LEARN = "Ix,Iy,Iz,k_rotors,rate_damping,drag,aerodynamic_moment"
-HEADER = "| set | hybrid-jax … | processor, s | answer | RMSE after 0.1 s; of frozen rates |\n|---|---|---|---|---|"
+HEADER = "| set | hybrid-jax … | s, wall s | answer | RMSE after 0.1, 0.5 s; of frozen rates |\n|---|---|---|---|---|"
 
 
 def main() -> None:
@@ -28,11 +33,12 @@ def main() -> None:
                 link.unlink(missing_ok=True)
                 link.symlink_to(file)
         for line in sets[name]["typed"]:
-            began, given = processor(), line.format(**values).split()
+            began, clock, given = processor(), time.perf_counter(), line.format(**values).split()
             found = ran(out / name, given)
-            rmse = [found.get("rmse", {}).get(model, {}) for model in ("model", "thrust, rates frozen")]
-            told = "; ".join(" ".join(f"{each:.3g}" for each in one["mean"]) for one in rmse if "mean" in one)
-            print(f"| {name} | `{line}` | {processor() - began:.0f} | {found['answer']} | {told} |", flush=True)
+            models = [found.get("rmse", {}).get(model, {}) for model in ("model", "thrust, rates frozen")]
+            told = "; ".join(", ".join(map(shown, (one["short"], one["long"]))) for one in models if "long" in one)
+            seconds = f"{processor() - began:.0f}, {time.perf_counter() - clock:.0f}"
+            print(f"| {name} | `{line}` | {seconds} | {found['answer']} | {told} |", flush=True)
 
 
 def ran(folder: Path, given: list[str]) -> dict[str, Any]:
@@ -42,6 +48,11 @@ def ran(folder: Path, given: list[str]) -> dict[str, Any]:
     if done.returncode not in (0, 4):
         return {"answer": (done.stderr.strip().splitlines() or [""])[-1]}
     return json.loads((folder / "runs" / given[0] / "report.json").read_text())
+
+
+def shown(errors: list[list[float]]) -> str:
+    """Over flights."""
+    return " ".join(f"{each:.3g}" for each in rmse(np.array(errors)))
 
 
 def processor() -> float:
