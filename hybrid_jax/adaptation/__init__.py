@@ -1,13 +1,11 @@
-"""Adapt a trained field to a few windows of a changed system, and say how well its parameters are known.
+"""Adapt a trained field to a few windows of a changed system, with confidence intervals for its parameters.
 
     source = hj.fit(hj.Hybrid(pendulum, network), train, validation, key)
     result = hj.adapt(source.best, windows)
     print(result.report())
-    result.parameters["log_length"].value, result.parameters["log_length"].low
 
-By default the windows choose: the source as it is, its physical parameters θ_p by least squares, with these a constant
-disturbance and, of a rigid body, drag and the rotors' efficiencies, and last the network, held at the source's weights
-(`Auto`). `METHODS` lists the other methods by name; `Method` says how to write one.
+By default (`Auto`) the most probable change is chosen; `METHODS` lists the other methods, and `Method` explains how you
+write your own.
 """
 
 from hybrid_jax.adaptation.adapting import METHODS, Adaptation, Parameter, adapt

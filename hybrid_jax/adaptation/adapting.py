@@ -1,4 +1,4 @@
-"""`adapt`: one call that adapts any field to windows of a changed system, by any method; one result for all methods."""
+"""`adapt`: adapt any field to windows of a changed system, with any method and one type of result."""
 
 import math
 import warnings
@@ -72,9 +72,9 @@ class Parameter:
 
     Attributes:
         value: the estimate, in `unit`.
-        low: the lower end of the interval in `unit`: NaN without a valid one, −∞ or 0 where the windows tell nothing.
-        high: the upper end in `unit`: NaN without a valid interval, ∞ where the windows tell nothing.
-        unit: a text such as "kg m²"; None if it is not known.
+        low: lower end of the interval in `unit`: NaN without a valid one, −∞ or 0 if the parameter is not identifiable.
+        high: upper end in `unit`: NaN without a valid interval, ∞ if the parameter is not identifiable.
+        unit: for example "kg m²"; None if unknown.
     """
 
     value: float
@@ -84,7 +84,7 @@ class Parameter:
 
     @property
     def has_interval(self) -> bool:
-        """Whether there is a valid interval, be it infinite."""
+        """Whether there is a valid interval, which may be infinite."""
         return not math.isnan(self.low)
 
     def __str__(self) -> str:
@@ -94,29 +94,29 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Adaptation:
-    """An adapted field and what is known about it.
+    """An adapted field with its parameters, their intervals and its expected errors.
 
     Attributes:
         field: the adapted field.
-        method: its name, or its class if it was passed as a value.
+        method: name of the method, or its class if you passed a value.
         parameters: of physics and disturbance, by the names of `uncertainty.named_parameters`.
         disturbance: the constant part of ẋ in the units of ẋ; None if there is none.
         mse_before: L_MSE of the source field on all windows, in squared units of the states.
-        mse_after: the same of the adapted field.
+        mse_after: L_MSE of the adapted field on all windows, in the same units.
         windows: the number of windows.
         steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
         status: how the method ended.
         level: confidence level of the intervals, between 0 and 1.
         without_intervals: why there are no intervals; None if there are.
-        covariance: of the parameters as the physics holds them; None without intervals.
-        degrees: degrees of freedom of the covariance, one less than the clusters of windows that touch, or None.
-        candidates: of "auto": by name how probable each change is, 0 to 1; of the network beside the one taken.
-        chosen: of "auto": the name of the candidate that was taken.
-        refused: of "auto": candidates that would be more probable than the chosen one if the source made no errors.
-        alone: of "auto": whether physics, fitted to the source's own motion, took the place of physics and network.
-        expected: of "auto": errors on a flight that was not seen, by horizon and quantity: value, low, high.
-        units: of the quantities in `expected`.
-        outside: by quantity the share of samples, 0 to 1, unlike those that the source learned from.
+        covariance: covariance in the physics' own parametrisation; None without intervals.
+        degrees: degrees of freedom of the covariance, one less than the clusters of adjacent windows, or None.
+        candidates: "auto" only: probability of each change by name, 0 to 1; the network's is relative to the one taken.
+        chosen: "auto" only: name of the chosen candidate.
+        refused: "auto" only: candidates that would be more probable than the chosen one if the source had no errors.
+        alone: "auto" only: whether physics, fitted to the source's own motion, replaced physics and network.
+        expected: "auto" only: errors on an unseen flight, by horizon and quantity: value, low, high.
+        units: units of the quantities in `expected`.
+        outside: share of samples, 0 to 1, outside the range of the source's training data, by quantity.
     """
 
     field: AbstractVectorField
@@ -188,7 +188,7 @@ class Adaptation:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything but the field, as JSON values: None for a number that is not finite."""
+        """All but the field as JSON values; numbers that are not finite become None."""
         parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
         found = vars(self) | {"status": str(self.status), "converged": self.converged, "parameters": parameters}
         return json_value({name: value for name, value in found.items() if name != "field"})
@@ -209,17 +209,16 @@ def adapt(
 
     Args:
         field: a trained `Hybrid`, or any other field.
-        windows: in the order of time and without overlap, for least squares more than there are parameters. Where they
-            follow each other, as those of one flight do, intervals allow for errors that are correlated within a fifth
-            of them.
-        method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` for one of your own.
-        validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out where
-            the method needs some.
-        learned_from: windows that the source was trained on, by default those that `hj.fit` keeps in its networks.
-            "auto" changes nothing that may be an error of the source on other motion than theirs, and the report warns
-            where these windows are unlike them.
-        settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, so that
-            units do not matter. Settings of your own have the objective that they name, by default the plain MSE.
+        windows: in the order of time and without overlap. Least squares needs more windows than parameters. If the
+            windows follow each other, for example in one flight, the intervals allow for errors that are correlated
+            within a fifth of the windows.
+        method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` to write your own.
+        validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out if
+            the method needs validation.
+        learned_from: windows that the source was trained on, by default those that `hj.fit` stores in its networks.
+            "auto" uses them to estimate the source's own error, and the report warns if `windows` are unlike them.
+        settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, which is
+            independent of units. If you pass settings, their objective is used, by default the plain MSE.
         level: confidence level of the intervals.
 
     Raises:
@@ -292,7 +291,7 @@ _mse = jit_with(FAST_COMPILE)(rollout_mse)
 
 
 def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[str, Any]:
-    """The attributes of `Adaptation` that say what was chosen, and the errors to expect of it."""
+    """Return the attributes of `Adaptation` that describe the choice and the expected errors."""
     seconds = windows.horizon * windows.dt
     chain = seconds * longest_chain(windows, len(choice.ends))
     return {
@@ -316,7 +315,7 @@ def _named(method: str | Method) -> tuple[str, Method]:
 
 
 def _split(windows: Trajectories, validation: Trajectories | None, needed: bool) -> tuple[Trajectories, Trajectories]:
-    """The windows to train on and those to validate with; the same where none are needed."""
+    """Split into training and validation windows; both are all windows if no validation is needed."""
     if validation is not None or not needed:
         return windows, windows if validation is None else validation
     if len(windows) < 2:
@@ -326,7 +325,7 @@ def _split(windows: Trajectories, validation: Trajectories | None, needed: bool)
 
 
 def _size(field: AbstractVectorField) -> int:
-    """The number of parameters of the physics, without a disturbance."""
+    """Count the parameters of the physics, without a disturbance."""
     physics = physics_of(without_disturbance(field))
     return sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(physics, trainable(physics))))
 
@@ -339,7 +338,7 @@ def _parameters(
     without: str | None,
     choice: Choice | None,
 ) -> dict[str, Any]:
-    """The attributes of `Adaptation` about the parameters: why there are no intervals, if there are none."""
+    """Return the attributes of `Adaptation` about the parameters, with the reason if there are no intervals."""
     if not 0 < _size(field) <= NAMED:
         return {"parameters": {}, "without_intervals": NOT_LEAST_SQUARES}
     own = physics_of(without_disturbance(field))

@@ -1,9 +1,7 @@
-"""Adapt a network by few windows without losing what it knows: a ridge Gauss-Newton step from where it is.
+"""Adapt a network to few windows by one ridge Gauss–Newton step from the source's weights.
 
-The step minimises Σ ‖r + J δ‖² + penalty ‖δ‖² over changes δ of the network's weights in the subspace that changes the
-predictions most (the range of Jᵀ, from random combinations of its columns: Halko, Martinsson and Tropp, SIAM Review
-2011). The penalty holds the weights at the source's, as L2-SP does (Li, Grandvalet and Davoine, 2018), and is the one
-that makes the windows most probable.
+The step minimises Σ ‖r + J δ‖² + penalty ‖δ‖² over δ in a random subspace of the range of Jᵀ (Halko, Martinsson and
+Tropp, SIAM Review 2011), with the penalty of largest evidence (L2-SP; Li, Grandvalet and Davoine 2018).
 """
 
 from collections.abc import Callable
@@ -29,13 +27,13 @@ TOGETHER = 8  # directions evaluated at a time
 
 
 class Anchored(NamedTuple):
-    """The step with the best of some penalties.
+    """The step with the best penalty.
 
     Attributes:
-        change: of the network's weights.
-        left_out: the same from all blocks of windows but one, for each of them (b, w).
-        odds: how much more probable the windows are with the best of the steps than with none.
-        naive: the same, if the source made no errors.
+        change: change of the network's weights.
+        left_out: change of the weights fitted without each block of windows (b, w).
+        odds: evidence of the best step over no step.
+        naive: the same odds if the source had no errors.
     """
 
     change: Float[Array, " w"]
@@ -54,11 +52,11 @@ def fit_anchored(
     error: Float[Array, ""],
     blocks,
 ) -> Anchored:
-    """The step for all penalties, and the best.
+    """Compute the step for each penalty and choose the best.
 
     Args:
         starts: of the windows, see `smoothed`, and the variance of one error from noise.
-        error: sum of squares that the source may err where nothing has changed, see `Unchanged`.
+        error: sum of squares of the source's own error without any change, see `Unchanged`.
         blocks: of windows, see `blocks_of`.
     """
     weights, _ = weights_of(field)
@@ -110,13 +108,13 @@ def fit_anchored(
 
 
 def with_change(field: AbstractVectorField, change: Float[Array, " w"]) -> AbstractVectorField:
-    """The field with a change added to the weights of its network."""
+    """Add a change to the weights of a field's network."""
     weights, unravel = weights_of(field)
     return eqx.tree_at(lambda hybrid: hybrid.residual, field, unravel(weights + change))
 
 
 def weights_of(field: AbstractVectorField) -> tuple[Float[Array, " w"], Callable[[Float[Array, " w"]], PyTree]]:
-    """The trainable weights of the network as a vector, and the network as a function of it."""
+    """Return the network's trainable weights as a vector, and the network as a function of it."""
     assert isinstance(field, Hybrid)
     learned, rest = eqx.partition(field.residual, trainable(field.residual))
     weights, unravel = ravel_pytree(learned)

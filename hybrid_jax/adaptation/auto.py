@@ -1,4 +1,4 @@
-"""Adaptation by the method that the windows themselves ask for."""
+"""Adaptation that chooses the most probable change, see `Auto`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -62,21 +62,20 @@ CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
 
 class Choice(NamedTuple):
-    """c candidates, and which one was taken.
+    """c candidates and the chosen one.
 
     Attributes:
         names: of the candidates.
-        probability: of each candidate that it is what changed; of the network, over that of the one taken before (c,).
-        refused: which would be more probable than the one taken if the source made no errors (c,).
-        taken: the index of the candidate that was taken.
-        alone: whether physics without the network took the source's place.
+        probability: probability of each change; the network's is relative to the candidate chosen before it (c,).
+        refused: which would be more probable than the chosen one if the source had no errors (c,).
+        taken: index of the chosen candidate.
+        alone: whether physics without the network replaced the source.
         parameters: names of the p parameters of the extended physics, see `extended`.
         free: which of these each candidate fitted (c, p).
-        theta: their values in each candidate, in the physics' own parametrisation; of those that were not taken to
-            first order (c, p).
-        equations: of each window at those that were taken.
-        change: of the network's weights in each candidate (c, w); None if the network may not change, or there is none.
-        ends: errors of blocks that were left out, see `errors_at_ends` (b, 2, d).
+        theta: parameters of each candidate in the physics' own parametrisation, to first order unless chosen (c, p).
+        equations: normal equations of each window at the chosen parameters.
+        change: change of the network's weights in each candidate (c, w); None without a trainable network.
+        ends: errors of left-out blocks, see `errors_at_ends` (b, 2, d).
     """
 
     names: tuple[str, ...]
@@ -94,18 +93,18 @@ class Choice(NamedTuple):
 
 @dataclass(frozen=True)
 class Auto(Method):
-    """The change that the windows make most probable, of several that a system may undergo; see `selection`.
+    """Choose the most probable of several changes; see `selection`.
 
-    Of a rigid body: none; of θ_p; with these of steady forces and torques, drag and the rotors' efficiencies.
-    Of another system: none, of θ_p, of θ_p and a constant disturbance. Then, with the one that was taken, of the
-    network, held at the source's weights. Where physics without the network predicts the source's own motion better,
-    it takes the source's place.
+    The candidates for a rigid body are no change, new θ_p, and new θ_p with constant forces and torques, drag and rotor
+    efficiencies; for other systems no change, new θ_p, and new θ_p with a constant disturbance. A penalised change of
+    the network's weights is then tried on top of the chosen one. If physics without the network predicts the source's
+    own motion better, it replaces the source.
 
     Attributes:
         networks: whether the network may change.
-        blocks: how many blocks of windows are left out in turn, for the errors to expect.
+        blocks: how many blocks of windows are left out in turn to estimate the expected errors.
         max_steps: the most steps of each fit.
-        plausible: how far the changed system plausibly is from the source.
+        plausible: prior standard deviations of the changes.
     """
 
     networks: bool = True
@@ -120,8 +119,8 @@ class Auto(Method):
         """See `Method.solve`.
 
         Args:
-            learned_from: windows that the source was trained on, by default those that it keeps; without any, its
-                errors are not known, and all that these windows show counts as a change.
+            learned_from: windows that the source was trained on, by default those that it stores; without them the
+                source is assumed to be exact.
         """
         jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))  # then the outer program has the options
@@ -154,7 +153,7 @@ class Auto(Method):
 def _judge(
     field, larger, train: Trajectories, around: Fit, every: Fit, own: Fit | None, learned_from, sizes, solver, scale
 ) -> tuple[Posterior, Float[Array, ""]]:
-    """The candidates' probabilities, around one fit and by one of everything, and how much the source may err."""
+    """Compute the candidates' probabilities around one fit and a fit of everything, and the source's own error."""
     start, free = ravel_parameters(larger)[0], np.stack([*free_parameters(larger).values()])
     if own is None:
         return posterior(around, every, start, free, sizes, jnp.zeros_like(start)), jnp.zeros(())
@@ -167,7 +166,7 @@ def _judge(
 def _conclude(
     method: Auto, field, larger, train: Trajectories, starts, found: Fit, chosen: Posterior, error, alone, options
 ) -> Solution:
-    """From the fit of the candidate that was taken: a change of the network, and errors of blocks left out."""
+    """Fit the network's change on top of the chosen candidate, and compute the errors of left-out blocks."""
     (sizes, solver, scale), (start, unravel) = options, ravel_parameters(larger)
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
@@ -207,18 +206,18 @@ _fit_each, _judged, _concluded = _compiled(fit_each), _compiled(_judge), _compil
 
 
 def at(fits: Fit, index: Int[Array, ""] | int) -> Fit:
-    """One of several fits."""
+    """Select one of several fits."""
     return jax.tree.map(lambda leaf: leaf[index], fits)
 
 
 def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
-    """The one of two trees of the same structure."""
+    """Select between two trees of the same structure."""
     arrays, rest = eqx.partition(other, eqx.is_array)
     return eqx.combine(jax.tree.map(partial(jnp.where, which), eqx.filter(one, eqx.is_array), arrays), rest)
 
 
 def network_effect(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> Float[Array, ""]:
-    """The sum of squares of what its network adds to the predictions, over scale."""
+    """Sum the squares of the network's effect on the predictions, over scale."""
     fields = field, without_network(field)
     errors = [
         jax.lax.map(lambda w, f=f: prediction_errors(f, w, solver, scale), windows, batch_size=64) for f in fields
@@ -227,24 +226,24 @@ def network_effect(field: AbstractVectorField, windows: Trajectories, solver: So
 
 
 def without_network(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with a network that adds nothing, of the same structure."""
+    """Return the field with a zero network of the same structure."""
     weights, unravel = weights_of(field)
     return eqx.tree_at(lambda hybrid: hybrid.residual, field, unravel(jnp.zeros_like(weights)))
 
 
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:
-    """The field of a candidate, from the extended source."""
+    """Build a candidate's field from the extended source."""
     adapted = ravel_parameters(larger)[1](choice.theta[index])
     return adapted if choice.change is None else with_change(adapted, choice.change[index])  # type: ignore
 
 
 def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:
-    """The field with all parameters that a candidate may fit, at values that change nothing."""
+    """Add all parameters that a candidate may fit, at values that change nothing."""
     return sized(with_disturbance(corrected(field)), d)
 
 
 def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
-    """For each candidate, which of the parameters of an extended field it fits (p,)."""
+    """Return which parameters of an extended field each candidate fits (c, p)."""
     names = [*named_parameters(field)]
     group = groups_of(names)
     lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
@@ -257,7 +256,7 @@ def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
 
 
 def has_network(field: AbstractVectorField) -> bool:
-    """Whether a field is a hybrid whose residual is not a disturbance, and can be trained."""
+    """Whether a field is a hybrid with a trainable residual other than a disturbance."""
     return (
         isinstance(field, Hybrid) and physics_of(field) is not field and any(jax.tree.leaves(trainable(field.residual)))
     )

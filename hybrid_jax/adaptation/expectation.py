@@ -1,4 +1,4 @@
-"""The error to expect on a flight that was not seen, from blocks of windows that were left out of the fit."""
+"""Estimate the error on an unseen flight from blocks of windows that were left out of the fit."""
 
 from collections.abc import Mapping
 
@@ -14,16 +14,15 @@ Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon →
 
 
 def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, float], space: StateSpace) -> Expected:
-    """RMSE at the end of a window and of windows that touch, with the 80 % interval for a flight of as many blocks.
+    """Return the RMSE at the end of single and of joined windows, with an 80 % prediction interval for an equal flight.
 
-    The mean over the blocks of another flight is taken to vary as that over these, so that their difference has twice
-    its variance (a prediction interval for a future mean; Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7), by
-    Student's t, for the logarithm of the mean square.
+    The interval (Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7) uses Student's t for the logarithm of the mean
+    square over blocks.
 
     Args:
-        squares: for each block the mean squared error of each state at the end of a window, and of those that touch.
-        seconds: how long these are.
-        space: of these states.
+        squares: for each block the mean squared error of each state at the end of single and of joined windows.
+        seconds: durations of these windows.
+        space: state space.
     """
     blocks = len(squares)
     reach = scipy.special.stdtrit(blocks - 1, (1 + LEVEL) / 2) * np.sqrt(2 * ALIKE / blocks) if blocks > 1 else np.inf
@@ -41,7 +40,7 @@ def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, f
 
 
 def lines_of(expected: Expected, units: Mapping[str, str]) -> list[str]:
-    """A line for each horizon."""
+    """Format a line for each horizon."""
 
     def text(name: str, value: float, low: float, high: float) -> str:
         return f"{name} {value:.3g} ({low:.2g} to {high:.2g}) {units[name]}".rstrip()

@@ -1,8 +1,6 @@
-"""Expert Augmentation (Wehenkel et al. 2023; paper, Sec. 4.7): estimate θ_p from the past, without target data.
+"""Expert Augmentation (Wehenkel et al. 2023; paper, Sec. 4.7): an encoder estimates θ_p from the past of a flight.
 
-A hybrid trained on the source (the expert) is rolled out with θ_p drawn from a box of factors around its own, which the
-physics must hold as logarithms. From these rollouts, and from source windows, an encoder learns to estimate θ_p from
-the past of a flight; the expert with that θ_p predicts what comes next.
+It learns from rollouts of a source hybrid (the expert) with θ_p drawn from a box of factors around its own.
 """
 
 from collections.abc import Callable
@@ -33,10 +31,10 @@ RECORDED = -1  # the augmentation_seed of a recorded window
 
 @portable
 class Encoder(eqx.Module):
-    """A perceptron from the states and inputs of the past to one number in (−1, 1) for each parameter.
+    """A perceptron from past states and inputs to one number in (−1, 1) for each parameter.
 
     Attributes:
-        weights: of each layer (out, in), the first one first.
+        weights: of each layer (out, in), in order.
         biases: of each layer (out,).
         seen: mean and variance of its inputs over source flights.
     """
@@ -58,7 +56,7 @@ class ExpertAugmented(eqx.Module):
 
     Attributes:
         encoder: from the past of a flight to a place in the box.
-        expert: the hybrid of the source, which stays as it is.
+        expert: the hybrid of the source, which does not change.
         box: lowest and highest factor on each of the expert's parameters.
     """
 
@@ -70,7 +68,7 @@ class ExpertAugmented(eqx.Module):
     def solve(
         self, field: AbstractVectorField, train: Trajectories, validation: Trajectories, settings: Settings
     ) -> Solution:
-        """The expert with the mean estimate of θ_p over the heads of the windows.
+        """Return the expert with the mean estimate of θ_p over the heads of the windows.
 
         Args:
             field: not used, as the expert is the source.
@@ -82,15 +80,15 @@ class ExpertAugmented(eqx.Module):
         return Solution(self.with_parameters(_mean_over(self.estimate, cut(train, past))))
 
     def estimate(self, past: Trajectories) -> Theta:
-        """θ̂_p of one flight in the physics' own parametrisation; always inside the box.
+        """Estimate θ_p of one flight in the physics' own parametrisation; the estimate is always inside the box.
 
         Args:
-            past: one window, as long as those that the encoder was made for.
+            past: one window, as long as the windows that the encoder was built for.
         """
         return self.inside(self.encoder(past))
 
     def inside(self, place: Theta) -> Theta:
-        """The parameters at a place in the box, uniform in the logarithm.
+        """Return the parameters at a place in the box, uniform in the logarithm.
 
         Args:
             place: one number for each parameter (p,): −1 is the low end of the box, 1 its high end.
@@ -99,7 +97,7 @@ class ExpertAugmented(eqx.Module):
         return own + (low + high) / 2 + (high - low) / 2 * place
 
     def with_parameters(self, parameters: Theta) -> AbstractVectorField:
-        """The expert with other parameters.
+        """Return the expert with other parameters.
 
         Args:
             parameters: in the physics' own parametrisation (p,).
@@ -109,11 +107,11 @@ class ExpertAugmented(eqx.Module):
     def predict(
         self, past: Trajectories, u: Float[Array | np.ndarray, "t m"], solver: Solver = None
     ) -> Float[Array, "t d"]:
-        """The states that follow one past flight, under the inputs u.
+        """Predict the states after one past flight, under the inputs u.
 
         Args:
             past: one window, at whose end the prediction starts.
-            solver: takes the expert from sample to sample, by default one step of RK4 each.
+            solver: integrates the expert over each sample interval, by default one step of RK4.
         """
         return rollout(self.with_parameters(self.estimate(past)), past.x[-1], u, past.dt, solver)
 
@@ -122,16 +120,16 @@ class ExpertAugmented(eqx.Module):
 def expert_augmented(
     expert: Hybrid, past: Trajectories, key: PRNGKeyArray, *, box: tuple[float, float] = (0.5, 2.0), hidden: int = 128
 ) -> ExpertAugmented:
-    """An expert with an untrained encoder of two hidden layers.
+    """Build an expert with an untrained encoder of two hidden layers.
 
     Args:
-        expert: a hybrid trained on the source, whose physics holds its parameters as logarithms.
-        past: windows of source flight, as long as those that the encoder will read; they set the scale of its inputs.
+        expert: a hybrid trained on the source; its physics must store its parameters as logarithms.
+        past: windows of source flight, as long as the encoder will read; they set the scale of its inputs.
         box: lowest and highest factor on each of the expert's parameters, 0 < low <= high.
         hidden: units of each hidden layer of the encoder.
 
     Raises:
-        ValueError: another box, or past windows that are malformed.
+        ValueError: an invalid box, or malformed past windows.
     """
     if len(box) != 2 or not 0 < box[0] <= box[1] < np.inf:
         raise ValueError(f"box must be two factors, 0 < low <= high, got {box}")
@@ -150,17 +148,17 @@ def expert_augmented(
 
 
 def encoder_inputs(past: Trajectories) -> Float[Array, " r"]:
-    """The inputs of the encoder for one flight: state, change of state and input of each interval, in a row."""
+    """Concatenate state, change of state and input of each interval of one flight."""
     states = jnp.concatenate([jnp.asarray(past.x0)[None], jnp.asarray(past.x)])
     # The change carries the information on ẋ; computed by the encoder from states it would be lost in rounding.
     return jnp.concatenate([states[:-1], jnp.diff(states, axis=0), jnp.asarray(past.u)], axis=1).ravel()
 
 
 class Labelled(Trajectories):
-    """Windows that are used as recorded, or as the expert flies them.
+    """Windows that are used as recorded or as flown by the expert.
 
     Attributes:
-        augmentation_seed: of each window, the seed of the θ_p with which the expert flies it, or RECORDED.
+        augmentation_seed: seed of θ_p for each window that the expert flies, or RECORDED.
     """
 
     augmentation_seed: Int[Array | np.ndarray, "*n"]
@@ -170,11 +168,11 @@ class Labelled(Trajectories):
 class Augmentation(Objective):
     """The objective of an `ExpertAugmented`: L_MSE of its predictions + weight × MSE(θ̂_p, θ_p) on augmented flights.
 
-    Every source window is used twice: as recorded, and as the expert flies it with a θ_p from the box.
+    Every source window is used twice: as recorded, and as flown by the expert with a θ_p from the box.
 
     Attributes:
         past: intervals at the head of a window that the encoder reads; the rest is predicted.
-        seed: of the random θ_p.
+        seed: seed of the random θ_p.
     """
 
     past: int = 10
@@ -201,12 +199,12 @@ class Augmentation(Objective):
         return _mean_over(lambda one: self._errors(field, one, settings)[0], data)
 
     def augmented(self, field: ExpertAugmented, one: Labelled, settings: Settings) -> tuple[Trajectories, Theta]:
-        """One window as recorded, or as the expert flies it, and its θ_p.
+        """Return one window, as recorded or as flown by the expert, and its θ_p.
 
         Args:
-            field: whose expert flies, and whose box θ_p is drawn from.
+            field: provides the expert and the box for θ_p.
             one: a window with its seed.
-            settings: of which the solver takes the expert from sample to sample.
+            settings: their solver integrates the expert.
         """
         own, _ = ravel_parameters(field.expert.field)
         key = jax.random.fold_in(jax.random.key(self.seed), one.augmentation_seed)
@@ -216,14 +214,14 @@ class Augmentation(Objective):
         return replace(one, x=jnp.where(recorded, one.x, other)), jnp.where(recorded, own, drawn)
 
     def _errors(self, field: ExpertAugmented, one: Labelled, settings: Settings):
-        """L_MSE of the prediction of one window, and the mean squared error of θ̂_p."""
+        """Return L_MSE of the prediction of one window, and the mean squared error of θ̂_p."""
         window, theta = self.augmented(field, one, settings)
         error = _window_mse(field, window, self.past, settings.solver)
         return error, jnp.mean(jnp.square(field.estimate(split(window, self.past)[0]) - theta))
 
 
 def prediction_mse(field: ExpertAugmented, windows: Trajectories, past: int, solver=None) -> Float[Array, ""]:
-    """L_MSE of the prediction after the first `past` intervals of each window, mean over windows."""
+    """Average L_MSE of the prediction after the first `past` intervals over windows."""
     check(windows, "windows")
     return _mean_over(lambda window: _window_mse(field, window, past, solver), windows)
 

@@ -26,13 +26,13 @@ from hybrid_jax.trajectories import Trajectories
 
 
 class Solution(NamedTuple):
-    """What a method of adaptation returns.
+    """The result of a method of adaptation.
 
     Attributes:
         field: the adapted field.
-        steps: that it took: epochs, or evaluations of the Jacobian; 0 for a closed form.
+        steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
         status: how it ended, a `Status`.
-        choice: the candidates of `Auto` and which one was taken, an `auto.Choice`; None for another method.
+        choice: the candidates of `Auto` and the chosen one, an `auto.Choice`; None for another method.
     """
 
     field: AbstractVectorField
@@ -42,7 +42,7 @@ class Solution(NamedTuple):
 
 
 class Method(Protocol):
-    """A method of adaptation. Any object with `solve` is one; a frozen dataclass of its hyper-parameters is best.
+    """A method of adaptation: any object with `solve`, for example a frozen dataclass of hyper-parameters.
 
         @dataclass(frozen=True)
         class BestOf:
@@ -51,8 +51,9 @@ class Method(Protocol):
             def solve(self, field, train, validation, settings):
                 return Solution(min(self.candidates, key=lambda one: rollout_mse(one, validation)))
 
-    Two class attributes are optional: `uses_validation = False` keeps all windows for training; `has_intervals = True`
-    says that the method minimises L_MSE over the physics' parameters alone, so that they have valid intervals.
+    Two class attributes are optional: `uses_validation = False` keeps all windows for training. You should set
+    `has_intervals = True` only if the method minimises L_MSE over nothing but the physics' parameters, since only these
+    then have valid intervals.
     """
 
     def solve(
@@ -61,10 +62,10 @@ class Method(Protocol):
         """Adapt a field. Methods of the library compile and map over stacked fields.
 
         Args:
-            field: the source, which is left as it is.
-            train: windows of the changed system, to adapt to.
+            field: the source, which must not be changed.
+            train: windows of the changed system to adapt to.
             validation: other windows of it, for early stopping and choices.
-            settings: objective and solver, and of methods that train, minibatches and regulariser.
+            settings: objective and solver; for training also minibatches and regulariser.
 
         Raises:
             ValueError: a field, windows or settings that the method cannot use.
@@ -74,10 +75,10 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class LeastSquares(Method):
-    """Least squares on θ_p and a constant disturbance; the residual stays as it is.
+    """Least squares for θ_p and a constant disturbance; the residual does not change.
 
     Attributes:
-        disturbance: whether one is fitted; "auto" if the windows need one, see `select_disturbance`.
+        disturbance: whether one is fitted; with "auto" only if the windows need one, see `select_disturbance`.
         indices: the disturbed states, see `with_disturbance`.
         max_steps: the most steps of each fit.
     """
@@ -117,14 +118,14 @@ class FineTune(Method):
     """Adam from the source's parameters, with early stopping on the validation windows.
 
     Attributes:
-        rates: a tree prefix of the field; by default 1e-2 for physics and 1e-3 for the residual.
-        frozen: the part that stays as it is, or None.
+        rates: learning rates, a tree prefix of the field; by default 1e-2 for physics and 1e-3 for the residual.
+        frozen: the part that is not trained, or None.
         min_epochs: no early stop before.
         patience: stop after so many epochs without a better validation loss.
         max_epochs: stop after so many epochs.
         regulariser_weight: λ of `settings.regulariser`, if there is one.
         l2_sp: weight of half the squared distance from the source's parameters, see `held_at_start`.
-        seed: of the order of minibatches.
+        seed: random seed for shuffling minibatches.
     """
 
     rates: PyTree = None
@@ -176,11 +177,11 @@ def held_at_start(weight: float) -> optax.GradientTransformation:
 
 @dataclass(frozen=True)
 class Ridge(Method):
-    """A linear correction by ridge regression, with the penalty that predicts the validation windows best.
+    """A linear correction by ridge regression, with the penalty of smallest validation error.
 
     Attributes:
         update: `ridge.last_layer`, `ridge.linear_residual` or a function like them.
-        penalties: the penalties that are tried.
+        penalties: the penalties to try.
     """
 
     update: ridge.Update

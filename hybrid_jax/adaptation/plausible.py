@@ -1,7 +1,4 @@
-"""How far a changed system plausibly is from the source: the prior of an adaptation.
-
-A direction of the parameters that a flight does not excite then stays where it was, however well it fits some noise.
-"""
+"""The prior of an adaptation: plausible sizes of changes, so that parameters without excitation do not fit noise."""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
@@ -22,16 +19,16 @@ GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[
 
 @dataclass(frozen=True)
 class Plausible:
-    """One standard deviation of what may change; the prior is normal, with the source as its mean.
+    """Standard deviations of a normal prior for changes, centred at the source.
 
     Attributes:
-        theta: of each parameter of a rigid body as it holds it, such as the logarithm of a ratio: 0.3 is 30 percent.
-        relative: of a parameter of another system, over the size of the source's; one that is 0 there is free.
-        force: steady, over the mass [m/s²].
-        torque: steady, over the inertia [rad/s²].
-        drag: added, over the mass [1/s].
-        efficiency: the logarithm of each rotor's.
-        disturbance: constant, of another system, over the RMS rate of each state in the windows.
+        theta: of each parameter of a rigid body in its own parametrisation, for example 0.3 for 30 % of a ratio.
+        relative: of a parameter of another system, relative to the source's value; one that is 0 there is free.
+        force: constant force over the mass [m/s²].
+        torque: constant torque over the inertia [rad/s²].
+        drag: added drag over the mass [1/s].
+        efficiency: logarithm of each rotor's efficiency.
+        disturbance: constant disturbance of another system, over the RMS rate of each state in the windows.
 
     Raises:
         ValueError: a size that is not positive.
@@ -50,7 +47,7 @@ class Plausible:
             checks.positive(name, value)
 
     def sizes(self, field: AbstractVectorField, windows: Trajectories) -> Float[Array, " p"]:
-        """Of each parameter of an extended source, in the order of `ravel_parameters`; infinite for one that is free.
+        """Return the sizes of an extended source's parameters, in the order of `ravel_parameters`; infinite if free.
 
         Args:
             field: the extended source.
@@ -72,7 +69,7 @@ class Plausible:
 
 
 def groups_of(names: Sequence[str]) -> list[str]:
-    """Which group each parameter of an extended field belongs to, by its name."""
+    """Return the group of each parameter of an extended field, by its name."""
     steady = {name for name in names if name.startswith("disturbance[")}
     groups = GROUPS if steady <= GROUPS.keys() else GROUPS | dict.fromkeys(steady, "disturbance")
     return [groups.get(name, groups.get(name.split("[")[0], "theta")) for name in names]

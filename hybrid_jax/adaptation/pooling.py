@@ -1,9 +1,4 @@
-"""Physical parameters from several sources, with intervals that hold the error of the source's network too.
-
-The covariance of one fit takes its network as exact. Sources that differ in their seed alone differ in what their
-networks absorbed, which the variance between their estimates shows. Both are combined as in multiple imputation
-(Rubin, Multiple Imputation for Nonresponse in Surveys, 1987, Sec. 3.1).
-"""
+"""Pool physical parameters from several sources, with intervals that include the error of the networks."""
 
 from collections.abc import Sequence
 
@@ -22,7 +17,11 @@ SOURCES = 3  # at least so many: the variance between two says nothing
 
 @entry
 def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parameter]:
-    """The parameters that every result fitted, each with an interval from within and between the results.
+    """Pool the parameters that all results share, with intervals from the variance within and between results.
+
+    The covariance of one fit assumes an exact network. Sources with different seeds differ in what their networks
+    absorbed, so they are combined as in multiple imputation (Rubin, Multiple Imputation for Nonresponse in Surveys,
+    1987, Sec. 3.1).
 
     Args:
         results: adaptations of sources that were trained with different seeds, all to the same windows.
@@ -54,9 +53,8 @@ def combined(
 ) -> tuple[float, float]:
     """The mean of m estimates and the half-width of its interval, given the variance of each (Rubin, Eq. 3.1.2–8).
 
-    The variances have some degrees of freedom (Barnard and Rubin, Biometrika 1999). Where the variance between the
-    estimates is nearly all of the total, their rule gives fewer degrees than the m - 1 of that variance alone, which is
-    then known better than it says: the larger of both is taken, and no more than there are within.
+    Degrees of freedom follow Barnard and Rubin (Biometrika 1999), at least m − 1 where nearly all variance is between
+    the estimates, and at most `degrees`.
     """
     m = len(estimates)
     between = (1 + 1 / m) * np.var(estimates, ddof=1)
@@ -70,7 +68,7 @@ def combined(
 
 
 def _estimates(result: Adaptation) -> dict[str, tuple[float, float]]:
-    """Each parameter, as the physics holds it, and its variance."""
+    """Return each parameter in the physics' own parametrisation, and its variance."""
     theta, _ = ravel_parameters(result.field)
     assert result.covariance is not None
     pairs = zip(theta.tolist(), np.diag(result.covariance).tolist(), strict=True)
@@ -78,6 +76,6 @@ def _estimates(result: Adaptation) -> dict[str, tuple[float, float]]:
 
 
 def _at(result: Adaptation, name: str, value: float) -> float:
-    """A parameter in the units of the report, from the number that the physics holds."""
+    """Convert a number from the physics' own parametrisation to the units of the report."""
     theta, unravel = ravel_parameters(result.field)
     return float(named_parameters(unravel(theta.at[[*result.parameters].index(name)].set(value)))[name])

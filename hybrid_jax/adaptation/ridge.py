@@ -1,8 +1,4 @@
-"""Adaptation in closed form: a linear correction of a pre-trained field by ridge regression.
-
-A field's defect is the mean derivative that it lacks over an interval. It is regressed on the hidden units of its
-network (`last_layer`; O'Connell et al. 2022, Neural-Fly, where an adaptive law does it in flight), or on x and u.
-"""
+"""Adaptation in closed form: regress defects on hidden units or on x and u (O'Connell et al. 2022, Neural-Fly)."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -32,8 +28,8 @@ class RidgeFit(NamedTuple):
 
     Attributes:
         field: at the chosen penalty.
-        penalty: the chosen one, which should not be an end of the grid.
-        mse: the validation loss there.
+        penalty: the chosen penalty, which should not be an end of the grid.
+        mse: the validation loss at this penalty.
     """
 
     field: AbstractVectorField
@@ -44,7 +40,7 @@ class RidgeFit(NamedTuple):
 def last_layer(
     field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> AbstractVectorField:
-    """A `ResidualNetwork`, or a `Hybrid` whose residual is one, with its output layer changed by ΔW, Δb.
+    """Change the output layer of a `ResidualNetwork`, or of a `Hybrid` whose residual is one, by ΔW, Δb.
 
     They minimise Σ ‖e − (ΔW φ̄ + Δb)‖² + penalty ‖(ΔW, Δb)‖² over all intervals, with e the field's defect and φ̄ the
     mean of the hidden units, in inference mode, at the two ends of the interval.
@@ -68,7 +64,7 @@ def last_layer(
 def linear_residual(
     field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> Hybrid:
-    """The field plus a linear map of the standardised [x, u], regressed on the defects; raises as `last_layer`."""
+    """Add a linear map of the standardised [x, u], regressed on the defects; raises as `last_layer`."""
     before, u, after = transitions(windows)
     z = jnp.concatenate([(before + after) / 2, u], axis=1)
     mean, scale = mean_and_scale(z)
@@ -84,7 +80,7 @@ def fit_ridge(
     penalties: tuple[float, ...] = PENALTIES,
     settings: Settings | None = None,
 ) -> RidgeFit:
-    """The updated field at the penalty with the least validation loss; pure: it compiles and maps."""
+    """Return the updated field at the penalty of smallest validation loss; pure: it compiles and maps."""
     check(train, "train")
     check(validation, "validation")
     if not penalties:
@@ -101,7 +97,7 @@ def fit_ridge(
 
 
 def transitions(windows: Trajectories) -> tuple[Float[Array, "s d"], Float[Array, "s m"], Float[Array, "s d"]]:
-    """The state before, the input held and the state after, of all intervals of all windows, which are checked."""
+    """Return the state before, the input and the state after each interval of all windows, which are checked."""
     check(windows, "windows")
     x0, u, x = (jnp.asarray(a) for a in (windows.x0, windows.u, windows.x))
     before = jnp.concatenate([x0[:, None], x[:, :-1]], axis=1)
@@ -110,10 +106,9 @@ def transitions(windows: Trajectories) -> tuple[Float[Array, "s d"], Float[Array
 
 
 def defects(field: AbstractVectorField, windows: Trajectories, solver: Solver = None) -> Float[Array, "s d"]:
-    """e, the derivative that the field lacks in each interval, mean of its two ends, to second order in dt.
+    """Return e, the derivative that the field lacks in each interval, mean of its two ends, to second order in dt.
 
-    With Φ one solver step, (x₁ − Φ(x₀)) / dt is off by ½ dt ∂f/∂x e, as a missing acceleration also changes the
-    position; the same step backwards from x₁ is off by the opposite amount.
+    With Φ one solver step, (x₁ − Φ(x₀)) / dt is off by ½ dt ∂f/∂x e; the step backwards from x₁ is off by the opposite.
     """
     (before, u, after), dt = transitions(windows), windows.dt
     before, u, solver = checked(field, before, u[:, None], dt, solver, windows=True)
@@ -135,7 +130,7 @@ def mean_and_scale(z: Float[Array, "s n"]) -> tuple[Float[Array, " n"], Float[Ar
 def ridge(
     z: Float[Array, "s n"], y: Float[Array, "s d"], penalty: Penalty
 ) -> tuple[Float[Array, "d n"], Float[Array, " d"]]:
-    """W, b that minimise Σ ‖y − (W z + b)‖² + penalty ‖(W, b)‖²."""
+    """Minimise Σ ‖y − (W z + b)‖² + penalty ‖(W, b)‖² over W, b."""
     checks.positive("penalty", penalty)
     # The normal equations would square the design's condition number, about 1e4 for hidden units, beyond float32.
     design = jnp.concatenate([z, jnp.ones((len(z), 1), z.dtype)], axis=1)

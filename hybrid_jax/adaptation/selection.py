@@ -1,11 +1,7 @@
-"""Choose what to adapt by how probable each change is, where a source may err although nothing has changed.
+"""Choose the change by Bayes factors (Kass and Raftery 1995) from a quadratic form around one fit of everything.
 
-Around one fit of everything the squared errors are quadratic in the parameters, so that what every candidate fits, and
-how probable the windows are if it is right, are known in closed form (Kass and Raftery, Bayes factors, 1995). A
-candidate lets its parameters change by a plausible size, see `Plausible`. Beside that every parameter seems to move by
-as much as windows of the source's own motion make it seem: a source is not exact, and windows of one kind of motion,
-such as hover, show its error as steadily as a change. The most probable candidate is taken if the
-evidence against no change is strong.
+The prior of a change is its plausible size (`Plausible`) plus the apparent change on the source's own motion, since a
+source is not exact. A change is chosen only on strong evidence.
 """
 
 from typing import Any, NamedTuple
@@ -60,12 +56,12 @@ class Fit(NamedTuple):
     converged: Bool[Array, ""]
 
     def at(self, theta: Float[Array, " p"]) -> NormalEquations:
-        """The equations at other parameters."""
+        """Return the equations at other parameters."""
         (gram, score, square), move = self.equations, theta - self.theta
         return NormalEquations(gram, score + gram @ move, square + (2 * score + gram @ move) @ move)
 
     def surely_better(self, other: "Fit") -> Bool[Array, ""]:
-        """Whether it predicts the same windows better, by so many standard errors that it is no chance."""
+        """Whether it predicts the same windows significantly better."""
         gain = other.equations.square - self.equations.square
         return jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / jnp.sqrt(len(gain))
 
@@ -73,10 +69,7 @@ class Fit(NamedTuple):
 def fit_each(
     field: AbstractVectorField, windows: Trajectories, free, sizes, solver: Solver, scale: Scale, max_steps: int
 ) -> tuple[Fit, Starts | None]:
-    """Fits of what each of c candidates leaves free; a distance from the field over its plausible size is an error.
-
-    Also the starts of the windows that they take, see `smoothed`.
-    """
+    """Fit the free parameters of each candidate, with the prior `sizes`; also return the `smoothed` starts."""
     starts, noise = smoothed(field, windows, solver, scale)
     smooth, weigh = from_starts(windows, starts)
     noise = jnp.maximum(noise, jnp.square(rounding(windows, scale)) / windows.x.size)
@@ -93,11 +86,11 @@ def fit_each(
 
 
 class Unchanged(NamedTuple):
-    """What windows show where nothing has changed.
+    """What windows show without any change.
 
     Attributes:
-        apparent: variance of the change of each parameter that they seem to ask for (p,).
-        error: sum over the windows of squared errors of the source, over scale, that they may have in common.
+        apparent: variance of the apparent change of each parameter (p,).
+        error: sum over the windows of the source's squared errors, over scale, that they may share.
     """
 
     apparent: Float[Array, " p"]
@@ -105,10 +98,9 @@ class Unchanged(NamedTuple):
 
 
 def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, field, learned_from, windows) -> Unchanged:
-    """From the source on its own motion: what each window asks for beyond noise (DerSimonian and Laird 1986).
+    """Estimate apparent changes beyond noise from the source's own motion (DerSimonian and Laird 1986).
 
-    Over windows that differ as those do it has its mean. Where they are unlike those, a network may err by as much as
-    it adds to the predictions: errors of a share of the windows move a parameter by no more than this share.
+    Where windows are unlike that motion, the network's error is assumed to be as large as its effect.
     """
     outside, missed = (shares_outside(field, *pair) for pair in ((learned_from, windows), (windows, learned_from)))
     places = jnp.maximum(1.0, (1 - missed) * len(windows))
@@ -123,20 +115,20 @@ def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, field, lear
 
 
 def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:
-    """As many windows of the source's motion as there are others, and no longer ones, so that one program serves."""
+    """Select as many of the source's windows as there are others, and no longer ones, so that one program serves."""
     places, t = np.linspace(0, len(learned_from) - 1, len(windows)).astype(int), windows.horizon
     own = Trajectories(learned_from.x0, learned_from.u[:, :t], learned_from.x[:, :t], learned_from.dt)
     return jax.tree.map(lambda leaf, other: jnp.asarray(leaf[places], other.dtype), own, windows)
 
 
 class Posterior(NamedTuple):
-    """Of each of c candidates.
+    """The posterior of c candidates.
 
     Attributes:
         theta: the parameters, to first order (c, p).
-        probability: that it is what changed (c,).
-        naive: the same, of a source that makes no errors.
-        taken: the index of the candidate that was taken.
+        probability: of each change (c,).
+        naive: the same probability if the source had no errors.
+        taken: index of the chosen candidate.
     """
 
     theta: Float[Array, "c p"]
@@ -153,8 +145,8 @@ def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array
         every: a fit of everything.
         start: the source's parameters (p,).
         free: which of them each candidate changes (c, p).
-        sizes: plausible changes; infinite for one of which nothing is known, which may change as one window says.
-        apparent: variance of the changes that these windows show where nothing has changed.
+        sizes: prior standard deviations; if infinite, the variance is what one window determines.
+        apparent: variance of the apparent changes without any change.
     """
     variance = dispersion(every, sizes)  # what remains where everything may change
     information = jnp.sum(around.equations.gram, axis=0) / variance
@@ -180,10 +172,7 @@ def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array
 
 
 def dispersion(found: Fit, sizes) -> Float[Array, ""]:
-    """The variance of an error by what blocks of windows ask the parameters for: at least that of noise.
-
-    Errors that are correlated within a block say less than as many independent ones (Wedderburn 1974).
-    """
+    """Estimate the variance of an error from the variation between blocks (Wedderburn 1974), at least the noise's."""
     places, counted = blocks_of(len(found.equations.score), BLOCKS)
     score = jnp.sum(found.equations.score[places] * counted[..., None], axis=1)
     total = jnp.sum(found.equations.gram, axis=0)
@@ -196,7 +185,7 @@ def dispersion(found: Fit, sizes) -> Float[Array, ""]:
 
 
 def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Trajectories) -> Float[Array, ""]:
-    """The largest share over quantities of samples outside of the 1 to 99 % range of the known ones; it compiles."""
+    """Return the largest share of samples, over quantities, outside the known 1 to 99 % range; it compiles."""
     space, t = state_space(field, known.x0.shape[-1]), min(known.horizon, asked.horizon)
 
     def features(windows: Trajectories) -> dict[str, Any]:
@@ -209,7 +198,7 @@ def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Traje
 
 
 def blocks_of(windows: int, blocks: int) -> tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]:
-    """The indices of the windows of each block, consecutive ones, and which count: a short block repeats its last."""
+    """Return the indices of each block's consecutive windows, and which count: a short block repeats its last."""
     each = -(-windows // min(blocks, windows))
     index = np.arange(-(-windows // each) * each).reshape(-1, each)
     return np.minimum(index, windows - 1), index < windows
@@ -218,7 +207,7 @@ def blocks_of(windows: int, blocks: int) -> tuple[Int[np.ndarray, "b m"], Bool[n
 def left_out_steps(
     equations: NormalEquations, held: Float[Array, "p p"], pull: Float[Array, " p"], blocks
 ) -> Float[Array, "b p"]:
-    """The Gauss–Newton step on all blocks but one, for each block, with the matrix of a penalty and its half slope."""
+    """Compute the Gauss–Newton step without each block, with a penalty's matrix and half slope."""
     places, counted = blocks
     gram = jnp.sum(equations.gram[places] * counted[..., None, None], axis=1)
     score = jnp.sum(equations.score[places] * counted[..., None], axis=1)
@@ -228,7 +217,7 @@ def left_out_steps(
 def errors_at_ends(
     field: AbstractVectorField, block: Trajectories, counted: Bool[Array, " m"], solver: Solver = None
 ) -> Float[Array, "2 d"]:
-    """Mean squared error of each state at the end of a window, and of windows that touch, predicted as one."""
+    """Return the mean squared error of each state at the end of single windows and of joined windows."""
 
     def one(carry, item):
         end, recorded = carry
@@ -246,7 +235,7 @@ def errors_at_ends(
 
 
 def correlated(windows: Trajectories) -> int:
-    """How many consecutive windows to take as one cluster: a fifth where they are of one flight, or of a few."""
+    """How many consecutive windows form a cluster: a fifth if they are from one flight or a few."""
     starts, ends = np.asarray(windows.x0), np.asarray(windows.x)[:, -1]
     touch = bool((starts[1:] == ends[:-1]).all(axis=1).any())
     of_flights = touch or overlap(windows) or _follow(starts, ends)
@@ -254,7 +243,7 @@ def correlated(windows: Trajectories) -> int:
 
 
 def _follow(starts: Float[np.ndarray, "n d"], ends: Float[np.ndarray, "n d"]) -> bool:
-    """Whether windows begin much nearer to the end of the one before than to those of others, after a gap."""
+    """Whether windows begin much nearer to the end of the previous one than to other ends, after a gap."""
     n, spread = len(starts), np.std(starts, axis=0)
     if n < FEW or not spread.any():
         return False
@@ -265,12 +254,12 @@ def _follow(starts: Float[np.ndarray, "n d"], ends: Float[np.ndarray, "n d"]) ->
 
 
 def overlap(windows: Trajectories) -> bool:
-    """Whether a window begins inside of the one before."""
+    """Whether a window begins inside the previous one."""
     return bool((np.asarray(windows.x0)[1:, None] == np.asarray(windows.x)[:-1, :-1]).all(axis=-1).any())
 
 
 def longest_chain(windows: Trajectories, blocks: int) -> int:
-    """How many windows that touch are predicted as one, at most."""
+    """Return the most adjacent windows that are joined."""
     x0, x, longest = np.asarray(windows.x0), np.asarray(windows.x), 1
     for places, counted in zip(*blocks_of(len(windows), blocks), strict=True):
         own = places[counted]
