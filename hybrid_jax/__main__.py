@@ -1,4 +1,4 @@
-"""`python -m hybrid_jax` is the console script `hybrid-jax`."""
+"""Run the console script `hybrid-jax` by `python -m hybrid_jax`."""
 
 from hybrid_jax.cli import main
 

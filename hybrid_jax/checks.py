@@ -1,7 +1,4 @@
-"""Checks of arguments. Each raises a ValueError of one line: the argument's name, what was expected, and the value.
-
-In a compiled or mapped program an array is traced: it has no numbers yet, and they are not checked.
-"""
+"""Checks of arguments: each raises a one-line ValueError that names the argument; traced arrays are not checked."""
 
 import errno
 import math
@@ -27,16 +24,11 @@ SMALLEST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32)
 
 
 def is_traced(value: Any) -> bool:
-    """Whether the numbers of a value are not known yet."""
     return isinstance(value, jax.core.Tracer)
 
 
 def not_traced(name: str, *arguments: Any) -> None:
-    """Refuse to be a part of `jax.jit`, `jax.vmap` or `jax.grad`: the function decides by numbers what it does next.
-
-    Raises:
-        TypeError: some argument is traced.
-    """
+    """Raise TypeError inside `jax.jit`, `jax.vmap` or `jax.grad`, for functions that branch on values."""
     if any(map(is_traced, jax.tree.leaves(arguments))):
         raise TypeError(
             f"{name} cannot be called under jax.jit, jax.vmap or jax.grad, as it decides by numbers; "
@@ -63,7 +55,7 @@ def floating(name: str, value: Any) -> jax.Array:
 
 
 def finite(name: str, array: Numbers) -> Numbers:
-    """The array unchanged. Refuses a number that is not finite in JAX's precision, and says where it is."""
+    """The array unchanged; ValueError, with the position, for a number that is not finite in JAX's precision."""
     if is_traced(array):
         return array
     values, precision = np.asarray(array), jnp.result_type(float)
@@ -78,7 +70,7 @@ def finite(name: str, array: Numbers) -> Numbers:
 
 
 def unit_quaternions(name: str, states: Numbers, part: slice = QUATERNION) -> None:
-    """Refuse states (..., d) whose quaternion, by default that of a rigid body, is not of norm 1."""
+    """Require states (..., d) with unit quaternions at `part`, by default at the place of a rigid body's."""
     if is_traced(states):
         return
     norms = np.linalg.norm(np.asarray(states)[..., part], axis=-1)
@@ -90,7 +82,7 @@ def unit_quaternions(name: str, states: Numbers, part: slice = QUATERNION) -> No
 
 
 def real(value: Any) -> float | None:
-    """The number that a real number, or an array of one without axes, holds; None for anything else."""
+    """The value as a float if it is a real number or an array without axes, else None."""
     if isinstance(value, Numbers) and value.ndim == 0 and not is_traced(value):
         value = value.item()
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
@@ -133,7 +125,7 @@ def instance(name: str, value: Any, kind: type) -> None:
 
 
 def list_of(name: str, values: Any, kind: type[T]) -> list[T]:
-    """The values as a list; requires that each is of a class. One of them alone is no list."""
+    """The values as a list of instances of `kind`; a single instance outside a list is an error."""
     found = list(values) if isinstance(values, Iterable) else [values]
     if not isinstance(values, Iterable) or not all(isinstance(value, kind) for value in found):
         raise ValueError(f"{name} must be a list of {kind.__name__}, got {short_repr(values)}")
@@ -141,7 +133,7 @@ def list_of(name: str, values: Any, kind: type[T]) -> list[T]:
 
 
 def places(name: str, values: Any, size: int = MOST) -> tuple[int, ...]:
-    """The values as a tuple; requires different indices, one at least, of an axis of some size."""
+    """The values as a tuple of at least one index of an axis of length `size`, all different."""
     found = tuple(values) if isinstance(values, Iterable) else ()
     whole = all(isinstance(value, int | np.integer) for value in found)
     if not whole or len({*found}) < max(1, len(found)) or not 0 <= min(found) <= max(found) < size:
@@ -169,18 +161,18 @@ def writable_folder(name: str, folder: Path) -> None:
 
 
 def short_repr(value: Any) -> str:
-    """The beginning of a value's own description, in one line."""
+    """The beginning of `repr(value)`, in one line."""
     return " ".join(repr(value)[:80].split())
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of what an error says, without the middle of a very long one, or the name of its kind."""
+    """The first line of an error's message, shortened in the middle, or the error's class name."""
     line = (str(getattr(error, "strerror", None) or error).strip() or type(error).__name__).splitlines()[0]
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} … {line[-LONGEST // 2 :]}"
 
 
 def content_of(path: str | Path) -> bytes:
-    """The bytes of a regular file; OSError for others, as a pipe or a device may never end."""
+    """The bytes of a regular file; OSError for others, since a pipe or a device may never end."""
     if Path(path).exists() and not Path(path).is_file():
         raise OSError(errno.EINVAL, "is no regular file")
     return Path(path).read_bytes()

@@ -1,4 +1,4 @@
-"""Many windows a few at a time, so that memory does not grow with their number."""
+"""Evaluate a function on many windows, a few at a time, so that memory does not grow with their number."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,10 +8,9 @@ import jax.numpy as jnp
 
 
 def in_chunks(function: Callable[[Any], Any], values: Any, size: int) -> Any:
-    """`function` of stacked values, of at most `size` at a time, in chunks of equal length.
+    """`function` on stacked values, at most `size` at a time.
 
-    The last value is repeated to fill the last chunk: a shorter one, as that of `jax.lax.map`, would be compiled as a
-    program of its own.
+    All chunks have equal length, padded with the last value: a shorter one would be compiled as its own program.
     """
     n = len(jax.tree.leaves(values)[0])
     chunks = -(-n // size)

@@ -1,4 +1,4 @@
-"""How far a flight lies outside of the flight that a model was trained on."""
+"""Measure how far a flight lies outside the range of the training flight."""
 
 from collections.abc import Mapping
 
@@ -14,13 +14,12 @@ Features = Mapping[str, np.ndarray]
 
 
 def features_of(windows: Trajectories, space: StateSpace) -> Features:
-    """`StateSpace.features` of every sample of some windows."""
     x, u = np.asarray(windows.x), np.asarray(windows.u)
     x, u = (part.reshape(x.shape[0] * x.shape[1], part.shape[-1]) for part in (x, u))
     return space.features(x, u)
 
 
 def shares_outside(known: Features, asked: Features) -> dict[str, float]:
-    """By quantity the share of samples outside the 1 to 99 % range of the known ones."""
+    """By quantity, the fraction of samples outside the 1 to 99 % range of the known ones."""
     ends = {name: np.quantile(values, RANGE) for name, values in known.items()}
     return {name: float(np.mean((asked[name] < low) | (asked[name] > high))) for name, (low, high) in ends.items()}

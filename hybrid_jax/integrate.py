@@ -1,4 +1,4 @@
-"""Trajectories of a vector field under inputs held over each interval, by any one-step solver of diffrax for ODEs."""
+"""Trajectories of a vector field with piecewise constant inputs, by any one-step ODE solver of diffrax."""
 
 import dataclasses
 from collections.abc import Callable
@@ -30,8 +30,8 @@ class RK4(diffrax.AbstractSolver):
     """The classical fourth-order Runge–Kutta method (Kutta 1901), which diffrax does not ship; fixed steps only.
 
     Attributes:
-        scanned: whether its stages are a loop, see `compact`. The result is the same.
-        substeps: steps of equal length in each interval, where one would be unstable or inaccurate.
+        scanned: whether its stages are a loop, which compiles faster (see `compact`). The result is the same.
+        substeps: steps of equal length in each interval, for systems where a single step is unstable or inaccurate.
     """
 
     scanned: bool = False
@@ -81,7 +81,7 @@ class RK4(diffrax.AbstractSolver):
 
 
 def compact(solver: Solver | None) -> Solver:
-    """The solver, by default RK4, for a program that runs seldom: with its stages in a loop it compiles sooner."""
+    """The solver, by default RK4, with its stages in a loop: it compiles faster, for programs that run rarely."""
     if solver is None or isinstance(solver, RK4):
         return RK4(scanned=True, substeps=1 if solver is None else solver.substeps)
     return solver
@@ -96,10 +96,10 @@ def integrate(
     substeps=1,
     project: Callable[[Array], Array] = lambda x: x,
 ) -> Float[Array, "t d *b"]:
-    """The states at the end of each of t intervals of length dt [s], solver steps of dt / substeps.
+    """The states at the end of each of t intervals of length dt [s], each in solver steps of dt / substeps.
 
-    Each interval is a solver step of its own, with its input as `args`: in a single solve that looks up its input by
-    time, a stage at the end of a step would read the next input. `project` moves the state after an interval.
+    Each interval is a separate solver step with its input as `args`: in a single solve that looks up the input by
+    time, a stage at the end of a step would read the next input. `project` maps the state after each interval.
     """
     solver = _prepared(solver, jnp.result_type(x0))
     term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
@@ -125,7 +125,7 @@ def integrate(
 def rk4_step(
     derivative: Derivative, x: Float[Array, " d *b"], u: Float[Array, " m *b"], dt: float
 ) -> Float[Array, " d *b"]:
-    """The state after one step of RK4 over dt [s] with the input held, as in an interval of `rollout`."""
+    """The state after one RK4 step of dt [s] with constant input, as in an interval of `rollout`."""
     evaluate = traced_once(derivative, x)
     term = diffrax.ODETerm(lambda t, x, held: evaluate(x, held))
     return RK4().step(term, 0.0, dt, x, u, None, made_jump=False)[0]
@@ -145,11 +145,7 @@ def _evaluate(field: AbstractVectorField, x, u):
 
 
 def _prepared(solver: Solver, dtype) -> Solver:
-    """The solver with tolerances for its root finder, and with its stages in a loop of bounded length.
-
-    Diffrax takes tolerances from an adaptive step size controller, which fixed steps have not. Its default, a
-    checkpointed loop, cannot be differentiated inside `shard_map`, where the runs of a sweep are.
-    """
+    """The solver with tolerances for its root finder and a bounded loop, which `shard_map` can differentiate."""
     if isinstance(solver, diffrax.HalfSolver):
         return eqx.tree_at(lambda half: half.solver, solver, _prepared(solver.solver, dtype))
     if isinstance(solver, diffrax.AbstractImplicitSolver) and not isinstance(solver.root_finder.rtol, float):  # pyright: ignore[reportAttributeAccessIssue]
@@ -171,22 +167,21 @@ def rollout(
     solver: Solver | None = None,
     substeps: int = 1,
 ) -> Float[Array, "t d"]:
-    """The trajectory of a field in inference mode: x[i] is the state (i + 1) dt after x0, u[i] the input until then.
+    """The trajectory of a field in inference mode: x[i] is the state (i + 1) dt after x0, u[i] the input before it.
 
-    Of more than a thousand intervals, after each an attitude is made a unit quaternion again, if the field's state
-    space has one. A trajectory that diverges continues as infinity or NaN; `Model.predict` raises.
+    For more than a thousand intervals, attitudes in the field's state space are normalised after each one. A
+    trajectory that diverges continues as infinity or NaN; `Model.predict` raises instead.
 
     Args:
         field: ẋ = f(x, u), a vector field or any function of a state (d,) and an input (m,).
-        x0: the state at the start (d,).
+        x0: the initial state (d,).
         dt: length of an interval [s].
-        solver: a one-step method of diffrax for ODEs; by default `RK4`.
+        solver: a one-step ODE solver of diffrax; by default `RK4`.
         substeps: solver steps of equal length in each interval.
 
     Raises:
-        ValueError: an argument of the wrong shape or type, or, where its numbers are known, one that is not finite; dt
-            or substeps that are not positive; a solver for other equations; or a field that does not accept x0 and u,
-            or does not return ẋ of the shape of x0.
+        ValueError: an argument has the wrong shape or type, or is not finite; dt or substeps is not positive; the
+            solver is not for ODEs; or the field does not map x0 and u to ẋ of the shape of x0.
     """
     return _integrate(field, *checked(field, x0, u, dt, solver, substeps), dt, substeps)
 
@@ -197,10 +192,7 @@ def _integrate(field, x0, u, solver, dt, substeps):
 
 
 def projection(field, d: int, intervals: int) -> Callable[[Array], Array]:
-    """What is done to a state after an interval of so many: projected on its manifold if these are `LONG`, or nothing.
-
-    Over the windows of training the norm of a quaternion is a state like others, which a residual may move.
-    """
+    """The map applied to a state after each interval: onto its manifold beyond `LONG` intervals, else the identity."""
     return state_space(field, d).projected if intervals > LONG else lambda x: x
 
 
@@ -216,8 +208,8 @@ def rollout_batch(
     """`rollout` of each of n windows.
 
     Args:
-        field: ẋ = f(x, u), as in `rollout`, like those that follow.
-        x0: the state at the start of each window (n, d).
+        field: ẋ = f(x, u); see `rollout`.
+        x0: the initial state of each window (n, d).
         dt: length of an interval [s].
         solver: by default `RK4`.
         substeps: solver steps of equal length in each interval.
@@ -238,7 +230,7 @@ def _integrate_batch(field, x0, u, solver, dt, substeps):
 def checked(
     field, x0, u, dt, solver, substeps: int = 1, *, windows: bool = False
 ) -> tuple[Float[Array, "*n d"], Float[Array, "*n t m"], Solver]:
-    """x0 in the precision of ẋ, u, and the solver or the default one, after the checks of `rollout`."""
+    """x0 in the precision of ẋ, u, and the solver or its default, after the checks of `rollout`."""
     x0, u = checks.floating("x0", x0), checks.floating("u", u)
     expected = "x0 (n, d) and u (n, t, m)" if windows else "x0 (d,) and u (t, m)"
     if x0.ndim != 1 + windows or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
@@ -252,7 +244,7 @@ def checked(
 
 
 def check_solver(solver) -> None:
-    """Refuse what is no one-step method of diffrax for ODEs of one term."""
+    """Require a one-step diffrax solver for ODEs of one term."""
     if not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver must be one of diffrax or of hybrid_jax.SOLVERS, got {checks.short_repr(solver)}")
     # A step starts at time zero, of which a multistep method would remember the wrong ones.
@@ -261,14 +253,14 @@ def check_solver(solver) -> None:
 
 
 def check_callable(field) -> None:
-    """Refuse what is no field, such as a result that holds one."""
+    """Require a field; a result that contains one is an error."""
     if not callable(field):
         inside = next((f"; pass its .{part}" for part in ("best", "field") if callable(getattr(field, part, None))), "")
         raise ValueError(f"field: must be a function (x, u) → ẋ, got {type(field).__name__}{inside}")
 
 
 def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-    """Shape and type of ẋ = field(x, u); ValueError if the field does not map x and u to ẋ of the shape of x."""
+    """Shape and type of ẋ = field(x, u); ValueError if it does not have the shape of x."""
     check_callable(field)
     name = getattr(field, "__name__", type(field).__name__)
     given = f"a state {x.shape} and an input {u.shape}"

@@ -1,7 +1,7 @@
-"""Systems of equations with small matrices, one after the other also under `vmap`.
+"""Solve systems with small matrices one after the other, also under `vmap`.
 
-On a CPU jaxlib shares a batch of factorisations out to the threads that run programs, and waits for them in one of
-these. Two batches at once, in one program or on two devices, can then wait for each other for ever.
+On a CPU, jaxlib distributes a batch of factorisations over the threads that run programs and waits for them in one
+of these threads, so two batches at once, in one program or on two devices, can deadlock.
 """
 
 import jax

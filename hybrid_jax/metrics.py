@@ -15,11 +15,11 @@ CHUNK = 1000  # windows predicted at once
 
 
 def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:
-    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window; ValueError for arrays of different shapes, or without a state.
+    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window; ValueError if the shapes differ or there is no state.
 
     Args:
-        predicted: x̂, predicted states (n, t, d), of one window also (t, d).
-        truth: x, the states that followed, of the same shape.
+        predicted: x̂, predicted states (n, t, d) or, for one window, (t, d).
+        truth: x, the true states, of the same shape.
     """
     if predicted.shape != truth.shape or predicted.ndim < 2 or 0 in predicted.shape[-2:]:
         raise ValueError(f"predicted and truth must both be (n, t, d), got shapes {predicted.shape} and {truth.shape}")
@@ -30,16 +30,14 @@ def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Flo
 def rollout_mse(
     field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None, chunk: int = CHUNK
 ) -> Float[Array, ""]:
-    """L_MSE of a field in inference mode, mean over windows, at the end of every `every`-th interval.
-
-    It is not finite if the field diverges. To predict `chunk` windows at a time bounds memory.
+    """L_MSE of a field in inference mode, mean over windows, on every `every`-th state; not finite if it diverges.
 
     Args:
         field: ẋ = f(x, u), evaluated in inference mode.
-        windows: the windows that are predicted from their first states.
+        windows: the windows, each predicted from its initial state.
         every: count the state after each so many intervals.
         solver: a one-step method of diffrax; by default `RK4`.
-        chunk: windows predicted at a time.
+        chunk: windows predicted at a time, which bounds memory.
 
     Raises:
         ValueError: malformed windows, windows that do not match the field, or an `every` beyond their horizon.
@@ -53,7 +51,7 @@ def window_mse(
     """L_MSE of each window; see `rollout_mse`.
 
     Args:
-        field: as in `rollout_mse`, like those that follow.
+        field: ẋ = f(x, u), evaluated in inference mode.
         windows: n windows.
         every: intervals between two states that count.
         solver: by default `RK4`.

@@ -1,4 +1,4 @@
-"""What was measured in an experiment: signals by name, each with samples at times of its own."""
+"""Measured signals by name, each with its own sample times."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,11 +21,11 @@ class Signal:
     Attributes:
         t: time of each sample [s], strictly increasing, from the start of the record.
         values: one column for each of `axes`, in SI units.
-        axes: which axes were measured; by default "0", "1", …
+        axes: names of the measured axes; by default "0", "1", …
         source: topic, group or columns that it came from, for messages.
 
     Raises:
-        ValueError: inconsistent shapes, values that are not finite, or times that do not increase: source and time.
+        ValueError: inconsistent shapes, values that are not finite, or times that do not increase (with their source).
     """
 
     t: Float[np.ndarray, " n"] = field(repr=False)
@@ -57,7 +57,7 @@ class Signal:
         return float(np.median(np.diff(self.t))) if len(self) > 1 else np.inf
 
     def gaps(self) -> list[tuple[float, float]]:
-        """Start and end [s] of each time without samples."""
+        """Start and end [s] of each interval without samples."""
         missing = np.flatnonzero(np.diff(self.t) > GAP * self.interval)
         return [(float(self.t[i]), float(self.t[i + 1])) for i in missing]
 
@@ -67,10 +67,10 @@ class Record:
     """The signals of one experiment.
 
     Attributes:
-        name: of the experiment in messages, usually its file.
-        signals: by name; what was not measured is absent.
-        notes: what a reader left out or had to assume, a sentence each.
-        facts: what a log says of its system and program, such as {"airframe": "4001"}, for reports and checks.
+        name: what messages call the experiment, usually its file.
+        signals: by name; signals that were not measured are absent.
+        notes: what a reader omitted or had to assume, one sentence each.
+        facts: metadata of a log for reports and checks, for example {"airframe": "4001"}.
     """
 
     name: str
@@ -80,16 +80,14 @@ class Record:
 
     @classmethod
     def of(cls, name: str = "record", **signals: tuple) -> "Record":
-        """A record of arrays.
-
-        For example `Record.of("run 1", torque=(t, torque), angle=(t_angle, angle))`.
+        """A record of arrays, for example `Record.of("run 1", torque=(t, torque), angle=(t_angle, angle))`.
 
         Args:
-            name: of the experiment in messages.
+            name: what messages call the experiment.
             signals: times [s] (n,) and values (n,) or (n, k) of each signal. Samples with a NaN are left out.
 
         Raises:
-            ValueError: as of a `Signal`.
+            ValueError: see `Signal`.
         """
         found = {}
         for label, (t, values) in signals.items():
@@ -100,11 +98,11 @@ class Record:
 
     @property
     def duration(self) -> float:
-        """From the first to the last sample of the signal that lasts longest [s]."""
+        """Length [s] of the longest signal, from its first to its last sample."""
         return max((float(signal.t[-1] - signal.t[0]) for signal in self.signals.values() if len(signal)), default=0.0)
 
     def part(self, begin: float, end: float) -> "Record":
-        """The samples between two times, which stay as they are.
+        """The samples between two times; times are not shifted.
 
         Args:
             begin: the first time [s].
@@ -124,8 +122,8 @@ class Gridded(NamedTuple):
         start: time of the grid's first point [s].
         u: the mean of the inputs over each interval.
         y: the samples of each output.
-        index: the interval in which each sample lies.
-        share: how far into it, from 0 to 1.
+        index: the interval that contains each sample.
+        share: the position of each sample in its interval, from 0 to 1.
     """
 
     start: float
@@ -143,19 +141,19 @@ def on_grid(
     between: Between = "held",
     begin: float | None = None,
 ) -> Gridded:
-    """A record on intervals of length dt, from the first to the last sample of its outputs where its inputs are known.
+    """A record on intervals of length dt, over the samples of its outputs for which the inputs are known.
 
     Args:
-        record: what was measured.
-        inputs: names of the signals that act, which make up u in this order.
+        record: the measured signals.
+        inputs: names of the signals that make up u, in this order.
         outputs: names of the signals that are compared.
         dt: length of an interval [s].
-        between: how the inputs act between samples: each "held" until the next, on a "linear" path to the next, or
-            "averaged" over the time since the one before.
-        begin: the first time [s], by default that of the first sample.
+        between: the inputs between samples: "held" until the next, "linear" interpolation, or "averaged" over the time
+            since the previous one.
+        begin: the first time [s], by default the time of the first sample.
 
     Raises:
-        ValueError: a signal that is not there, or signals that have no time in common: name and what was expected.
+        ValueError: a signal is missing, or the signals do not overlap in time.
     """
     for name in (*inputs, *outputs):
         if name not in record.signals or len(record.signals[name]) == 0:
@@ -186,7 +184,7 @@ def on_grid(
 
 
 def _span(record: Record, inputs, outputs, between: Between) -> tuple[float, float]:
-    """From the first to the last time at which all inputs act."""
+    """The first and last time for which all inputs are known."""
     acting = [record.signals[name] for name in inputs]
     lasting = [signal.interval if between == "held" and len(signal) > 1 else 0.0 for signal in acting]
     begin = max((signal.t[0] - (signal.interval if between == "averaged" else 0) for signal in acting), default=-np.inf)
@@ -197,12 +195,12 @@ def _span(record: Record, inputs, outputs, between: Between) -> tuple[float, flo
 
 
 def integral(signal: Signal, t: Float[np.ndarray, " n"], between: Between) -> Float[np.ndarray, "n k"]:
-    """The integral of a signal up to each time.
+    """The integral of a signal up to each time; its first and last values continue beyond its ends.
 
     Args:
-        signal: what is integrated; beyond its ends its first and last samples go on.
+        signal: what is integrated.
         t: the times [s].
-        between: what it is between its samples, see `on_grid`.
+        between: interpolation between samples, see `on_grid`.
     """
     edges, values = signal.t, signal.values
     step = np.diff(edges)[:, None]

@@ -1,4 +1,4 @@
-"""Trajectories of many windows at once, by the kernels of `hybrid_jax.kernels` where they serve, else by JAX."""
+"""Trajectories of many windows at once, by the kernels of `hybrid_jax.kernels` where available, else by JAX."""
 
 import diffrax
 import equinox as eqx
@@ -18,9 +18,9 @@ _evaluate = eqx.filter_jit(lambda field, x, u: field(x, u))
 def rollout_minibatch(
     field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1
 ) -> Float[Array, "t d b"]:
-    """The trajectories of a minibatch in training mode, features first: batch normalisation sees all of its windows.
+    """The trajectories of a minibatch in training mode, features first, so that batch normalisation sees all windows.
 
-    A field for one sample is integrated samples first: transposing in each evaluation would cost up to half the step.
+    A field for one sample is integrated samples first, as transposing in each evaluation costs up to half the step.
     """
     if (states := kernels.trained(field, x0, u, dt, solver, substeps)) is not None:
         return states
@@ -44,7 +44,7 @@ def predict(
     dt: float,
     solver: Solver | None = None,
 ) -> Float[Array, "n t d"]:
-    """What `rollout_batch` returns, to rounding; it raises the same."""
+    """`rollout_batch` by the kernels where available; equal to rounding, with the same errors."""
     by_kernels = np.ndim(u) == 3 and np.shape(u)[1] <= LONG  # they do not project, see `integrate.projection`
     states = kernels.predicted(field, x0, u, dt, RK4() if solver is None else solver) if by_kernels else None
     return rollout_batch(field, x0, u, dt, solver) if states is None else states

@@ -34,7 +34,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 
 def rotate(q: Quaternion, v: Vector) -> Vector:
-    """The vector part of q ⊗ [0, v] ⊗ q̄: a body vector in the world frame (scaled by |q|² if q is not unit)."""
+    """A body vector in the world frame, the vector part of q ⊗ [0, v] ⊗ q̄ (scaled by |q|² for other than unit q)."""
     return multiply(multiply(q, jnp.stack([jnp.zeros_like(v[0]), *v])), conjugate(q))[1:]
 
 
@@ -63,7 +63,6 @@ def derivative(q: Quaternion | Rows, body_rates: Vector | Rows) -> Quaternion:
 
 
 def normalise(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
-    """The unit quaternion of the same direction."""
     return q / jnp.linalg.norm(q, axis=-1, keepdims=True)
 
 
@@ -85,7 +84,7 @@ def from_rotation_vector(v: Vector) -> Quaternion:
 def rotation_vector(q: Quaternion) -> Vector:
     """Rotation vector [rad] of q, at most π long and equal for q and −q; q need not have length 1.
 
-    The sine of the angle would be simpler, but it is 0 at half a turn, where a controller that minimises it stays.
+    The sine of the angle would be simpler but vanishes at half a turn, where a controller that minimises it gets stuck.
     """
     w, v = jnp.where(q[0] < 0, -q[0], q[0]), jnp.where(q[0] < 0, -q[1:], q[1:])
     square = v @ v
@@ -101,15 +100,12 @@ def attitude_error(reference: Quaternion, q: Quaternion) -> Vector:
 
 
 def canonicalize_quaternion(q: Quaternion) -> Quaternion:
-    """Whichever of q and −q has a positive first nonzero entry.
-
-    Both are the same rotation, but different inputs to a network, which was trained near w > 0.
-    """
+    """q or −q, the same rotation, with a positive first nonzero entry: the networks were trained near w > 0."""
     return q * jnp.sign(q[jnp.argmax(q != 0)])
 
 
 def tilt(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
-    """The angle [rad] of the body's z axis from the vertical, of unit quaternions."""
+    """The angle [rad] between the body's z axis and the vertical, for unit quaternions."""
     of = jnp if isinstance(q, jax.Array) else np
     return of.arccos(of.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1))  # pyright: ignore[reportReturnType]
 

@@ -1,4 +1,4 @@
-"""Process-wide JAX set-up: one device per CPU core, XLA options, compilation cache, precision; and the hardware."""
+"""Process-wide JAX set-up: one device per CPU core, XLA options, compilation cache and precision."""
 
 import contextlib
 import os
@@ -45,13 +45,13 @@ _owner: dict[str, int] = {}  # the process that first computed
 
 
 def configure(folder: Path | None = None) -> None:
-    """Configure JAX. Call it before the first array is made, which fixes JAX's devices.
+    """Configure JAX. Call this before you create the first array; afterwards devices and XLA options cannot change.
 
     Args:
-        folder: JAX keeps compiled programs in it, by default in `programs` of the user's cache folder for hybrid_jax.
-            JAX_COMPILATION_CACHE_DIR goes first. Old programs are deleted in the default folder alone.
+        folder: cache of compiled programs, by default `programs` in the user's cache folder for hybrid_jax.
+            JAX_COMPILATION_CACHE_DIR takes precedence. Old programs are deleted only in the default folder.
 
-    Warns if JAX has begun: its devices and XLA's options stay as they are, and the rest is set.
+    Warns if JAX has already started: its devices and XLA options stay as they are, and the rest is set.
 
     Raises:
         ValueError: the folder cannot be written.
@@ -88,10 +88,10 @@ def configure(folder: Path | None = None) -> None:
 
 @cache
 def load_lapack() -> None:
-    """Load LAPACK, which JAX takes from SciPy, with one thread, unless it is loaded already or the user has said.
+    """Load SciPy's LAPACK, which JAX uses, with one thread, unless it is loaded already or the user set a number.
 
-    Its threads wait for each other at every column of a matrix as small as those here: a QR decomposition of
-    13 000 × 16 took 0.6 ms with one thread, and up to 80 ms with two on a busy machine.
+    With small matrices its threads mostly wait for each other: a QR decomposition of 13 000 × 16 took 0.6 ms with one
+    thread, and up to 80 ms with two on a busy machine.
     """
     alone = THREADS not in os.environ
     os.environ.setdefault(THREADS, "1")
@@ -101,10 +101,9 @@ def load_lapack() -> None:
 
 
 def entry(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator of a public function that computes.
+    """Decorator of public functions that compute: NumPy promotion, and an error in a process forked after JAX started.
 
-    It computes with NumPy's promotion, also where the user told JAX to be strict with code of their own, and refuses a
-    process that was forked from one that has used JAX, where the threads of XLA are missing and a call never returns.
+    In such a process XLA's threads are missing, and a call would never return.
     """
 
     @wraps(function)
@@ -121,19 +120,18 @@ def entry(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def jit_with(options: dict[str, bool | int] | None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """`equinox.filter_jit` with compiler options, of which its own type does not know."""
+    """`equinox.filter_jit` with compiler options, which its type annotation lacks."""
     return partial(eqx.filter_jit, compiler_options=options)  # pyright: ignore[reportCallIssue, reportReturnType]
 
 
 def machine() -> tuple[str, ...]:
-    """What a compiled program is bound to: XLA's options, the devices, and the instructions of the processor."""
+    """What a compiled program depends on: XLA options, devices and the processor's instructions."""
     lines = CPUS.read_text().splitlines() if CPUS.exists() else []
     flags = next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
     return os.environ.get(FLAGS, ""), str(jax.devices()), platform.machine(), flags
 
 
 def cores() -> int:
-    """The CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -155,10 +153,7 @@ def hardware() -> dict[str, Any]:
 
 
 def _delete_stale(programs: Path) -> None:
-    """Delete what nobody used for `UNUSED`, what exceeds `MOST`, and what a kill left half written.
-
-    JAX would warn of a half-written program in every run and never replace it.
-    """
+    """Delete programs unused for `UNUSED`, beyond `MOST`, or half written (JAX would warn of these in every run)."""
     looked = programs / ".verified"
     since = looked.stat().st_mtime if looked.exists() else 0.0
     looked.touch()  # first, so that programs written meanwhile are verified next time
@@ -174,7 +169,7 @@ def _delete_stale(programs: Path) -> None:
 
 
 def _is_truncated(program: bytes) -> bool:
-    """Whether it is a zlib stream that ends too early. Programs compressed by zstandard are not checked."""
+    """Whether a zlib stream ends too early; zstandard is not checked."""
     stream = zlib.decompressobj()
     try:
         stream.decompress(program)

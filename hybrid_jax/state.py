@@ -1,4 +1,4 @@
-"""Where each quantity of a multirotor sits in its state x (13) and input u (one for each rotor).
+"""Layout of a multirotor's state x (13) and input u (one for each rotor).
 
 x = [p, q, v, ω]: position p [m, world frame, z up]; unit quaternion q = (w, x, y, z), body → world; velocity
 v [m/s, world frame]; body rates ω [rad/s, body frame: x forward, y left, z up]. u: the rotor speeds [rad/s].
@@ -24,5 +24,4 @@ Input = Float[Array, " rotors"]  # rad/s
 
 
 def input_names(rotors: int) -> tuple[str, ...]:
-    """u0, u1, …"""
     return tuple(f"u{i}" for i in range(rotors))

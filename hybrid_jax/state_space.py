@@ -1,8 +1,7 @@
-"""What the numbers of a state mean, and how to change a state and compare two of them where they are no vectors.
+"""What the numbers of a state mean, and how to perturb and compare states that are not vectors, for example attitudes.
 
-A state is a row of quantities. Most are vectors; an angle wraps around, and an attitude is a unit quaternion. A field
-says what its state is by its attribute `state_space`; one that says nothing has vectors alone. What a quantity of your
-own is, a subclass of `Quantity` says.
+A field describes its state by its attribute `state_space`; without one, all numbers are vectors. To add a quantity of
+your own, write a subclass of `Quantity`.
 """
 
 from collections.abc import Iterator
@@ -22,19 +21,18 @@ Change = Float[Array, " e"]  # of a state or a quantity, in the tangent space
 
 @dataclass(frozen=True)
 class Quantity:
-    """Numbers of a state that are one vector. A subclass says what is different of a manifold.
+    """Numbers of a state that form one vector; subclasses override the methods for a manifold.
 
     Attributes:
-        name: such as "velocity".
-        size: how many numbers of the state it is.
-        unit: of its numbers, such as "m/s"; empty if it has none.
-        labels: a short name of each number, such as ("vx", "vy", "vz"); empty for their places in the state.
-        scale: of the quantity, in its unit, for a small difference of its numbers of norm 1.
-        uniform: whether its numbers are values of one quantity at many points, so that a constant disturbance is one
-            number for all.
+        name: for example "velocity".
+        size: how many numbers of the state it has.
+        unit: of its numbers, for example "m/s"; empty without a unit.
+        labels: a short name of each number, for example ("vx", "vy", "vz"); empty to use their indices.
+        scale: a typical small difference of the quantity (norm), in its unit.
+        uniform: whether its numbers are one quantity at many points, so that a constant disturbance is one number.
 
     Raises:
-        ValueError: a size that is no count, or as many labels as it has not.
+        ValueError: the size is not a count, or the number of labels differs from it.
     """
 
     name: str
@@ -51,7 +49,7 @@ class Quantity:
 
     @property
     def tangent_size(self) -> int:
-        """How many numbers a small change has."""
+        """The dimension of the tangent space."""
         return self.size
 
     @property
@@ -76,19 +74,19 @@ class Quantity:
         return y - x
 
     def normalise(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The numbers by which the value near to x is usually given."""
+        """The usual representation of the value near x."""
         return x
 
     def nearest(self, x: Float[Array, " n"], to: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The same value as x, by those of its numbers that are nearest to others.
+        """The representation of x that is nearest to another value's numbers.
 
         Args:
-            to: these others (n).
+            to: the numbers of the other value (n).
         """
         return x
 
     def continuous(self, path: Float[np.ndarray, "t n"]) -> Float[np.ndarray, "t n"]:
-        """The same values one after the other, without jumps from one way to give them to another.
+        """A sequence of values without jumps between representations.
 
         Args:
             path: values in the order of time (t, n).
@@ -96,21 +94,21 @@ class Quantity:
         return path
 
     def check(self, name: str, x: Numbers, part: slice) -> None:
-        """Refuse states that have no such value.
+        """Require states in which this quantity is valid.
 
         Args:
             name: what the message calls the states.
             x: the states (…, d).
-            part: which of their numbers are the quantity's.
+            part: which of their numbers belong to the quantity.
 
         Raises:
-            ValueError: one of them has none.
+            ValueError: a state is invalid.
         """
 
 
 @dataclass(frozen=True)
 class Angle(Quantity):
-    """Angles [rad] that differ by whole turns are the same."""
+    """Angles [rad] modulo whole turns."""
 
     unit: str = "rad"
 
@@ -129,7 +127,7 @@ class Angle(Quantity):
 
 @dataclass(frozen=True)
 class Attitude(Quantity):
-    """An attitude by its unit quaternion (w, x, y, z), body → world; changes are rotation vectors in the body [rad]."""
+    """An attitude as a unit quaternion (w, x, y, z), body → world; changes are rotation vectors [rad, body frame]."""
 
     size: int = 4
     unit: str = "rad"
@@ -162,12 +160,11 @@ class Attitude(Quantity):
 
 @dataclass(frozen=True)
 class StateSpace:
-    """Quantities one after the other, d numbers in all.
+    """A sequence of quantities with d numbers in total.
 
     Attributes:
-        quantities: in the order of the state; none if nothing is known of it.
-        disturbed: the states on which a constant disturbance acts if nothing else is said, one after the other; None
-            for all.
+        quantities: in the order of the state; empty if nothing is known about it.
+        disturbed: indices of the states on which a constant disturbance acts by default; None for all.
     """
 
     quantities: tuple[Quantity, ...] = ()
@@ -175,18 +172,18 @@ class StateSpace:
 
     @property
     def size(self) -> int:
-        """d; 0 if nothing is known of the state."""
+        """d; 0 if nothing is known about the state."""
         return sum(quantity.size for quantity in self.quantities)
 
     @property
     def parts(self) -> tuple[tuple[slice, Quantity], ...]:
-        """Each quantity and which numbers of the state it is."""
+        """Each quantity with its slice of the state."""
         ends = accumulate(quantity.size for quantity in self.quantities)
         return tuple((slice(end - one.size, end), one) for end, one in zip(ends, self.quantities, strict=True))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """A name for each number of the state: its label, or its place."""
+        """A name for each number of the state: its label or its index."""
         return tuple(
             one.labels[i - part.start] if one.labels else str(i)
             for part, one in self.parts
@@ -200,11 +197,11 @@ class StateSpace:
 
     @property
     def tangent_size(self) -> int:
-        """How many numbers a small change of the state has."""
+        """The dimension of the state's tangent space."""
         return sum(quantity.tangent_size for quantity in self.quantities)
 
     def padded(self, d: int) -> "StateSpace":
-        """With d numbers: further ones are quantities of their own, x[i]. Nothing is known of states of fewer.
+        """This space extended to d numbers by quantities x[i]; empty if d is too small.
 
         Args:
             d: how many numbers a state has.
@@ -218,7 +215,7 @@ class StateSpace:
         """The state after a change.
 
         Args:
-            change: a tangent vector at x (e), that of one quantity after the other.
+            change: a tangent vector at x (e), quantity by quantity.
         """
         ends = [*accumulate((one.tangent_size for one in self.quantities), initial=0)]
         pairs = zip(self.parts, ends, strict=False)
@@ -233,17 +230,17 @@ class StateSpace:
         return jnp.concatenate([one.difference(y[part], x[part]) for part, one in self.parts])
 
     def normalise(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The state by the numbers by which it is usually given, as with quaternions of norm 1."""
+        """The usual representation of the state, for example with unit quaternions."""
         for part, one in self._curved():
             x = x.at[part].set(one.normalise(x[part]))
         return x
 
     def projected(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The state next to numbers that rounding, or a solver's step, has left near to one."""
+        """The valid state nearest to x, which rounding or a solver step may have moved off the manifold."""
         return self.nearest(self.normalise(x), x)
 
     def nearest(self, x: Float[Array, " d"], to: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The same state as x, by those of its numbers that are nearest to another's.
+        """The representation of x that is nearest to another state's numbers.
 
         Args:
             to: the other state (d).
@@ -253,10 +250,10 @@ class StateSpace:
         return x
 
     def continuous(self, x0: Numbers, x: Numbers) -> Numbers:
-        """Trajectories whose numbers do not jump where the state does not; traced ones are returned as they are.
+        """Trajectories without jumps between representations; traced ones are returned unchanged.
 
         Args:
-            x0: the states at the start (…, d), which stay.
+            x0: the initial states (…, d), which stay unchanged.
             x: the states that follow (…, t, d).
         """
         if checks.is_traced(x0) or checks.is_traced(x):
@@ -269,20 +266,20 @@ class StateSpace:
         return x
 
     def check(self, name: str, x: Numbers) -> None:
-        """Refuse states that are none, such as those of a rigid body without a unit quaternion.
+        """Require valid states, for example rigid bodies with unit quaternions.
 
         Args:
             name: what the message calls them.
             x: states (…, d).
 
         Raises:
-            ValueError: it says where, and what is expected there.
+            ValueError: with the position and what was expected there.
         """
         for part, one in self._curved():
             one.check(name, x, part)
 
     def features(self, x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
-        """What decides whether a model has seen the like of a sample, by name; by default each number of x and of u."""
+        """By name, what determines whether a model has seen similar samples; by default each number of x and of u."""
         return {f"{name}[{i}]": column for name, part in (("x", x), ("u", u)) for i, column in enumerate(part.T)}
 
     def _curved(self) -> Iterator[tuple[slice, Quantity]]:

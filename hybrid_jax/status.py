@@ -1,4 +1,4 @@
-"""How a fit ended: one enumeration for all that iterate."""
+"""How a fit ended: one enumeration for all iterative methods."""
 
 from enum import IntEnum
 
@@ -8,10 +8,10 @@ from jaxtyping import Array, Bool, Int
 
 
 class Status(IntEnum):
-    """How a fit ended. Compiled programs carry it as an integer, `Status(int(number))` reads it; its text is its name.
+    """How a fit ended, as an integer in compiled programs (`Status(int(number))`); as text it is its name.
 
     Attributes:
-        message: the same in words.
+        message: a description in words.
     """
 
     RUNNING = 0, "interrupted"
@@ -37,5 +37,5 @@ class Status(IntEnum):
 def ended(
     converged: Bool[Array | np.ndarray, "*runs"], finite: Bool[Array | np.ndarray, "*runs"]
 ) -> Int[Array, "*runs"]:
-    """The status of fits that have ended; those that have not converged were stopped by their limit of steps."""
+    """The status of finished fits; those that have not converged reached their limit of steps."""
     return jnp.where(finite, jnp.where(converged, Status.OK, Status.CAPPED), Status.DIVERGED).astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""Windows of recorded trajectories: an initial state, the inputs held over each interval, and the next states."""
+"""Windows of recorded trajectories: an initial state, the next inputs, and the resulting states."""
 
 import math
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ SAME = 1e-3  # two dt that differ by less, relatively, are of clocks and not of 
 
 
 def _plain(dt):
-    """A Python number of one of NumPy, which Equinox would take for an array."""
+    """A NumPy scalar as a Python number, since Equinox would treat it as an array."""
     return dt.item() if isinstance(dt, np.floating) else dt
 
 
@@ -24,7 +24,7 @@ class Trajectories(eqx.Module):
 
     Attributes:
         x0: initial state of each window (n, d).
-        u: input held over each interval (n, t, m).
+        u: input during each interval (n, t, m), constant over it.
         x: state at the end of each interval (n, t, d): x[:, i] is (i + 1) dt after x0.
         dt: length of an interval [s].
     """
@@ -43,7 +43,7 @@ class Trajectories(eqx.Module):
         return self.x.shape[-2]
 
     def __getitem__(self, index) -> "Trajectories":
-        """The windows at a number, a slice or an array of indices, which may be traced; IndexError out of range."""
+        """The windows at an index, a slice or an array of indices, which may be traced; IndexError out of range."""
         # JAX would clamp the index, and a loop over the windows would not end.
         if isinstance(index, int | np.integer) and not -len(self) <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
@@ -51,7 +51,7 @@ class Trajectories(eqx.Module):
 
 
 def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectories:
-    """The trajectories unchanged; ValueError for shapes, a dt or, unless traced, a number that is not finite."""
+    """The trajectories unchanged; ValueError for wrong shapes or dt or, unless traced, numbers that are not finite."""
     if not isinstance(trajectories, Trajectories):
         raise ValueError(f"{name}: must be Trajectories, got {type(trajectories).__name__}")
     x0, u, x = trajectories.x0, trajectories.u, trajectories.x
@@ -83,7 +83,7 @@ def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> N
 
 
 def check_like(trajectories: Trajectories, windows: Trajectories, name: str, dt: bool = True) -> None:
-    """Raise ValueError unless sizes of states and inputs, and dt if that counts, are those of other windows."""
+    """Raise ValueError unless the sizes of state and input, and dt if `dt`, agree with other windows."""
     for part, axis in (("x0", "states"), ("u", "inputs")):
         expected, found = (getattr(each, part).shape[-1] for each in (windows, trajectories))
         if found != expected:
@@ -117,11 +117,11 @@ def windows_of(
 ) -> Trajectories:
     """Cut one trajectory, states[i] → states[i + 1] under inputs[i], into windows of `steps` intervals.
 
-    Numbers that are not finite are accepted, so that windows with gaps can be removed afterwards; see `check`.
+    Numbers that are not finite are accepted, so that you can remove windows with gaps afterwards; see `check`.
 
     Args:
         states: the state at the start and after each interval (t + 1, d).
-        inputs: the input held over each interval (t, m).
+        inputs: the input during each interval (t, m).
         dt: length of an interval [s].
         steps: intervals of each window.
         stride: intervals between the starts of two windows; by default `steps`, so that windows do not overlap.
@@ -145,10 +145,10 @@ def windows_of(
 
 
 def concatenate(parts: Iterable[Trajectories]) -> Trajectories:
-    """All windows of the parts, in order; ValueError if they differ in dt, horizon, or size of state or input.
+    """All windows of the parts, in order; ValueError if dt, horizon, or sizes of state or input differ.
 
     Args:
-        parts: windows of the same dt, horizon, and sizes of state and input.
+        parts: windows with the same dt, horizon, and sizes of state and input.
     """
     parts = checks.list_of("parts", parts, Trajectories)
     if not parts or len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:

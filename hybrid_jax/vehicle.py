@@ -1,4 +1,4 @@
-"""The constants of a multirotor: mass, geometry and nominal coefficients, and their TOML file."""
+"""The constants of a multirotor (mass, geometry and nominal coefficients) and their TOML file."""
 
 import math
 import tomllib
@@ -23,7 +23,7 @@ ROUNDING = 0.05  # share by which a moment may exceed the sum of the other two: 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """The constants of a multirotor, body frame x forward, y left, z up.
+    """The constants of a multirotor; body frame x forward, y left, z up.
 
     Attributes:
         mass: in kg.
@@ -32,13 +32,13 @@ class Vehicle:
         torque_coefficient: c_m [N m/(rad/s)²]; the reaction torque of a rotor is c_m u².
         rotor_positions: (x, y) of each rotor from the centre of mass [m].
         spin: the sign of each rotor's reaction torque about body z, ±1.
-        max_rotor_speed: the fastest that a rotor turns [rad/s].
-        rotor_radius: of a rotor [m]; 0 if it is not known.
-        gravity: the acceleration of free fall [m/s²].
+        max_rotor_speed: the largest rotor speed [rad/s].
+        rotor_radius: radius of a rotor [m]; 0 if unknown.
+        gravity: acceleration of free fall [m/s²].
         name: what reports and messages call it.
 
     Raises:
-        ValueError: numbers that are not positive and finite, or of a body or in units that no vehicle has.
+        ValueError: numbers that are not positive and finite, physically impossible, or in the wrong unit.
     """
 
     mass: float
@@ -73,7 +73,7 @@ class Vehicle:
         self._require_possible()
 
     def _require_possible(self) -> None:
-        """Refuse what no body has, and lengths and moments that are in another unit."""
+        """Reject physically impossible values, and lengths and moments in another unit."""
         arm = max(math.hypot(*place) for place in self.rotor_positions)
         if len(set(self.rotor_positions)) < 2:
             raise ValueError(f"rotor_positions must not all be one point, got {self.rotor_positions[0]} for each rotor")
@@ -91,7 +91,7 @@ class Vehicle:
 
     @property
     def rotors(self) -> int:
-        """How many there are."""
+        """The number of rotors."""
         return len(self.rotor_positions)
 
     @property
@@ -109,15 +109,15 @@ class Vehicle:
 def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
     """Read the table `[vehicle]` of a TOML file whose keys are the attributes of `Vehicle`.
 
-    `dynamics.vehicle_file.load_vehicle_model` reads its other tables, too, and checks what is in them.
+    Use `dynamics.vehicle_file.load_vehicle_model` to read and check the other tables as well.
 
     Args:
         path: the TOML file.
-        variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, such as the mass with a payload.
-            All variants of the file are checked.
+        variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, for example the mass with a
+            payload. All variants of the file are checked.
 
     Raises:
-        ValueError: the file, the key and what was expected, in one line.
+        ValueError: one line with the file, the key and what was expected.
     """
     tables = read_tables(path)
     vehicle = vehicle_of(tables, path, variant)
@@ -134,7 +134,7 @@ def read_tables(path: str | Path) -> dict[str, Any]:
 
 
 def vehicle_of(tables: Mapping[str, Any], path: str | Path, variant: str | None = None) -> Vehicle:
-    """As `load_vehicle`, of the tables of a file that was read already."""
+    """`load_vehicle` on the tables of a file that has already been read."""
     table = tables.get("vehicle")
     if not isinstance(table, dict):
         raise ValueError(f"{path}: has no table [vehicle]")
@@ -151,7 +151,7 @@ def vehicle_of(tables: Mapping[str, Any], path: str | Path, variant: str | None 
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
-    """A dataclass from a table of TOML; ValueError, after `where`, for a wrong or missing key or a refused value."""
+    """A dataclass from a TOML table; ValueError, after `where`, for a wrong or missing key or an invalid value."""
     required = [each.name for each in fields(cls) if each.default is MISSING and each.default_factory is MISSING]  # type: ignore
     require_known(where, table, [each.name for each in fields(cls)])  # type: ignore
     if missing := [name for name in required if name not in table]:
@@ -169,7 +169,7 @@ def require_known(where: str, table: Mapping[str, Any], known: Iterable[str]) ->
 
 
 def require_numbers(name: str, value: Any, shape: tuple[int, ...], what: str) -> None:
-    """Raise ValueError unless the value is a finite number, or nested tuples of them of this shape."""
+    """Raise ValueError unless the value is a finite number, or nested tuples of finite numbers, of this shape."""
 
     def fits(value: Any, shape: tuple[int, ...]) -> bool:
         if shape:
@@ -183,7 +183,7 @@ def require_numbers(name: str, value: Any, shape: tuple[int, ...], what: str) ->
 
 
 def as_tuple(value: Any) -> Any:
-    """Convert nested lists of TOML to tuples, which can be hashed."""
+    """Convert nested lists of TOML to tuples, which are hashable."""
     return tuple(as_tuple(item) for item in value) if isinstance(value, list) else value
 
 
