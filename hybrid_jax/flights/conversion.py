@@ -1,4 +1,4 @@
-"""From a recording, whose signals have times of their own, to the samples of a flight on one grid."""
+"""Resample a recording, whose signals have their own times, to the samples of a flight."""
 
 import re
 from collections.abc import Sequence
@@ -38,18 +38,18 @@ SINCE = {"vehicle_angular_velocity": (1, 10), "vehicle_acceleration": (1, 11), "
 
 
 def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] = ()) -> FlightLog:
-    """The flight at intervals of dt [s], from the time on when all signals have begun; a gap of one is a gap of all.
+    """Resample a recording at intervals of dt [s] where all its signals exist; a gap in one is a gap in all.
 
-    States are interpolated linearly, attitudes spherically; rotor speeds are means of held values.
+    States are interpolated linearly and attitudes spherically; rotor speeds are averaged over each interval.
 
     Args:
-        recording: what was read of a log.
+        recording: the log as it was read.
         dt: interval of the samples [s].
         polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, of commands as shares from 0 to 1; not needed where
             speeds were measured, but then preferred to speeds that are slower than commands.
 
     Raises:
-        ValueError: a quantity that is missing and what to log, or signals that share no time, in one line.
+        ValueError: a quantity is missing, or the signals have no time in common.
     """
     checks.positive("dt", dt, "a positive number of seconds")
     if missing := missing_states(recording):
@@ -84,19 +84,19 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
 
 
 def flight_at(recording: Recording, dt: float | None = None, polynomial: Sequence[float] = ()) -> FlightLog:
-    """The flight at its rows' own times, or at intervals of dt [s], by default 0.01: see `to_flight`."""
+    """Return the flight at the times of its rows if it has such rows, else at intervals of dt [s]: see `to_flight`."""
     rows = own_rows(recording)
     return to_flight(recording, dt or DT, polynomial) if rows is None else rows
 
 
 def own_interval(recording: Recording) -> float:
-    """Between the samples of `flight_at` [s]."""
+    """Return the sample interval of `flight_at` [s]."""
     rows = own_rows(recording)
     return DT if rows is None else rows.dt
 
 
 def own_rows(recording: Recording) -> FlightLog | None:
-    """The flight at the times of the rows of a CSV file, if most of them hold all that a flight needs; else None."""
+    """Return the flight at the rows of a CSV file if most of them are complete, else None."""
     names = {"velocity" if "velocity" in recording.signals else "body_velocity", "rotor_speed"}
     names |= {"position", "attitude", "rates"}
     found = {name.removeprefix("body_"): each for name, each in recording.signals.items() if name in names}
@@ -111,17 +111,16 @@ def own_rows(recording: Recording) -> FlightLog | None:
 
 
 def missing_states(recording: Recording) -> list[str]:
-    """The quantities that a flight needs and the recording lacks, partly or whole."""
+    """List the quantities that a flight needs and the recording lacks, in part or entirely."""
     found = {name for name, signal in recording.signals.items() if len(signal.axes) >= 3}
     found |= {"velocity"} if "body_velocity" in found else set()
     return [name for name in STATES if name not in found] + ["motors"] * (not found & ROTOR_UNITS.keys())
 
 
 def what_to_log(recording: Recording) -> str:
-    """What to change in what is logged, or why a quantity that is logged was left out.
+    """Advise what to log, or say why a logged quantity was left out.
 
-    A list of topics takes the place of PX4's profile (logged_topics.cpp), so it names all that a model and its
-    identification need; PX4 passes over those that its version does not know.
+    A topics file replaces PX4's logging profile, so the advice lists all topics that identification needs.
     """
     kind, program = (recording.facts.get(name, "") for name in ("format", "program"))
     for note in (note for note in recording.notes if "is not valid" in note):
@@ -135,7 +134,7 @@ def what_to_log(recording: Recording) -> str:
 
 
 def without_common_time(recording: Recording) -> str:
-    """Which signals, if any, share no time, as with two clocks."""
+    """Describe two signals without a common time, for example from two clocks; empty if there are none."""
     signals = [signal for name, signal in recording.signals.items() if len(signal) and name != "voltage"]
     if not signals:
         return ""
@@ -147,7 +146,7 @@ def without_common_time(recording: Recording) -> str:
 
 
 def motors_of(recording: Recording, convertible: bool = True) -> Signal:
-    """Rotor speeds where there are any, unless commands that can be converted are faster."""
+    """Choose rotor speeds, or commands if they can be converted and are faster."""
     speeds, commands = (recording.signals.get(name) for name in ("rotor_speed", "command"))
     faster = speeds is None or (convertible and commands is not None and commands.interval < 0.9 * speeds.interval)
     chosen = commands if faster else speeds

@@ -1,7 +1,4 @@
-"""Load logs of any format: one, or all of a folder, checked before they become flights, and cleaned.
-
-The format is told by a file's first bytes, and by its suffix.
-"""
+"""Load logs of any format (detected from the first bytes and the suffix), check them and clean them."""
 
 import contextlib
 import warnings
@@ -55,18 +52,18 @@ def load_log(
     motor_order: Sequence[int] = (),
     dt: float | None = None,
 ) -> FlightLog:
-    """Read one log, without checking it.
+    """Read one log without checking it.
 
     Args:
-        path: of a log of any format that `read_recording` reads.
-        columns: as of `load_windows`.
-        polynomial: as of `load_windows`.
-        topics: as of `load_windows`.
-        motor_order: as of `load_windows`.
-        dt: interval [s] of a flight whose signals have times of their own, by default 0.01; of others it is not used.
+        path: a log of any format that `read_recording` reads.
+        columns: see `load_windows`.
+        polynomial: see `load_windows`.
+        topics: see `load_windows`.
+        motor_order: see `load_windows`.
+        dt: sample interval [s] if the signals have their own times, by default 0.01; otherwise ignored.
 
     Raises:
-        ValueError: the file, row, field and what to do, in one line.
+        ValueError: the log is invalid: file, row, field and what to do.
     """
     return flight_at(read_recording(path, columns, topics, motor_order), dt, polynomial)
 
@@ -83,21 +80,21 @@ def load_logs(
     vehicle: Vehicle | None = None,
     failed: Failed = "refuse",
 ) -> list[FlightLog]:
-    """Read all logs of a folder in the order of their names, check them with `check_recording` and clean them.
+    """Read all logs of a folder in alphabetical order, check them with `check_recording` and clean them.
 
     Args:
-        folder: as of `load_windows`.
-        columns: as of `load_windows`.
-        polynomial: as of `load_windows`.
-        topics: as of `load_windows`.
-        motor_order: as of `load_windows`.
-        dt: as of `load_windows`.
-        cleaning: changes to every log; by default none.
-        vehicle: constants that the logs are compared with; without it, motors are not.
-        failed: what a failed check does: "refuse" raises an error, "warn" is a warning.
+        folder: see `load_windows`.
+        columns: see `load_windows`.
+        polynomial: see `load_windows`.
+        topics: see `load_windows`.
+        motor_order: see `load_windows`.
+        dt: see `load_windows`.
+        cleaning: changes to every log, by default none.
+        vehicle: constants that you expect; without it, motors are not checked.
+        failed: whether a failed check raises an error ("refuse") or warns ("warn").
 
     Raises:
-        ValueError: the folder holds no logs, or the file, row, field and what to do, in one line.
+        ValueError: the folder has no logs, or one of them is invalid: file, row, field and what to do.
     """
     if failed not in (known := get_args(Failed)):
         raise ValueError(f"failed must be one of {', '.join(known)}, got {failed!r}")
@@ -120,7 +117,7 @@ def load_logs(
 
 
 def report(found: Sequence[tuple[str, Check]], failed: Failed) -> None:
-    """Raise ValueError for the first check that failed, or warn; `found` are names of logs and their checks."""
+    """Raise ValueError for the first failed check, or warn; `found` are pairs of a log's name and a check."""
     lines = {FAILS: [], WARNS: []}
     for name, check in found:
         lines.get(check.verdict, []).append(f"{name}: {check.name}: {check.suggestion}")
@@ -132,7 +129,7 @@ def report(found: Sequence[tuple[str, Check]], failed: Failed) -> None:
 
 
 def format_of(path: str | Path) -> tuple[str, str]:
-    """The format of a file or folder, by its first bytes, else by its suffix; or "" and why it is not read."""
+    """Return the format of a file or folder, or "" and why it cannot be read."""
     path = Path(path)
     if path.is_dir():
         return (ROSBAG, "") if (path / BAG).is_file() else ("", "a folder; give it by itself")
@@ -148,20 +145,20 @@ def format_of(path: str | Path) -> tuple[str, str]:
 
 
 def _head(path: str | Path, unpack: bool = True) -> bytes:
-    """The first bytes of a file; empty where they cannot be read: the reader then says why."""
+    """Return the first bytes of a file; empty if it cannot be read, so that the reader reports why."""
     with contextlib.suppress(ValueError), readable(path, unpack) as file:
         return file.read(32)
     return b""
 
 
 def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
-    """The logs of a folder in the order of their names, and its other files, each with why it is left.
+    """List the logs of a folder in alphabetical order, and its other files with why they are skipped.
 
     Args:
-        folder: holds logs; hidden files are passed over. A ROS bag is one log.
+        folder: folder of logs; hidden files are ignored, and a ROS bag is one log.
 
     Raises:
-        ValueError: there is no such folder.
+        ValueError: the folder does not exist.
     """
     folder, logs, left = Path(folder), [], {}
     if not folder.is_dir():
@@ -183,16 +180,16 @@ def read_recording(
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
 ) -> Recording:
-    """Read one log of any format of `format_of`.
+    """Read one log of any supported format.
 
     Args:
-        path: of the log: a file, or the folder of a ROS bag.
-        columns: column map (or its TOML file) of CSV logs; by default they have the library's columns and units.
-        topics: for ROS bags, the topics of some quantities: see `hybrid_jax.flights.formats.rosbag`.
-        motor_order: which motor of the log, from 0, each rotor of the vehicle is; by default they are in one order.
+        path: a file, or the folder of a ROS bag.
+        columns: column map (or its TOML file) of CSV logs; by default the library's columns and units.
+        topics: topics of a ROS bag by quantity: see `hybrid_jax.flights.formats.rosbag`.
+        motor_order: index in the log of each rotor's motor; by default the vehicle's order.
 
     Raises:
-        ValueError: file, topic or column, time and what was expected, in one line.
+        ValueError: the log is invalid: file, topic or column, time and what was expected.
     """
     kind, why = format_of(path)
     if not Path(path).exists():
@@ -212,10 +209,10 @@ def read_recording(
 
 
 def reordered(recording: Recording, motor_order: Sequence[int]) -> Recording:
-    """The recording with its motors in the vehicle's order: rotor i is the log's motor `motor_order[i]`.
+    """Reorder the motors for the vehicle: rotor i is the log's motor `motor_order[i]`.
 
     Raises:
-        ValueError: a motor is named twice, or the log has no such motor.
+        ValueError: a motor is named twice or does not exist.
     """
     signals, order = dict(recording.signals), [*motor_order]
     for name in ROTOR_UNITS.keys() & signals.keys():

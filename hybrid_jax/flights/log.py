@@ -1,4 +1,4 @@
-"""A recorded flight in the library's frames and units, checked when it is created, and its segments without gaps."""
+"""A recorded flight in the library's frames and units, validated when it is created, and its segments without gaps."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,16 +18,16 @@ JITTER = 0.1  # relative deviation from the median interval that still counts as
 
 @dataclass(frozen=True)
 class FlightLog:
-    """n samples of one flight. Quaternions are normalised and their signs made continuous, the first with w ≥ 0.
+    """n samples of one flight; quaternions are normalised and their signs made continuous, the first with w ≥ 0.
 
     Attributes:
         t: time of each sample [s], strictly increasing.
         x: state at that time, as in `hybrid_jax.state`: z up, forward-left-up, SI.
-        u: rotor speeds held from this sample to the next [rad/s].
-        name: of the flight in messages and reports, usually its file.
+        u: rotor speeds, constant from this sample to the next [rad/s].
+        name: name of the flight in messages and reports, usually its file.
 
     Raises:
-        ValueError: inconsistent shapes, or the first impossible sample and field, in one line.
+        ValueError: shapes are inconsistent, or a sample is impossible.
     """
 
     t: Float[np.ndarray, " n"] = field(repr=False)
@@ -53,15 +53,15 @@ class FlightLog:
         return len(self.t)
 
     def __getitem__(self, rows) -> "FlightLog":
-        """The samples selected by a slice, a mask or increasing indices."""
+        """Select samples by a slice, a mask or increasing indices."""
         return FlightLog(self.t[rows], self.x[rows], self.u[rows], self.name)
 
     @property
     def dt(self) -> float:
-        """The median interval between samples [s], rounded to nanoseconds so that logs of one rate agree.
+        """Median interval between samples [s], rounded to nanoseconds so that logs of one rate agree.
 
         Raises:
-            ValueError: fewer than two samples.
+            ValueError: the log has fewer than two samples.
         """
         if len(self) < 2:
             raise ValueError(f"{self.name}: {len(self)} samples have no interval")
@@ -69,7 +69,7 @@ class FlightLog:
 
 
 def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
-    """Impossible values: index of the sample, field and what to do."""
+    """Yield impossible values: index of the sample, field and what to do."""
     rotors = input_names(u.shape[1])
     for names, block in ((("t",), t[:, None]), (STATE_NAMES, x), (rotors, u)):
         sound = np.isfinite(block) if names == ("t",) else np.abs(block) < LARGEST
@@ -88,13 +88,13 @@ def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
 
 
 def unlike_one(q: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
-    """Which quaternions are not of norm 1."""
+    """Whether the norm of each quaternion differs from 1."""
     with np.errstate(over="ignore", invalid="ignore"):  # an infinite norm is refused too
         return ~(np.abs(np.linalg.norm(q, axis=1) - 1) <= NORM_TOLERANCE)
 
 
 def _canonical(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Unit quaternions without jumps from q to −q."""
+    """Normalise quaternions and remove jumps from q to −q."""
     q = q / np.linalg.norm(q, axis=1, keepdims=True)
     flips = np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     start = -1.0 if q[0, 0] < 0 else 1.0
@@ -102,34 +102,34 @@ def _canonical(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
 
 
 def gaps(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
-    """Whether samples are missing in an interval."""
+    """Whether samples are missing in each interval."""
     return np.diff(log.t) > GAP * log.dt if len(log) > 1 else np.zeros(0, bool)
 
 
 def repeats(log: FlightLog) -> Bool[np.ndarray, " n"]:
-    """Whether a state equals the one before in every digit, which noise rules out for fresh samples."""
+    """Whether a state equals its predecessor in every digit, which noise rules out for fresh samples."""
     return np.concatenate([[False], (np.diff(log.x, axis=0) == 0).all(axis=1)])
 
 
 def sound_intervals(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
-    """Whether an interval is no gap and has fresh samples at both ends."""
+    """Whether each interval is without a gap and has fresh samples at both ends."""
     stale = repeats(log)
     return ~(gaps(log) | stale[:-1] | stale[1:])
 
 
 def runs_of(mask: Bool[np.ndarray, " n"], extra: int = 0) -> list[slice]:
-    """The maximal runs of true entries, each longer by `extra` at its end."""
+    """Find the maximal runs of true entries, each extended by `extra` at its end."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).tolist()
     return [slice(start, stop + extra) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def segments(log: FlightLog) -> list[slice]:
-    """Maximal runs of at least two samples joined by sound intervals."""
+    """Find the maximal runs of at least two samples joined by sound intervals."""
     return runs_of(sound_intervals(log), 1)
 
 
 def even_segments(log: FlightLog) -> list[slice]:
-    """Return the segments; refuse a log whose samples are not evenly spaced within each."""
+    """Return the segments; raise ValueError if samples are not evenly spaced within one."""
     uneven = unevenness(log)
     if uneven.any():
         row = int(uneven.argmax())
@@ -141,5 +141,5 @@ def even_segments(log: FlightLog) -> list[slice]:
 
 
 def unevenness(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
-    """Whether a sound interval has another length than the median one."""
+    """Whether each sound interval differs in length from the median."""
     return sound_intervals(log) & (np.abs(np.diff(log.t) - log.dt) > JITTER * log.dt)

@@ -1,8 +1,4 @@
-"""What a log holds, before it is a flight: signals at their own rates, in the library's frames and units.
-
-A reader turns a file of some format into a `Recording`. Checks judge it; `to_flight` and the identification from
-commands and measurements take from it what they need.
-"""
+"""A log as recorded: signals at their own rates, in the library's frames and units."""
 
 from dataclasses import dataclass
 
@@ -25,16 +21,16 @@ QUANTITIES = (*AXES, *ROTOR_UNITS)
 
 
 def axes_of(quantity: str, count: int) -> tuple[str, ...]:
-    """The names of so many columns of a quantity; of three axes one alone is the last."""
+    """Name the axes of `count` columns of a quantity; a single column of three axes is the last."""
     return AXES[quantity][0][-count:] if quantity in AXES else tuple(map(str, range(count)))
 
 
 @dataclass(frozen=True)
 class Recording(Record):
-    """The signals of one log, by names of `QUANTITIES`; for its attributes see `hybrid_jax.records.Record`.
+    """The signals of one log by `QUANTITIES`; for its attributes see `hybrid_jax.records.Record`.
 
     Raises:
-        ValueError: an unknown quantity, or axes that it does not have.
+        ValueError: a quantity or axis is unknown.
     """
 
     def __post_init__(self):
@@ -47,6 +43,6 @@ class Recording(Record):
 
     @property
     def rotors(self) -> int:
-        """How many rotors were commanded or measured; 0 if none."""
+        """Number of rotors that were commanded or measured; 0 if none."""
         found = [len(self.signals[name].axes) for name in ROTOR_UNITS if name in self.signals]
         return max(found, default=0)

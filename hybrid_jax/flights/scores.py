@@ -19,13 +19,13 @@ Errors = Float[Array | np.ndarray, "*n"]
 
 
 class FlightErrors(NamedTuple):
-    """Sizes of the errors of predicted states.
+    """Magnitudes of the errors of predicted states.
 
     Attributes:
-        position: length of the error [m].
-        velocity: length of the error [m/s].
+        position: norm of the error [m].
+        velocity: norm of the error [m/s].
         rotation: angle from the predicted attitude to the true one [rad], 0 … π.
-        body_rates: length of the error [rad/s].
+        body_rates: norm of the error [rad/s].
     """
 
     position: Errors
@@ -35,7 +35,6 @@ class FlightErrors(NamedTuple):
 
 
 def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"]) -> FlightErrors:
-    """Compute the error of each predicted state."""
     position, velocity, rates = (
         jnp.linalg.norm(predicted[..., part] - truth[..., part], axis=-1) for part in (POSITION, VELOCITY, BODY_RATES)
     )
@@ -49,16 +48,16 @@ def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"
 def flight_errors(
     field: AbstractVectorField, windows: Trajectories, solver: diffrax.AbstractSolver | None = None, chunk: int = 2000
 ) -> FlightErrors:
-    """Compute the errors (n, t) of a field in inference mode, for every window at the end of every interval.
+    """Compute the errors (n, t) of a field in inference mode at the end of every interval of every window.
 
     Args:
         field: the model.
         windows: true states and inputs, states as in `hybrid_jax.state`.
-        solver: integrates the field; by default the classical Runge–Kutta method of fourth order.
-        chunk: number of windows that are predicted at a time.
+        solver: ODE solver, by default the classical Runge–Kutta method of fourth order.
+        chunk: number of windows per batch.
 
     Raises:
-        ValueError: malformed windows, or states other than those of a multirotor.
+        ValueError: the windows are malformed, or their states are not a multirotor's.
     """
     check(windows, "windows")
     checks.count("chunk", chunk)

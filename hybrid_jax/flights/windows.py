@@ -1,7 +1,4 @@
-"""From recorded logs to training windows: reading folders, splitting by flight or manoeuvre, cutting.
-
-Windows of one flight overlap and share wind, battery and payload, so a split of windows would leak into the test.
-"""
+"""Split recorded logs by flight or manoeuvre and cut them into windows, which overlap and share wind and load."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -60,29 +57,30 @@ def load_windows(
 ) -> Trajectories:
     """Read all logs of a folder, check them against the vehicle and cut them into windows.
 
-    Windows never cross a gap or a repeated sample. What a check warns of is a one-line warning. A model takes motors as
-    held over an interval: faster ones are averaged over it, and of some that were sampled once in it you are warned.
+    Windows never cross a gap or a repeated sample. You get a one-line warning for each check that warns. The model
+    assumes constant motors in each interval: faster motor signals are averaged, and you are warned if they were
+    undersampled.
 
     Args:
-        folder: holds one log per flight, of any format of `read_recording`; other files are passed over.
-        vehicle: constants that the checks compare the logs with.
+        folder: folder with one log per flight, of any format of `read_recording`; other files are ignored.
+        vehicle: constants for the checks.
         dt: interval [s] to which logs of other intervals are resampled; by default all logs must share one, and those
             whose signals have times of their own get 0.01.
         steps: intervals per window.
         stride: samples between the starts of two windows.
-        columns: column map (or its TOML file) of CSV logs; by default they have the library's columns and units.
-        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for logs of commands from 0 to 1 alone.
-        topics: for ROS bags, the topics of some quantities: see `hybrid_jax.flights.formats.rosbag`.
-        motor_order: which motor of the log, from 0, each rotor of the vehicle is.
-        motor_time_constant: first-order lag [s] of the rotors, for logs that record commands and not rotor speeds.
-        cleaning: changes to every log, such as `Cleaning(in_flight=True)`; by default none.
-        failed: what a failed check does: "refuse" raises an error, "warn" is a warning.
+        columns: column map (or its TOML file) of CSV logs; by default the library's columns and units.
+        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for logs with commands (0 to 1) but no speeds.
+        topics: topics of a ROS bag by quantity: see `hybrid_jax.flights.formats.rosbag`.
+        motor_order: index in the log of each rotor's motor, from 0.
+        motor_time_constant: first-order lag [s] of the rotors, for logs with commands instead of rotor speeds.
+        cleaning: changes to every log, for example `Cleaning(in_flight=True)`; by default none.
+        failed: whether a failed check raises an error ("refuse") or warns ("warn").
 
     Returns:
         Windows in float32: x0 (n, 13), u (n, steps, rotors) [rad/s], x (n, steps, 13), as in `hybrid_jax.state`.
 
     Raises:
-        ValueError: the file or argument, and what was expected, in one line.
+        ValueError: a file or argument is invalid.
     """
     checks.count("steps", steps)
     checks.count("stride", stride)
@@ -98,28 +96,28 @@ def load_windows(
 
 
 def flight_of(log: FlightLog) -> str:
-    """The name of a flight's file, without folder and suffix."""
+    """Return the name of a flight's file without folder and suffix."""
     return _SUFFIX.sub("", Path(log.name).name)
 
 
 def manoeuvre_of(log: FlightLog) -> str:
-    """The name of a flight without the number of its run: "chirp_run2" and "chirp-03" are both "chirp".
+    """Return a flight's name without its run number: "chirp_run2" and "chirp-03" give "chirp".
 
-    A number counts as that of a run after a separator or after "run", "flight", "take" or "log"; "figure8" has none.
+    The number must follow a separator or "run", "flight", "take" or "log", so "figure8" is unchanged.
     """
     return _RUN.sub("", flight_of(log)) or flight_of(log)
 
 
 def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[FlightLog], str] = flight_of) -> Split:
-    """Split flights into those of other names and those of the given names.
+    """Split flights into training flights and held-out flights.
 
     Args:
         logs: the flights.
-        names: of the flights that are held out.
-        of: the name of a flight: `flight_of`, `manoeuvre_of` or a function of your own.
+        names: names of the flights to hold out.
+        of: function that names a flight: `flight_of`, `manoeuvre_of` or your own.
 
     Raises:
-        ValueError: an unknown name, or one side is empty.
+        ValueError: a name is unknown, or one side is empty.
     """
     known = sorted({of(log) for log in logs})
     for name in names:
@@ -140,8 +138,8 @@ def folds(
     Args:
         logs: the flights.
         count: number of splits; by default one per name.
-        of: the name of a flight: `flight_of`, `manoeuvre_of` or a function of your own.
-        seed: of the order in which names are dealt to the splits.
+        of: function that names a flight: `flight_of`, `manoeuvre_of` or your own.
+        seed: seed for assigning names to splits.
 
     Raises:
         ValueError: count is less than 2 or more than the number of names.
@@ -155,7 +153,7 @@ def folds(
 
 
 def require_common_interval(logs: Sequence[FlightLog]) -> float:
-    """Return the interval [s] between samples, which all logs must share."""
+    """Return the interval [s] between samples; raise ValueError if the logs differ."""
     for log in logs:
         even_segments(log)
         if log.dt != logs[0].dt:
@@ -167,15 +165,15 @@ def require_common_interval(logs: Sequence[FlightLog]) -> float:
 
 
 def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWindows:
-    """Cut logs into windows of `steps` intervals that cross no gap; logs shorter than a window are left out.
+    """Cut logs into windows of `steps` intervals without gaps; logs shorter than a window are left out.
 
     Args:
-        logs: flights with even samples.
+        logs: evenly sampled flights.
         steps: intervals per window.
         stride: samples between the starts of two windows.
 
     Raises:
-        ValueError: no log is as long as a window, or samples are not evenly spaced.
+        ValueError: all logs are shorter than a window, or samples are not evenly spaced.
     """
     parts = []
     for log in require_length(logs, steps):
@@ -187,7 +185,7 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWi
 
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
-    """Return the logs that hold a window of `steps` intervals; refuse logs of which none does."""
+    """Return the logs with at least one window of `steps` intervals; raise ValueError if there are none."""
     long = [log for log in logs if max(_intervals(log), default=0) >= steps]
     if not long:
         names = ", ".join(map(flight_of, logs))
@@ -200,7 +198,7 @@ def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
 
 
 def count_windows(logs: Sequence[FlightLog], steps: int) -> int:
-    """Count the windows that `cut_windows` finds with a stride of 1."""
+    """Count the windows of `cut_windows` with a stride of 1."""
     return sum(max(0, length - steps + 1) for log in logs for length in _intervals(log))
 
 

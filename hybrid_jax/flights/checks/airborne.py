@@ -1,7 +1,4 @@
-"""When a vehicle is in the air: motors that turn do not yet carry it.
-
-On the ground an accelerometer measures gravity whatever the thrust is. Near it the ground effect adds to the thrust.
-"""
+"""Detect when a vehicle is in the air; on the ground, and near it, accelerations do not show the thrust."""
 
 from collections.abc import Iterable
 
@@ -18,14 +15,14 @@ MARGIN = 0.5  # s left out beside time with idle motors where the height is not 
 
 
 def airborne(recording: Recording, told: str = "command") -> list[tuple[float, float]]:
-    """Start and end [s] of each time in the air.
+    """Find the start and end [s] of each time in the air.
 
-    Motors that idle for half a second end a flight. A flight that began with such a rest counts while the vehicle is
-    `CLEAR` above the height at which it stood. If no height is measured, it counts once `MARGIN` has passed since the
-    rest and the power has reached its median over the flight, which carries the vehicle.
+    Motors that idle for half a second end a flight. After such a rest, a flight begins once the vehicle is `CLEAR`
+    above the height at which it stood or, without a height, once `MARGIN` has passed and the power has reached its
+    median.
 
     Args:
-        told: the quantity that drives the rotors, "command" or "rotor_speed".
+        told: the quantity to use, "command" or "rotor_speed".
     """
     inputs, position = recording.signals[told], recording.signals.get("position")
     power = (np.asarray(inputs.values) ** 2).sum(axis=1)
@@ -36,18 +33,17 @@ def airborne(recording: Recording, told: str = "command") -> list[tuple[float, f
 
 
 def on_ground(log: FlightLog) -> Bool[np.ndarray, " n"]:
-    """Which samples are not `airborne`."""
     flights = _flights(log.t, (log.u**2).sum(axis=1), log.x[:, 2])
     return ~within(log.t, flights)
 
 
 def within(t: Float[np.ndarray, " n"], spans: Iterable[tuple[float, float]]) -> Bool[np.ndarray, " n"]:
-    """Which times lie in one of some spans, from start to end [s]."""
+    """Whether each time lies in one of the spans, from start to end [s]."""
     return np.any([(t >= start) & (t <= end) for start, end in spans] or [np.zeros(len(t), bool)], axis=0)
 
 
 def flying_intervals(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
-    """Whether an interval is sound and begins in the air."""
+    """Whether each interval is sound and begins in the air."""
     return sound_intervals(log) & ~on_ground(log)[:-1]
 
 

@@ -20,13 +20,13 @@ class Cleaning:
     """Changes to every log, in this order; by default none.
 
     Attributes:
-        in_flight: cut out periods of half a second and more with hardly any thrust: the vehicle is on the ground.
+        in_flight: cut out the time on the ground: half a second or longer with hardly any thrust.
         resample: new interval between samples [s].
         longest_gap: with resample, interpolate across gaps and repeated samples up to this long [s].
-        delay: of the motors [s]: the gyro's lag behind them, as `check_log` finds it.
+        delay: delay [s] to add to the motors: the gyro's lag that `check_log` reports.
 
     Raises:
-        ValueError: a number out of its range, or longest_gap without resample.
+        ValueError: a number is out of range, or longest_gap is given without resample.
     """
 
     in_flight: bool = False
@@ -44,14 +44,14 @@ class Cleaning:
 
 
 def clean(log: FlightLog, cleaning: Cleaning) -> tuple[FlightLog, list[str]]:
-    """Apply some changes to a log; also return one line per change.
+    """Apply some changes to a log and describe each in one line.
 
     Args:
         log: the log.
-        cleaning: which changes.
+        cleaning: the changes.
 
     Raises:
-        ValueError: the log, the field of `cleaning` and why it is impossible, in one line.
+        ValueError: a change is impossible.
     """
     changes: dict[str, Callable[[FlightLog], tuple[FlightLog, str]]] = {
         "in_flight": in_flight,
@@ -102,7 +102,7 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
 
 
 def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
-    """Cut out the time on the ground, where `airborne` says that the vehicle is not in the air.
+    """Cut out the time on the ground (see `airborne`).
 
     Args:
         log: the flight.
@@ -121,7 +121,7 @@ def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
 
     Args:
         log: the flight.
-        lag: delay [s]; a negative one shifts the motors to earlier times.
+        lag: delay [s]; negative shifts the motors to earlier times.
 
     Raises:
         ValueError: no segment is longer than the lag.
@@ -144,7 +144,7 @@ def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
     """Replace motors u by the mean over each interval of w with τ ẇ = u − w; segments start in equilibrium.
 
     Args:
-        log: the flight, with even samples.
+        log: an evenly sampled flight.
         time_constant: τ [s], at least 0.
 
     Raises:

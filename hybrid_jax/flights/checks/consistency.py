@@ -1,7 +1,4 @@
-"""Consistency checks of a log: each compares two independent records of one motion.
-
-Where they disagree, common mistakes are undone one at a time, and the one that resolves the disagreement is suggested.
-"""
+"""Compare independent records of one motion in a log, and suggest the common mistake that explains a disagreement."""
 
 import math
 from dataclasses import dataclass, replace
@@ -59,12 +56,12 @@ class Check:
     """The result of one check.
 
     Attributes:
-        name: of the check, such as the two records compared.
-        value: what was found, in `unit`; not a number where the check cannot tell.
-        unit: of value and limit, such as "s" or "relative error".
-        limit: maximum of the value; of correlations the minimum.
+        name: name of the check, for example the two records compared.
+        value: result in `unit`; NaN if the verdict is "cannot tell".
+        unit: unit of value and limit, for example "s" or "relative error".
+        limit: maximum of the value; for correlations, the minimum.
         verdict: "ok", "warns", "fails" or "cannot tell".
-        suggestion: what to correct, if anything.
+        suggestion: what you should correct, if anything.
     """
 
     name: str
@@ -76,14 +73,14 @@ class Check:
 
 
 def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
-    """Run all checks of a log against itself and its vehicle; without a vehicle, those that need none.
+    """Check a log for consistency with itself and, if given, with its vehicle.
 
     Args:
         log: the flight.
-        vehicle: constants that its motion is compared with.
+        vehicle: constants to compare the motion with.
 
     Raises:
-        ValueError: fewer than two samples, or another number of motors than the vehicle has.
+        ValueError: fewer than two samples, or the number of motors differs from the vehicle's.
     """
     if vehicle is not None and log.u.shape[1] != vehicle.rotors:
         found = f"{log.name}: has {log.u.shape[1]} motors, {vehicle.name} has {vehicle.rotors}"
@@ -115,12 +112,12 @@ def _at_most(name: str, value: float, unit: str, limit: float, suggestion: str) 
 
 
 def judged(name: str, value: float, unit: str, limit: float, advice: str) -> Check:
-    """A check that fails if there is something to advise."""
+    """Make a check that fails if there is advice."""
     return Check(name, float(value), unit, limit, *((FAILS, advice) if advice else (OK, NOTHING)))
 
 
 def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
-    """Check the mean specific force along body z in flight, over k Σu² / m."""
+    """Compare the mean specific force along body z in flight with k Σu² / m."""
     flying = flying_intervals(log)
     thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
@@ -149,7 +146,7 @@ def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
 
 
 def _columns(log: FlightLog) -> Check:
-    """Check for equal motors, constant columns and gyros at their limit: read twice, not recorded or saturated."""
+    """Find motors recorded twice, columns that never change and gyros that saturate."""
     values = np.hstack([log.x[:, VELOCITY.start :], log.u]).T
     names = (*STATE_NAMES[VELOCITY.start :], *input_names(log.u.shape[1]))
     columns: dict[str, np.ndarray] = dict(zip(names, values, strict=True))
@@ -165,7 +162,7 @@ def _columns(log: FlightLog) -> Check:
 
 
 def _saturates(values: np.ndarray) -> bool:
-    """Whether the largest or smallest value stands far more often than others do."""
+    """Whether the largest or smallest value occurs far more often than others."""
     usual = AT_LIMIT * len(values) / len(np.unique(values))
     return max((values == values.max()).sum(), (values == values.min()).sum()) > max(AT_LIMIT, usual)
 
@@ -213,7 +210,7 @@ def _spin(log: FlightLog, vehicle: Vehicle, yaw: float) -> Check:
 
 
 def _compare(log: FlightLog, name: str, pairs: Pairs, least: float) -> Check:
-    """Compare two records in flight; what no mistake explains in any span is the result of the shortest."""
+    """Compare two records in flight over growing spans; return the shortest's result if nothing explains any."""
     check = shortest = _compare_means(log, name, pairs, least, SPANS[0])
     for span in SPANS[1:]:
         check = _compare_means(log, name, pairs, least, span) if UNUSUAL in check.suggestion else check
@@ -221,7 +218,7 @@ def _compare(log: FlightLog, name: str, pairs: Pairs, least: float) -> Check:
 
 
 def _compare_means(log: FlightLog, name: str, pairs: Pairs, least: float, span: float) -> Check:
-    """Compare two records with each mistake undone; kinematics hold on each axis, v̇ has wind and drag."""
+    """Compare two records with each mistake undone, per axis for kinematics; v̇ includes wind and drag."""
     sound, limit = flying_intervals(log), THRUST_LIMIT if name == THRUST else KINEMATICS_LIMIT
     width = min(max(1, round(span / log.dt)), len(sound))
     whole = moving_mean(sound[:, None].astype(float), width)[:, 0] > 1 - 1e-9
@@ -243,7 +240,7 @@ def _compare_means(log: FlightLog, name: str, pairs: Pairs, least: float, span: 
 
 
 def _nearer(pairs: Pairs, limit: float, least: float) -> str:
-    """The mistake that, undone, lets the records agree best; empty if none does."""
+    """Return the mistake that best reconciles the records once undone; empty if none does."""
     left = {mistake: a - b for mistake, (a, b) in pairs.items()}
     own = left[NOTHING]
     # Any improvement counts if two differ by more than noise: an axis with little motion contributes little.
@@ -268,10 +265,8 @@ def _other_scale(a: Vectors, b: Vectors) -> str:
 
 
 def _size(values: Float[np.ndarray, "n d"]) -> float:
-    """Root mean square of the vectors' lengths."""
     return float(np.sqrt((values**2).sum(axis=1).mean()))
 
 
 def _relative_error(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"]) -> float:
-    """RMS of a − b over the root of the summed mean squares."""
     return _size(a - b) / float(np.hypot(_size(a), _size(b)))

@@ -1,4 +1,4 @@
-"""Mistakes of logs: pairs of records that should be equal, such as dp/dt and v, each with one mistake undone."""
+"""Pairs of records that should be equal, for example dp/dt and v, each with one common mistake undone."""
 
 from collections.abc import Iterator
 
@@ -25,7 +25,7 @@ Pairs = dict[str, tuple[Vectors, Vectors]]
 
 
 def velocities(log: FlightLog) -> Pairs:
-    """dp/dt and v [m/s]."""
+    """Pair dp/dt with v [m/s]."""
     p, v, attitude = log.x[:, POSITION], log.x[:, VELOCITY], rotation_of(log.x[:, QUATERNION])
     slope, frd = np.diff(p, axis=0) / np.diff(log.t)[:, None], BODIES["FRD"]
     stated = {
@@ -49,7 +49,7 @@ def velocities(log: FlightLog) -> Pairs:
 
 
 def _shifted(log: FlightLog) -> Iterator[tuple[str, np.ndarray]]:
-    """What is said of a quantity that is late or early, and the rows that undo it."""
+    """Yield a description of each time shift and the rows that undo it."""
     now = np.arange(len(log))
     for seconds in LATE:
         late = round(seconds / log.dt)
@@ -58,7 +58,7 @@ def _shifted(log: FlightLog) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def rates(log: FlightLog) -> Pairs:
-    """Body rates that turn each attitude into the next, and ω [rad/s]."""
+    """Pair the body rates between attitudes with ω [rad/s]."""
     q, omega = log.x[:, QUATERNION], middle(log.x[:, BODY_RATES])
     turned, back = rates_between(log.t, q), rotation_of(q[:-1]).inv()
     found = {
@@ -85,7 +85,7 @@ def rates(log: FlightLog) -> Pairs:
 
 
 def accelerations(log: FlightLog) -> Pairs:
-    """v̇, and Σu² along body z less gravity at the best thrust coefficient [m/s²]."""
+    """Pair v̇ with Σu² along body z minus gravity, at the best thrust coefficient [m/s²]."""
     q, v = log.x[:, QUATERNION], log.x[:, VELOCITY]
     attitude, thrust = rotation_of(q), (log.u[:-1] ** 2).sum(axis=1, keepdims=True)
     frd = attitude.as_matrix() @ BODIES["FRD"].T
@@ -109,7 +109,7 @@ def accelerations(log: FlightLog) -> Pairs:
 
 
 def _turn(angle: Float[np.ndarray, " n"], q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Attitudes turned about the world's z [rad]."""
+    """Rotate attitudes about the world's z [rad]."""
     w, x, y, z = q.T
     c, s = np.cos(angle / 2), np.sin(angle / 2)
     return np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=1)
@@ -134,11 +134,11 @@ def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
 
 
 def middle(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n-1 d"]:
-    """Means of adjacent samples."""
+    """Average adjacent samples."""
     return 0.5 * (values[1:] + values[:-1])
 
 
 def moving_mean(values: Float[np.ndarray, "n d"], width: int) -> Float[np.ndarray, "m d"]:
-    """The mean of each `width` consecutive rows."""
+    """Average each `width` consecutive rows."""
     total = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
     return (total[width:] - total[:-width]) / width

@@ -1,4 +1,4 @@
-"""How the body turns as its motors change: their order, their direction of spin and their lag, by correlation."""
+"""Estimate the order, spin and lag of motors by correlating the body's rotation with them."""
 
 from functools import cache
 from itertools import combinations, permutations
@@ -23,7 +23,7 @@ PERMUTED = 6  # rotors at most of which all orders are tried: 720; of more, thos
 
 
 class Response(NamedTuple):
-    """The order of motors and the lag that explain roll and pitch best, and their correlation with yaw."""
+    """The motor order and lag that explain roll and pitch best, and the correlation with yaw."""
 
     order: tuple[int, ...]  # u[:, order] is in the order of the vehicle's rotors
     yaw_sign: int  # −1 if every rotor spins opposite to the vehicle file
@@ -34,7 +34,7 @@ class Response(NamedTuple):
 
 
 def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
-    """Find the best order and lag up to ±0.1 s by correlation, then the sign of yaw; None with too little flight."""
+    """Find the best order and lag up to ±0.1 s, then the sign of yaw; None with too little flight."""
     torque, squares = _quick(log, vehicle)
     reach = round(min(LONGEST_LAG, max(SHORT_LAG, len(squares) * log.dt / 8)) / log.dt)
     if np.count_nonzero(squares.any(axis=1)) < 4 * reach + 8 or not (torque.std(axis=0) > 0).all():
@@ -62,7 +62,7 @@ def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
 
 @cache
 def orders(rotors: int) -> Int[np.ndarray, "orders rotors"]:
-    """The orders of the motors that are tried, first the one that they have."""
+    """List the candidate motor orders, beginning with the recorded one."""
     if rotors <= PERMUTED:
         return np.array(list(permutations(range(rotors))))
     found = np.tile(np.arange(rotors), (1 + rotors * (rotors - 1) // 2, 1))
@@ -74,7 +74,7 @@ def orders(rotors: int) -> Int[np.ndarray, "orders rotors"]:
 def correlations(
     torque: Float[np.ndarray, "n 3"], squares: Float[np.ndarray, "n rotors"], mix: Float[np.ndarray, "3 rotors"], lag
 ) -> Float[np.ndarray, "orders 3"]:
-    """Correlation of torque with the prediction of each order of the motors `lag` samples before."""
+    """Correlate torque with the prediction of each motor order, `lag` samples earlier."""
     ahead, behind = (torque[lag:], squares[: len(squares) - lag]) if lag >= 0 else (torque[:lag], squares[-lag:])
     cross, spread = ahead.T @ behind, behind.T @ behind
     order = orders(mix.shape[1])
@@ -85,7 +85,7 @@ def correlations(
 
 
 def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n rotors"]]:
-    """J ω̇ + ω × J ω and u² of each interval, band-passed from `FAST` to `SLOW`; zero near gaps."""
+    """Return J ω̇ + ω × J ω and u², band-passed from `FAST` to `SLOW`; zero near gaps."""
     fast, slow = (max(1, round(span / log.dt)) for span in (FAST, SLOW))
     sound, omega, inertia = sound_intervals(log), log.x[:, BODY_RATES], np.asarray(vehicle.inertia)
     if len(sound) < fast + slow:
@@ -102,7 +102,7 @@ def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], 
 
 
 def _vertex(score: Float[np.ndarray, " l"], at: int) -> float:
-    """Sub-sample position of the peak, −0.5 … 0.5, by a parabola through the maximum and its neighbours."""
+    """Refine a peak by a parabola; returns an offset of −0.5 … 0.5 samples."""
     if not 0 < at < len(score) - 1:
         return 0.0
     left, top, right = score[at - 1 : at + 2]

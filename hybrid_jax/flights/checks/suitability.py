@@ -1,7 +1,4 @@
-"""Checks of a recording before it becomes a flight: is it whole, of such a vehicle, and fast enough for its use?
-
-They judge signals as they were recorded, before anything is interpolated. `consistency` then compares the signals.
-"""
+"""Check the raw signals of a recording: are they complete, of the expected vehicle, and fast enough?"""
 
 from collections.abc import Sequence
 
@@ -25,12 +22,12 @@ USED = ("position", "velocity", "body_velocity", "attitude", "rates")
 
 
 def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: float | None = None) -> list[Check]:
-    """Run all checks of a recording.
+    """Check the signals of a recording before interpolation.
 
     Args:
-        recording: what was read of a log.
-        vehicle: the vehicle that the log is to be of; without it, its rotors and largest speed are not compared.
-        dt: interval [s] that the flight is to have; without it, the rates of the signals are not judged.
+        recording: the log as it was read.
+        vehicle: the expected vehicle; without it, rotor count and largest speed are not checked.
+        dt: intended sample interval [s]; without it, signal rates are not checked.
     """
     damage, missing = recording.facts.get("damage", ""), missing_states(recording)
     motors = motors_of(recording) if recording.signals.keys() & ROTOR_UNITS.keys() else None
@@ -49,7 +46,7 @@ def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: fl
 
 
 def failures(checks: Sequence[Check], name: str) -> list[str]:
-    """A line for each check that failed."""
+    """Format each failed check as one line."""
     return [f"{name}: {check.name}: {check.suggestion}" for check in checks if check.verdict == FAILS]
 
 
@@ -102,7 +99,7 @@ def _clock(recording: Recording) -> Check:
 
 
 def _limits(recording: Recording, vehicle: Vehicle | None) -> Check:
-    """No command is below 0 or above 1, and no speed above that of the vehicle file."""
+    """Check that commands are in 0 … 1 and speeds do not exceed the vehicle's maximum."""
     fastest = np.inf if vehicle is None else vehicle.max_rotor_speed
     for name, most in (("command", 1.0), ("rotor_speed", fastest)):
         if name not in recording.signals:

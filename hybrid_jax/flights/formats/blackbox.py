@@ -1,7 +1,7 @@
-"""Read blackbox logs of Betaflight with orangebox (extra `logs`; it is under the GPL, version 3).
+"""Read Betaflight blackbox logs with orangebox (extra `logs`; GPL-3).
 
-Betaflight's body is forward-left-up. Units of fields are those of betaflight/src/main/blackbox/blackbox.c: gyroADC in
-deg/s times `gyro_scale`, accSmooth in 1 g / `acc_1G`, eRPM in 100 / min of the field, of `motor_poles` poles.
+Units are documented in betaflight/src/main/blackbox/blackbox.c: gyroADC in deg/s times `gyro_scale`, accSmooth in g /
+`acc_1G`, eRPM in 100 / min of `motor_poles` poles. Betaflight's body is forward-left-up.
 """
 
 import contextlib
@@ -27,10 +27,10 @@ FULL = {True: (48.0, 2047.0), False: (1000.0, 2000.0)}  # motors at rest and at 
 
 
 def read_blackbox(path: str | Path) -> Recording:
-    """Read the longest flight of a file. Commands are shares of the largest; rotor speeds need bidirectional DShot.
+    """Read the longest flight of a file. Commands are in 0 … 1; rotor speeds need bidirectional DShot.
 
     Raises:
-        ValueError: file, field, time and what to do, in one line; or orangebox is not installed.
+        ValueError: the file is invalid, or orangebox is not installed.
     """
     try:
         import orangebox  # noqa: F401
@@ -67,13 +67,11 @@ def read_blackbox(path: str | Path) -> Recording:
 
 @cache
 def _parser() -> Any:
-    """Orangebox's parser, which also knows the events of later firmware that it takes for damage."""
+    """Extend orangebox's parser by the events of later firmware, which it takes for damage."""
     import orangebox
     from orangebox.decoders import _signed_vb, _unsigned_vb
 
     class Parser(orangebox.Parser):
-        """Of `FlightLogEvent_e` in blackbox_fielddefs.h."""
-
         def _parse_event_frame(self, reader: Any):
             kind = reader.value()
             if kind not in (ADJUSTED, RESUMED, DISARMED, ENDED):
@@ -96,7 +94,7 @@ def _parser() -> Any:
 
 
 def _frames(content: bytes) -> tuple[Any, np.ndarray, str]:
-    """The parser, its frames as rows of the fields of main frames, and how the log is damaged; empty if it is not."""
+    """Return the parser, the main frames as rows, and a description of any damage."""
     from orangebox.reader import Reader
     from orangebox.types import FrameType
 
@@ -143,7 +141,7 @@ def _parts(path, columns, headers) -> Iterator[tuple[str, Samples]]:
 
 
 def _scale(path, headers) -> float:
-    """deg/s of one count of the gyro: the bits of a float."""
+    """Decode gyro_scale [deg/s per count] from the bits of a float."""
     given = headers.get("gyro_scale", 0x3F800000)
     with contextlib.suppress(struct.error):
         (scale,) = struct.unpack("<f", struct.pack("<I", given))
@@ -153,7 +151,7 @@ def _scale(path, headers) -> float:
 
 
 def _most(given) -> float:
-    """The largest of the numbers of a header; 0 without any."""
+    """Return the largest number of a header; 0 without any."""
     each = given if isinstance(given, list) else [given]
     return max((number for number in each if isinstance(number, int | float)), default=0)
 

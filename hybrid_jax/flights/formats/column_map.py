@@ -54,7 +54,7 @@ class Columns:
     Attributes:
         columns: names in the header of the file.
         unit: one of `SCALES`.
-        polynomial: of motor commands, the coefficients c0, c1, … of their map to rotor speeds [rad/s].
+        polynomial: coefficients c0, c1, … that map motor commands to rotor speeds [rad/s].
     """
 
     columns: tuple[str, ...]
@@ -64,7 +64,7 @@ class Columns:
 
 @dataclass(frozen=True)
 class Format:
-    """How the numbers stand in the file.
+    """The number format of a file.
 
     Attributes:
         delimiter: one character between fields.
@@ -90,15 +90,15 @@ class ColumnMap:
         time: time of each row.
         position: position in the world.
         attitude: rotation body → world, as a quaternion or as roll, pitch and yaw.
-        velocity: in the world or the body, as `frames` says.
+        velocity: velocity in the frame given by `frames`.
         body_rates: angular velocity of the body.
-        specific_force: of the body, as an accelerometer measures it.
-        voltage: of the battery.
+        specific_force: specific force in the body frame, as an accelerometer measures it.
+        voltage: battery voltage.
         motors: rotor speeds or commands, in the vehicle's order.
         format: delimiter and decimal mark of the file.
 
     Raises:
-        ValueError: the table, the key and what was expected, in one line.
+        ValueError: a table or key is invalid.
     """
 
     frames: Frames
@@ -121,12 +121,12 @@ class ColumnMap:
 
     @property
     def quantities(self) -> dict[str, Columns]:
-        """The columns of each quantity that is given, in the order of `SCALES`."""
+        """Return the columns of each quantity that is given, in the order of `SCALES`."""
         return {name: getattr(self, name) for name in SCALES if getattr(self, name) is not None}
 
     @property
     def names(self) -> list[str]:
-        """All columns, in the order of `SCALES`."""
+        """List all columns in the order of `SCALES`."""
         return [column for stated in self.quantities.values() for column in stated.columns]
 
 
@@ -134,10 +134,10 @@ def load_column_map(path: str | Path) -> ColumnMap:
     """Read a column map.
 
     Args:
-        path: of the TOML file.
+        path: the TOML file.
 
     Raises:
-        ValueError: file, table, key and what was expected, in one line.
+        ValueError: the file, a table or a key is invalid.
     """
     tables, parts = read_tables(path), {}
     require_known(str(path), tables, [*ColumnMap.__dataclass_fields__])
@@ -150,7 +150,7 @@ def load_column_map(path: str | Path) -> ColumnMap:
 
 
 def library_map(path: str | Path) -> ColumnMap:
-    """The map of a file with the library's columns t, px … wz, u0 …; errors as of `read_table`."""
+    """Return the map of a file with the library's columns t, px … wz, u0 …"""
     names, motors = header_of(path), input_names(MOST_ROTORS)
     count = max([FEWEST_ROTORS, *(i + 1 for i, name in enumerate(motors) if name in names)])
     return ColumnMap(
@@ -165,17 +165,17 @@ def library_map(path: str | Path) -> ColumnMap:
 
 
 def read_mapped(path: str | Path, column_map: ColumnMap | None = None) -> Recording:
-    """Read what a CSV file, plain or gzip, holds of the quantities of a recording.
+    """Read the mapped quantities of a CSV file, plain or gzip.
 
-    A row without a time is left out. A quantity that stands in some rows only, as in tables of several rates that were
-    joined, has the times of these.
+    Rows without a time are left out. If a quantity is given in some rows only, for example in joined tables of several
+    rates, it has the times of those rows.
 
     Args:
-        path: of the file.
-        column_map: the meaning of its columns; by default it has the library's.
+        path: the CSV file.
+        column_map: the meaning of its columns, by default the library's.
 
     Raises:
-        ValueError: file, row, field and what to do, in one line.
+        ValueError: the file is invalid: row, field and what to do.
     """
     column_map = library_map(path) if column_map is None else column_map
     form, stated, frames = column_map.format, column_map.quantities, column_map.frames
@@ -201,7 +201,7 @@ def read_mapped(path: str | Path, column_map: ColumnMap | None = None) -> Record
 
 
 def of_unit(motors: Float[np.ndarray, "n m"], unit: str) -> Float[np.ndarray, "n m"]:
-    """Motors as rad/s or as shares; a little below its rest, as at 900 µs, or at 0, a motor stands."""
+    """Convert motors to rad/s or to shares of 0 … 1; values slightly below rest, for example 900 µs, become 0."""
     rest = REST.get(unit, 0.0)
     disarmed = (motors == 0) | ((motors >= DISARMED * rest) & (motors < rest))
     return np.where(disarmed, 0.0, motors - rest) * SCALES["motors"][unit]

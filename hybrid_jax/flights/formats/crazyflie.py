@@ -32,13 +32,13 @@ def _named(pattern: str, axes: Iterable[str]) -> tuple[str, ...]:
 
 
 def _without_pitch(v: np.ndarray) -> np.ndarray:
-    """Attitudes whose z axis is along acceleration and gravity, from roll and yaw [deg] and acceleration [g, world]."""
+    """Find attitudes with z along acceleration plus gravity, from roll and yaw [deg] and acceleration [g, world]."""
     roll, yaw, x, y, z = (v * [DEGREES, DEGREES, 1, 1, 1] + [0, 0, 0, 0, 1]).T
     return from_euler(np.stack([roll, np.arctan2(np.cos(yaw) * x + np.sin(yaw) * y, z), yaw], axis=1))
 
 
 def unpack_attitude(numbers: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of 32 bits: which of x, y, z, w is largest; of each other a sign and nine bits (quatcompress.h)."""
+    """Unpack (w, x, y, z) from 32 bits: index of the largest, then sign and nine bits each (quatcompress.h)."""
     bits = numbers.astype(np.int64)
     largest, q = bits >> 30, np.zeros((len(bits), 4))
     for i in (3, 2, 1, 0):
@@ -105,10 +105,10 @@ Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # variable → its ticks [µ
 
 
 def read_crazyflie(path: str | Path) -> Recording:
-    """Read one log. `command` is the PWM if there is any, else what the mixer asked for, as shares of 65536.
+    """Read one log. Commands are the PWM or, without it, the mixer's output, as shares of 65536.
 
     Raises:
-        ValueError: file, variable, time and what to do, in one line.
+        ValueError: the file is invalid: variable, time and what to do.
     """
     content = raw.unpacked(path)
     try:
@@ -138,12 +138,12 @@ def read_crazyflie(path: str | Path) -> Recording:
 
 
 def is_crazyflie(head: bytes) -> bool:
-    """Whether a file, by its first bytes, unpacked, is such a log."""
+    """Whether a file is such a log, by its unpacked first bytes."""
     return len(head) >= 3 and head[0] == MAGIC and head[1:3] == VERSION.to_bytes(2, "little")
 
 
 def _header(path, content: bytes) -> tuple[dict[bytes, tuple[list[str], np.dtype]], int]:
-    """Variables and the type of a record of each event type, by the bytes of its id, and where the records begin."""
+    """Return the variables and type of each event by its id, and where the records begin."""
     if not is_crazyflie(content):
         raise ValueError(f"{path}: is no µSD log of version {VERSION} of a Crazyflie; copy the file again")
     count, at, events = *struct.unpack_from("<H", content, 3), 5, {}
@@ -169,7 +169,7 @@ def _text(content: bytes, at: int) -> tuple[str, int]:
 
 
 def _columns(content: bytes, at: int, end: int, events) -> tuple[Columns, int]:
-    """The variables of all whole records, and where these end."""
+    """Return the variables of all complete records, and where these end."""
     starts, sizes = {key: array.array("q") for key in events}, {key: kind.itemsize for key, (_, kind) in events.items()}
     while at + 2 <= end and (size := sizes.get(key := content[at : at + 2])) and at + 2 + size <= end:
         starts[key].append(at + 2)

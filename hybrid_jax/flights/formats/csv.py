@@ -1,4 +1,4 @@
-"""Tables of numbers in CSV files, plain or gzip, with a header that names the columns, in any order."""
+"""Numeric tables in CSV files, plain or gzip, with a header that names the columns in any order."""
 
 import contextlib
 import io
@@ -30,13 +30,13 @@ def read_table(
     decimal: str = ".",
     max_rows: int = MAX_ROWS,
 ) -> tuple[Float[np.ndarray, "n c"], tuple[str, ...]]:
-    """Read the named columns of a CSV file with a header, in the given order, and a note if it was cut off.
+    """Read the named columns of a CSV file in the given order, and a note if the file was cut off.
 
-    A cell without a number is NaN. Lines before the header that begin with # or % or say `sep=;` are passed over; the
-    header may begin with them, too.
+    Cells without a number are NaN. Lines before the header that begin with #, % or `sep=;` are skipped; the header
+    itself may begin with # or %.
 
     Raises:
-        ValueError: file, row, field and what to do, in one line.
+        ValueError: the file is invalid: row, field and what to do.
     """
     parts, block = [], ""
     try:
@@ -67,14 +67,14 @@ def read_table(
 
 
 def header_of(path: str | Path, delimiter: str = ",") -> list[str]:
-    """The names of the columns; errors as of `read_table`."""
+    """Return the column names; raises like `read_table`."""
     with readable(path) as file, contextlib.suppress(UnicodeDecodeError):
         return _header(io.TextIOWrapper(file, encoding="utf-8-sig"), delimiter)[0]
     return []
 
 
 def _header(text: IO[str], delimiter: str) -> tuple[list[str], str, int]:
-    """Names of the columns, the line that holds them, and its row."""
+    """Return the column names, the header line and its row."""
     row, line = 1, text.readline(MAX_ROW_LENGTH)
     while (COMMENT.match(line) and delimiter not in line) or line.startswith("sep="):
         row, line = row + 1, text.readline(MAX_ROW_LENGTH)
@@ -97,7 +97,7 @@ def _header_complaint(path, name: str, names: list[str], header: str, delimiter:
 
 
 def _numbers(path, lines: list[str], row: int, names, picked, delimiter: str) -> Float[np.ndarray, "n c"]:
-    """Parse the picked cells of some lines, the first of which is the given row."""
+    """Parse the picked cells of some lines, whose first is the given row."""
     for at, line in enumerate(lines):
         if (count := line.count(delimiter) + 1) != len(names):
             found = f"{count} fields" if line.strip() else "a blank line"
@@ -121,7 +121,7 @@ def _told(cell: str) -> str:
 
 
 def _bad_cell(cell: str, delimiter: str) -> str:
-    """Why a cell is no number, and what to do; empty if it is one."""
+    """Say why a cell is not a number and what to do; empty if it is one."""
     with contextlib.suppress(ValueError):
         np.loadtxt([_told(cell)], delimiter=delimiter, comments=None)
         return ""

@@ -1,4 +1,4 @@
-"""Samples as they stand in a log, in ticks of its clock, and how they become the signals of a `Recording`."""
+"""Samples in ticks of a log's clock, and their conversion to the signals of a `Recording`."""
 
 import bisect
 import contextlib
@@ -38,7 +38,7 @@ RATIO, MOST, SMALL = 100, 2**31, 2**24  # bytes that a gzip file may hold: for e
 
 
 class Samples(NamedTuple):
-    """n samples of one quantity at integer or real ticks, and where they came from, for messages."""
+    """n samples of one quantity at integer or real ticks, and their source for messages."""
 
     ticks: np.ndarray
     values: Float[np.ndarray, "n k"]
@@ -46,7 +46,7 @@ class Samples(NamedTuple):
 
 
 class _Unpacked(io.RawIOBase):
-    """The bytes in a gzip file, as many as a log may hold."""
+    """Bytes of a gzip file, up to the size that a log may have."""
 
     def __init__(self, path: Path, packed: IO[bytes]):
         self.path, self.file = path, gzip.GzipFile(fileobj=packed)
@@ -66,7 +66,7 @@ class _Unpacked(io.RawIOBase):
 
 @contextlib.contextmanager
 def readable(path: str | Path, unpack: bool = True) -> Iterator[IO[bytes]]:
-    """A file, plain or gzip, to read; ValueError, with the file and what to do, if that cannot be done."""
+    """Open a file, plain or gzip; raise ValueError, with the file and what to do, if it cannot be read."""
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
@@ -84,7 +84,7 @@ def readable(path: str | Path, unpack: bool = True) -> Iterator[IO[bytes]]:
 
 
 def unpacked(path: str | Path) -> bytes:
-    """The bytes of a file, plain or gzip; errors as of `readable`."""
+    """Return the bytes of a file, plain or gzip; raises like `readable`."""
     with readable(path) as file:
         return file.read()
 
@@ -96,14 +96,13 @@ def record(
     notes: Sequence[str] = (),
     facts: Mapping[str, str] | None = None,
 ) -> Recording:
-    """The recording of a file whose clock counts ticks of so many seconds, by quantity; empty parts are left out.
+    """Convert samples by quantity, on a clock of `tick` seconds, to a recording.
 
-    Left out with a note are repeated time stamps, samples up to `LATE` out of order, a few with a time far from their
-    neighbours', and those without a number or a rotation: as they all become gaps, nothing is made up. Of a value that
-    stands in several rows, the first is kept.
+    These samples are left out, with a note, and become gaps: repeated time stamps, samples up to `LATE` out of order, a
+    few with outlying times, and values that are not a number or a rotation. The first of several equal times is kept.
 
     Raises:
-        ValueError: file, source, time and what was expected, in one line.
+        ValueError: the log is invalid: file, source, time and what was expected.
     """
     parts = {name: part for name, part in parts.items() if len(part.ticks)}
     if not parts:
@@ -144,7 +143,7 @@ def record(
 
 
 def _lost(name: str, part: Samples) -> np.ndarray:
-    """Which samples are no numbers, far beyond any measurement, or no rotations."""
+    """Whether each sample is not a number, far out of range, or not a rotation."""
     lost = np.asarray(~(np.abs(np.asarray(part.values)) < LARGEST).all(axis=1))
     return lost | np.asarray(unlike_one(part.values)) if name == "attitude" else lost
 
@@ -159,7 +158,7 @@ def _wrong(name: str, part: Samples, row: int, t: np.ndarray) -> str:
 
 
 def _in_order(where: str, ticks: np.ndarray, tick: float) -> tuple[np.ndarray, list[str]]:
-    """The samples that come after all before them, and what is to be said of the others."""
+    """Return which samples come after all before them, and notes about the others."""
     t = (ticks - ticks[len(ticks) // 2]).astype(float) * tick
     for row in np.flatnonzero(~np.isfinite(t))[:1]:
         raise ValueError(f"{where}: the time of sample {row} is {t[row]}, must be finite")
@@ -195,13 +194,13 @@ def _in_order(where: str, ticks: np.ndarray, tick: float) -> tuple[np.ndarray, l
 
 
 def wrapped(fall: float) -> str:
-    """Which counter, if any, falls by so many seconds when it begins anew."""
+    """Name the counter that falls by so many seconds when it wraps; empty if there is none."""
     found = [name for name, seconds in WRAPS.items() if abs(fall / seconds - 1) < 0.02]
     return f"a counter of {found[0]} began anew" if found else ""
 
 
 def longest_rise(t: Float[np.ndarray, " n"]) -> np.ndarray:
-    """Indices of the longest sequence of times that do not fall."""
+    """Find the indices of the longest non-decreasing sequence of times."""
     tops, at, before = [], [], np.full(len(t), -1)
     for i, time in enumerate(t.tolist()):
         place = bisect.bisect_right(tops, time)
@@ -215,12 +214,11 @@ def longest_rise(t: Float[np.ndarray, " n"]) -> np.ndarray:
 
 
 def own_samples(t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], repeated: bool = True):
-    """Times and values of the samples that a program repeated or drew lines between, or the arguments as they are.
+    """Recover the original samples of a signal that a program repeated or interpolated; else return the arguments.
 
-    A program that puts signals of several rates on one clock repeats each value of a slow one until the next comes, or
-    writes it as lines with bends at its samples. A sample that fell between two times of that clock is where the lines
-    beside it meet. A line as long as several intervals keeps a sample in each; one longer than `GAP` intervals becomes
-    a gap, which may lie under it, unless the value rests.
+    A program that joins signals of several rates repeats each slow value until the next, or draws lines with bends at
+    the samples. A sample between two times of its clock is where the adjacent lines meet. A line of several intervals
+    keeps a sample in each; one longer than `GAP` intervals becomes a gap unless the value is constant.
     """
     sound = np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()
     if len(t) < FEWEST_OF_LINES or not sound:
@@ -243,14 +241,14 @@ def own_samples(t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], re
 
 
 def _in_steps(values: Float[np.ndarray, "n k"]) -> bool:
-    """Whether all values are multiples of a step, as of a sensor or a file with few digits."""
+    """Whether all values are multiples of a step, for example from a sensor or a file with few digits."""
     steps = np.abs(np.diff(values, axis=0))
     least = np.min(steps, axis=0, where=steps > 0, initial=np.inf)
     return bool(np.abs(steps / least - np.round(steps / least)).max() < WHOLE)
 
 
 def _fresh(values: Float[np.ndarray, "n k"]) -> np.ndarray:
-    """Which rows hold new values, if all stand in about as many rows; where one rests longer, as often. Else all."""
+    """Which rows have new values, if they repeat about equally often (or regularly at rest); else all."""
     new = np.append(True, (np.diff(values, axis=0) != 0).any(axis=1))
     counts = np.diff(np.flatnonzero(new))
     counts = counts[counts <= GAP * np.median(counts)] if len(counts) else counts
@@ -262,7 +260,7 @@ def _fresh(values: Float[np.ndarray, "n k"]) -> np.ndarray:
 
 
 def _meetings(t, values, slope, bend):
-    """Time and value of each sample in which lines meet: at a bend, or between two bends that follow each other."""
+    """Find the samples at which lines meet: at a bend, or between two consecutive bends."""
     k = 1
     while k < len(t) - 1:
         late = 0.0
@@ -276,7 +274,7 @@ def _meetings(t, values, slope, bend):
 
 
 def turned(parts: Mapping[str, Samples], world: str, body: str) -> dict[str, Samples]:
-    """Quantities that stand in frames of `WORLDS` and `BODIES`, in the library's: world z up, body forward-left-up."""
+    """Rotate quantities from frames of `WORLDS` and `BODIES` to z up and forward-left-up."""
     turns = dict.fromkeys(("position", "velocity"), WORLDS[world].T)
     turns |= dict.fromkeys(("body_velocity", "rates", "specific_force"), BODIES[body].T)
     found = {name: part._replace(values=part.values @ turns[name]) for name, part in parts.items() if name in turns}
@@ -287,7 +285,7 @@ def turned(parts: Mapping[str, Samples], world: str, body: str) -> dict[str, Sam
 
 
 def attitude(q: Float[np.ndarray, "n 4"], world: str, body: str) -> Float[np.ndarray, "n 4"]:
-    """Attitudes between other frames as attitudes between the library's; those of no rotation stay as they are."""
+    """Convert attitudes between other frames to the library's; invalid ones are unchanged."""
     with np.errstate(over="ignore"):
         sound = np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0)
     turned = np.array(q, float)

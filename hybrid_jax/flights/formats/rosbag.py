@@ -1,10 +1,10 @@
 """Read bags of ROS 2 (SQLite or MCAP) and ROS 1 with rosbags (extra `logs`).
 
-Odometry, poses, IMU and battery are found by their message types. Motors have no message type of their own, and two
-topics may hold one quantity: then the topics are named, as in {"odometry": "/mavros/odometry"} and
-{"motors": "/rotors:data:rpm"}, of the topic, the field that holds one number for each motor, and its unit.
+Odometry, poses, IMU and battery are found by message type. You should name the topics of motors, which have no standard
+type, and of a quantity with several topics, for example {"odometry": "/mavros/odometry", "motors": "/rotors:data:rpm"}:
+topic, field with one number per motor, and unit.
 
-Frames are those of REP 103 and 105: world z up, body forward-left-up, an odometry's twist in the body.
+Frames follow REP 103 and 105: world z up, body forward-left-up, the twist of an odometry in the body.
 """
 
 import re
@@ -60,10 +60,10 @@ Messages = dict[str, list[tuple[int, Any]]]  # topic → time [ns] and content o
 
 
 def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Recording:
-    """Read one bag: a folder with metadata.yaml, or a file .mcap, .db3 or .bag.
+    """Read one bag: a folder with metadata.yaml, or a .mcap, .db3 or .bag file.
 
     Raises:
-        ValueError: file, topic, time and what to do, in one line; or rosbags is not installed.
+        ValueError: the bag is invalid, or rosbags is not installed.
     """
     topics = topics or {}
     if unknown := topics.keys() - set(ROLES):
@@ -92,7 +92,7 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
 
 
 def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, tuple[str, str, str]], Messages]:
-    """Types of all topics, those that are chosen for each role, and the messages of these and of PX4's topics."""
+    """Return all topics' types, the topic chosen for each role, and the messages of these and of PX4's topics."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -122,7 +122,7 @@ def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, t
 
 
 def _twist_in_world(parts: dict[str, Samples], topic: str) -> None:
-    """Where a topic tells of velocity in the world, none in the body counts; rates beside it are in the world, too."""
+    """Prefer a topic's velocity in the world to its velocity in the body, and rotate its body rates."""
     parts.pop("body_velocity", None)
     rates, attitude = parts.get("rates"), parts.get("attitude")
     if rates and attitude and rates.source == attitude.source == topic:
@@ -131,13 +131,13 @@ def _twist_in_world(parts: dict[str, Samples], topic: str) -> None:
 
 
 def _px4(kind: str) -> str:
-    """The topic of PX4 that a message of px4_msgs is of, such as vehicle_attitude of VehicleAttitude; else empty."""
+    """Name the PX4 topic of a message of px4_msgs, for example vehicle_attitude for VehicleAttitude; else ""."""
     name = kind.split("/")[-1] if kind.startswith(PX4) else ""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 def _px4_table(messages) -> dict[str, np.ndarray]:
-    """Field → array, as of a ULog: of arrays a field for each element."""
+    """Map field → array as in a ULog, with one field per array element."""
     rows = [dict(_fields(message)) for _, message in messages]
     return {name: np.array([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
 
@@ -155,7 +155,7 @@ def _fields(message, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _chosen(path, types: Mapping[str, str], topics: Mapping[str, str]) -> dict[str, tuple[str, str, str]]:
-    """Role → topic, and of motors field and unit."""
+    """Map role → topic and, for motors, field and unit."""
     found = {}
     for role, kinds in READERS.items():
         known = {kind for kind in kinds if role in topics or (role, kind) not in ASKED_FOR}
@@ -195,7 +195,7 @@ def _require(path, topic: str, types: Mapping[str, str], role: str = "", kinds: 
 
 
 def _stamps(messages) -> np.ndarray:
-    """Ticks [ns] of the headers, where there are any, else of the bag."""
+    """Return the time stamps [ns] of the headers if there are any, else of the bag."""
     headers = [getattr(message, "header", None) for _, message in messages]
     if all(header is not None and (header.stamp.sec or header.stamp.nanosec) for header in headers):
         return np.array([header.stamp.sec * 10**9 + header.stamp.nanosec for header in headers if header], np.int64)
@@ -203,14 +203,14 @@ def _stamps(messages) -> np.ndarray:
 
 
 def _numbers(message, field: str):
-    """A field of a message, or with a point a field of each of its parts, such as esc_telemetry.rpm."""
+    """Read a field of a message, or of each of its parts, for example esc_telemetry.rpm."""
     whole, _, part = field.partition(".")
     found = getattr(message, whole, ())
     return [getattr(each, part, None) for each in found] if part else np.ravel(found)
 
 
 def _motors(path, topic: str, field: str, messages) -> tuple[np.ndarray, str]:
-    """Numbers of each motor, and the name of the field that holds them."""
+    """Return the numbers of each motor and the name of their field."""
     fields = field.split("|")
     name = next((name for name in fields if len(_numbers(messages[0], name))), fields[0])
     try:

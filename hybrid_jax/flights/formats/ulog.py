@@ -1,7 +1,7 @@
-"""Read PX4 ULog files, plain or gzip, of PX4 1.5 to 1.16, with pyulog (extra `logs`).
+"""Read PX4 ULog files of PX4 1.5 to 1.16, plain or gzip, with pyulog (extra `logs`).
 
-PX4 states attitude as body FRD → world NED and vectors in these frames (msg/versioned/VehicleAttitude.msg,
-msg/versioned/VehicleLocalPosition.msg); the format is that of docs.px4.io, "ULog File Format".
+Attitudes are body FRD → world NED (msg/versioned/VehicleAttitude.msg, VehicleLocalPosition.msg); for the format see
+docs.px4.io, "ULog File Format".
 """
 
 import contextlib
@@ -51,10 +51,10 @@ MOST = 16  # motors or outputs in any topic
 
 
 def read_ulog(path: str | Path) -> Recording:
-    """Read one log. Commands are shares of the largest, of PWM between the log's minimum and maximum.
+    """Read one log. Commands are in 0 … 1; PWM is scaled by the log's minimum and maximum.
 
     Raises:
-        ValueError: file, topic, time and what to do, in one line; or pyulog is not installed.
+        ValueError: the log is invalid, or pyulog is not installed.
     """
     log, damage = _load(path)
     tables, notes = _instances(log.data_list)
@@ -76,7 +76,7 @@ def read_ulog(path: str | Path) -> Recording:
 
 
 def _instances(data) -> tuple[dict[str, Any], list[str]]:
-    """Topic → the first of its instances that changes, else the first; and which that is, where there are several."""
+    """Map topic → its first instance that changes, else its first, with notes about the others."""
     chosen = {}
     for each in sorted(data, key=lambda each: each.multi_id):
         values = [column for name, column in each.data.items() if not name.startswith(("timestamp", "noutputs"))]
@@ -93,7 +93,7 @@ def _instances(data) -> tuple[dict[str, Any], list[str]]:
 
 
 def _load(path: str | Path) -> tuple[Any, str]:
-    """The log, and how it is damaged; empty if it is not."""
+    """Return the log and a description of any damage."""
     try:
         import pyulog
     except ImportError as error:
@@ -115,7 +115,7 @@ def _load(path: str | Path) -> tuple[Any, str]:
 
 
 def _cut(content: bytes) -> bool:
-    """Whether the last message is incomplete, which pyulog does not say."""
+    """Whether the last message is incomplete, which pyulog does not report."""
     at = 16  # behind the header
     if content[at + 2 : at + 3] == b"B":  # appended data begin anew at an offset, whatever was cut before it
         at = max(at, *struct.unpack("<3Q", content[at + 19 : at + 43]))
@@ -128,7 +128,7 @@ def _cut(content: bytes) -> bool:
 
 
 def _kind(parameters, tables) -> int:
-    """The vehicle as of MAV_TYPE; −1 where the log does not say."""
+    """Return the vehicle's MAV_TYPE; −1 if unknown."""
     kind = _whole(parameters, "MAV_TYPE") or int(tables.get(STATUS, {}).get("system_type", [0])[-1])
     airframe = _whole(parameters, "SYS_AUTOSTART")
     if 13000 <= airframe < 14000 or any(tables.get(STATUS, {}).get("is_vtol", ())):
@@ -137,18 +137,18 @@ def _kind(parameters, tables) -> int:
 
 
 def _whole(parameters, name: str) -> int:
-    """A parameter, 0 where it is no number."""
+    """Return an integer parameter, or 0."""
     given = parameters.get(name, 0)
     return int(given) if isinstance(given, int | float) and np.isfinite(given) else 0
 
 
 def _has(tables, topic: str, fields) -> bool:
-    """Whether a topic has its time and these fields, as far as the log is not damaged."""
+    """Whether a topic has its time and these fields, as far as the log is readable."""
     return {"timestamp", *fields} <= {*tables.get(topic, ())}
 
 
 def _table(tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple[np.ndarray, np.ndarray]:
-    """Ticks [µs] and fields of a topic."""
+    """Return the ticks [µs] and fields of a topic."""
     table = tables[topic]
     # The time of the measurement where it is recorded, else that of the message.
     use_clock = clock in table and table[clock].min(initial=1) > 0
@@ -158,7 +158,7 @@ def _table(tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple
 
 
 def states(tables, notes: list[str]) -> dict[str, Samples]:
-    """The quantities of `SOURCES` in tables of topics: field → array."""
+    """Read the quantities of `SOURCES` from tables of topics: field → array."""
     found = {}
     for quantity, places in SOURCES.items():
         topic, fields = next((place for place in places if _has(tables, *place)), ("", ()))
@@ -171,7 +171,7 @@ def states(tables, notes: list[str]) -> dict[str, Samples]:
 
 
 def _valid(table, quantity: str, ticks, values, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """The samples that the estimator calls valid."""
+    """Return the samples that the estimator marks as valid."""
     known = np.ones(len(ticks), bool)
     for flag in VALID[quantity]:
         known &= table.get(flag, np.ones(len(ticks))) > 0
@@ -185,7 +185,7 @@ def _valid(table, quantity: str, ticks, values, notes: list[str]) -> tuple[np.nd
 
 
 def motors(tables, parameters, expected: int, notes: list[str], simulated: bool = False) -> dict[str, Samples]:
-    """Rotor speeds and commands of all motors that the tables know; `expected` rotors where they tell of none."""
+    """Read rotor speeds and commands of all motors, or of `expected` rotors if their number is unknown."""
     expected, found = _whole(parameters, "CA_ROTOR_COUNT") or expected, {}
     for topic, field in MOTORS.items():
         quantity = "rotor_speed" if topic == "esc_status" else "command"
@@ -215,7 +215,7 @@ def motors(tables, parameters, expected: int, notes: list[str], simulated: bool 
 
 
 def _shares(outputs: np.ndarray, parameters) -> tuple[np.ndarray, str]:
-    """Outputs as shares, and of what: what protocol they are for is told by their range alone."""
+    """Scale outputs to 0 … 1 and describe their unit, which only their range shows."""
     running = outputs[outputs > 0]
     low, full = (_pwm(parameters, end, default) for end, default in (("MIN", IDLE_PWM), ("MAX", FULL_PWM)))
     unit = f"from {low:g} to {full:g} µs"
@@ -229,6 +229,6 @@ def _shares(outputs: np.ndarray, parameters) -> tuple[np.ndarray, str]:
 
 
 def _pwm(parameters, end: str, default: float) -> float:
-    """PWM_MIN or PWM_MAX, in later versions PWM_MAIN_MIN1 …"""
+    """Return PWM_MIN or PWM_MAX, in later versions PWM_MAIN_MIN1 …"""
     given = (_whole(parameters, name) for name in (f"PWM_MAIN_{end}1", f"PWM_MAIN_{end}", f"PWM_{end}"))
     return float(next((value for value in given if value > 0), default))
