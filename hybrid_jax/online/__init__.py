@@ -1,7 +1,4 @@
-"""Adapt while the system runs, one sample at a time.
-
-`OnlineAdaptation` is an extended Kalman filter of the parameters.
-"""
+"""Online adaptation, one sample at a time: `OnlineAdaptation` is an extended Kalman filter of the parameters."""
 
 from hybrid_jax.online.estimator import OnlineAdaptation
 from hybrid_jax.online.hypotheses import Hypothesis

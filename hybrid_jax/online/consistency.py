@@ -1,10 +1,9 @@
-"""Can it be true what a filter says? Its model is used only while it can.
+"""Use a filter's model only while it is consistent with the samples.
 
-- While the mean of the normalised innovations squared (NIS) is far too large, no θ explains the samples (Bar-Shalom,
-  Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4).
-- Alarms that do not end, or a parameter at its bound, are not changes of the vehicle: a sensor has a wrong sign, unit
-  or place. The estimate is then that before these alarms.
-- A filter with a number that is not finite begins anew.
+A large mean of the normalised innovations squared (NIS) means that no θ explains the samples (Bar-Shalom, Li,
+Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4). Persistent alarms, or a
+parameter at its bound, indicate a sensor with a wrong sign, unit or position: the estimate returns to its value before
+the alarms. A filter with a number that is not finite restarts.
 """
 
 import equinox as eqx
@@ -25,7 +24,7 @@ SETTLED = 0.5  # count of alarms below which an estimate is kept
 def believed(
     state: OnlineState, verdict: Verdict, sample: Sample, periods: float, tuning: Tuning
 ) -> dict[str, Float[Array, "..."]]:
-    """The guard's parts of the next state: mean NIS, count of alarms, θ that is used, and that before alarms began."""
+    """Compute the consistency fields of the next state: mean NIS, alarms, and θ in use and before the alarms."""
     share = jnp.sum(verdict.squares) / jnp.maximum(jnp.sum(jnp.where(sample.seen, 1.0, 0.0)), 1.0)
     nis = state.nis + jnp.where(sample.measured, -jnp.expm1(-periods / WINDOW), 0.0) * (share - state.nis)
     at_bound = sample.measured & (jnp.max(jnp.abs(verdict.theta)) >= tuning.bound)
@@ -41,7 +40,7 @@ def believed(
 
 
 def sound(new: OnlineState, begun: OnlineState, old: OnlineState, variances: Float[Array, " d"]) -> OnlineState:
-    """The new state, or if a number is not finite a beginning at the last good θ, as uncertain as the prior."""
+    """Return the new state, or restart at the last good θ and the prior covariance if a number is not finite."""
     root = kalman.diagonal_root(variances, jnp.ones_like(old.theta))
     values = old.trusted, old.trusted, old.settled, root, old.doubt, old.changes, old.restarts + 1
     again = eqx.tree_at(

@@ -1,15 +1,14 @@
-"""Adapt while it runs: extended Kalman filters of state, θ_p and a constant disturbance, one sample at a time.
+"""Extended Kalman filters of state, θ_p and a constant disturbance that adapt while the system runs.
 
-The state of the filter is z = [x, θ]: the state x of the system, which the one-step predictions need without noise,
-and θ, all parameters of the physics and the disturbance.
+The filter state is z = [x, θ]: the state x of the system, because one-step predictions need it without noise, and θ,
+all parameters of the physics and the disturbance.
 
-- A test of the innovations finds a change (`change_test`). An alarm opens the covariance.
-- Forgetting: θ is a slow random walk, and the disturbance, such as a gust, walks faster and faster while it is pulled
-  to one side, until it is no more. Parameters of a vehicle are constant between two changes; they do so only where no
-  disturbance is estimated.
-- Hypotheses: with these, filters of a few parameters compete with that of all (`multiple_model`).
-- Excitation: what samples do not tell stays as it is, with its variance (`excitation`).
-- Consistency: what the filter says is not used while it cannot be true (`consistency`), and the last good estimate is.
+- A test of the innovations detects a change (`change_test`) and an alarm resets the covariance.
+- θ follows a slow random walk. The process noise of the disturbance (of all parameters if there is none) grows while
+  the innovations are biased, for example in a gust.
+- Filters of a few parameters may compete with the filter of all (`multiple_model`).
+- Directions of θ that are not excited keep their value and variance (`excitation`).
+- An inconsistent estimate is replaced by the last good one (`consistency`).
 """
 
 import math
@@ -46,34 +45,34 @@ TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a 
 
 
 class OnlineAdaptation(AbstractEstimator):
-    """Recursive estimator of the parameters of any field, and of a constant disturbance, with their covariance.
+    """Recursive estimator of the parameters of any field and of a constant disturbance, with their covariance.
 
         filter = hj.OnlineAdaptation(field, dt=0.01, noise=0.02, disturbance=1.0)
         state = filter.begin(x)
         state = filter.update(state, x, u)  # at each sample; then filter.model(state), filter.intervals(state)
 
-    Pure: its methods compile and map over stacked states. They refuse samples of another shape; numbers that are bad
-    raise nothing, see `flags`.
+    All methods are pure: you can compile them and map them over stacked states. A sample of another shape raises
+    ValueError; invalid numbers do not, see `flags`.
 
     Attributes:
-        field: its physics is adapted from the values that it has; a network beside it stays as it is.
+        field: the model; its physics is adapted from its present values, its network is not changed.
         dt: time between two samples [s].
-        noise: standard deviation of what is measured of each state.
+        noise: standard deviation of the measurement of each state.
         prior: standard deviation of each parameter before and after a change, in the physics' own parametrisation (for
-            a rigid body: logarithms), one number for all or by name: of one entry, efficiency[0], or of all of an
-            array, efficiency. Zero holds a parameter.
+            a rigid body: logarithms), one number for all or by name: efficiency[0] is one
+            entry, efficiency a whole array. Zero keeps a parameter constant.
         disturbance: standard deviation of the constant part of ẋ at each disturbed state; 0 for none.
-        indices: of the disturbed states; by default those that the field has, or that its state space says.
-        process: standard deviation of what the model leaves out of ẋ, as white noise, of each state [1/√s].
-        initial: share of the prior that is uncertain at the start, before a change.
-        hypotheses: of which one may hold at a time, each on a change of a few parameters, found by how well it
-            explains the samples. With hypotheses the model stays the field's own until a change is found.
-        tuning: how fast it forgets, and what it calls a change.
-        names: of the parameters, in the order of θ.
+        indices: indices of the disturbed states, by default the field's or its state space's.
+        process: standard deviation of the white process noise of each state [1/√s].
+        initial: initial uncertainty as a share of the prior, before a change.
+        hypotheses: mutually exclusive changes of a few parameters, weighted by how well they explain the samples. The
+            model stays the field's own until a change is detected.
+        tuning: settings of forgetting and change detection.
+        names: names of the parameters, in the order of θ.
         scales: the prior standard deviation of each, in that order.
 
     Raises:
-        ValueError: a number out of range, an unknown name, or physics without parameters.
+        ValueError: a number is out of range, a name unknown, or the physics has no parameters.
     """
 
     field: AbstractVectorField
@@ -123,7 +122,7 @@ class OnlineAdaptation(AbstractEstimator):
 
     @entry
     def begin(self, x: Float[Array, " d"]) -> OnlineState:
-        """Before the first sample x, at the field's own parameters."""
+        """Return the state before the first sample x, at the field's own parameters."""
         x, indices = jnp.asarray(x, float), getattr(disturbance_of(self.field), "indices", None)
         if x.ndim != 1:
             raise ValueError(f"x must be one sample (d,), got shape {x.shape}")
@@ -163,14 +162,13 @@ class OnlineAdaptation(AbstractEstimator):
         elapsed: Float[Array, ""] | float = 1.0,
         each: Each = jax.vmap,
     ) -> OnlineState:
-        """After one period.
+        """Update the state after one period.
 
         Args:
             x: the new sample; NaN where nothing was measured.
-            u: the mean input over the period, as it acted: delayed and lagged, not as it was commanded.
-            elapsed: periods since the last update. Over more than one nothing is learned of the input, and the state is
-                taken from the sample.
-            each: turns a function of the filter of one hypothesis into one of arrays of all.
+            u: the mean applied input over the period (after latency and rotor lag), not the command.
+            elapsed: periods since the last update. After more than one, the state is reset to the sample.
+            each: maps a function over the filters of all hypotheses, for example `jax.vmap`.
         """
         checks.not_negative("elapsed", elapsed)
         x, u = jnp.asarray(x, state.x.dtype), jnp.asarray(u, state.x.dtype)
@@ -208,10 +206,10 @@ class OnlineAdaptation(AbstractEstimator):
 
     @entry
     def estimate(self, state: OnlineState) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
-        """The last good θ as a change of the field's own, and its covariance, in the physics' own parametrisation.
+        """Return the last good change of θ and its covariance, in the physics' own parametrisation.
 
         Args:
-            state: of the filter, as `begin` and `update` return it.
+            state: the filter's state from `begin` or `update`.
         """
         scales, d = jnp.asarray(self.scales, state.x.dtype), len(state.x)
         covariance = state.covariance[d:, d:]
@@ -221,26 +219,26 @@ class OnlineAdaptation(AbstractEstimator):
 
     @entry
     def model(self, state: OnlineState) -> AbstractVectorField:
-        """The field at the last good estimate, with its disturbance."""
+        """Return the field at the last good estimate, with its disturbance."""
         theta, unravel = ravel_parameters(self.field)
         return unravel((theta + jnp.asarray(self.scales, theta.dtype) * state.trusted).astype(theta.dtype))
 
     @entry
     def intervals(self, state: OnlineState, level: float = 0.95) -> dict[str, Interval]:
-        """Parameters and disturbance with their intervals, in physical units; see `hybrid_jax.intervals`.
+        """Return parameters and disturbance with their intervals in physical units; see `hybrid_jax.intervals`.
 
         Args:
-            state: of the filter, as `begin` and `update` return it.
-            level: probability that an interval holds the value, between 0 and 1.
+            state: the filter's state from `begin` or `update`.
+            level: probability that an interval contains the value, between 0 and 1.
         """
         return intervals(self.model(state), self.estimate(state)[1], level)
 
     @entry
     def flags(self, state: OnlineState) -> Flags:
-        """What is wrong with samples, parameters and model, or was found.
+        """Report problems with samples, parameters and model, and detected changes.
 
         Args:
-            state: of the filter, or states of several, stacked along leading axes.
+            state: the filter's state, or several, stacked along leading axes.
         """
         return flags_of(state, self.tuning)
 
@@ -255,7 +253,6 @@ class OnlineAdaptation(AbstractEstimator):
         return model_set(self.hypotheses, len(self.names), self.dt)
 
     def _filter_model(self, sample: Sample, each: Each) -> FilterModel:
-        """With ẋ as a function of x and θ."""
         x, (start, unravel) = sample.x, ravel_parameters(self.field)
 
         def rates(x, theta):
@@ -269,7 +266,7 @@ class OnlineAdaptation(AbstractEstimator):
     def _filtered(
         self, state: OnlineState, model: FilterModel, sample: Sample
     ) -> tuple[Belief, Excitation, Correction, Array]:
-        """The filter of all parameters, which moves what the samples tell; what that is, and the gains of θ."""
+        """Update the filter of all parameters along excited directions; also return excitation and gains of θ."""
         d, tuning, ones = len(state.x), self.tuning, jnp.ones_like(state.theta)
         walk = tuning.drift * jnp.exp(state.haste)
         diffusion = self.dt / tuning.pace * sample.elapsed * jnp.square(walk)
@@ -288,7 +285,7 @@ class OnlineAdaptation(AbstractEstimator):
         return kalman.triangular(belief, d), told, correction, gains
 
     def _haste(self, state: OnlineState, sample: Sample, opens: Bool[Array, ""]) -> Float[Array, " p"]:
-        """How much faster parameters walk: disturbances, or all if there is none, while they are pulled to one side."""
+        """Update the log-scale of the random walk: of disturbances, or of all parameters without one."""
         varies, tuning = self._varies(), self.tuning
         pulled = state.test.pulled / EAGER - 1
         rise = jnp.where(pulled > 0, RISE * jnp.minimum(pulled, 4.0), -FALL)

@@ -1,13 +1,11 @@
-"""Which directions of θ do the samples tell? Only along these does a filter move θ and become more certain.
+"""Move θ, and shrink its covariance, only along directions that the samples excite.
 
-In hover a thrust coefficient cannot be told from a disturbance along z but by what the controller does about noise.
-Noise that the filter takes for motion is then correlated with the input, and in time it is sure of a wrong value, by a
-bias of about 0.04 / √I of the prior, where I is the information of a sample on that direction, in units of the prior.
-So a direction with little information is not estimated but considered: it stays, with its variance, and so does what
-it adds to the uncertainty of all others (Schmidt, "Application of state-space methods to navigation problems", 1966).
-
-The information is that of the innovations, by their sensitivity to θ, as of the filter of a bias in two stages
-(Friedland, "Treatment of bias in recursive filtering", 1969).
+In hover, a thrust coefficient and a disturbance along z are distinguishable only by the controller's response to noise.
+That noise is correlated with the input, so the filter becomes certain of a wrong value, with a bias of about 0.04 / √I
+of the prior, where I is the information of a sample in units of the prior. Directions with little information are
+therefore considered, not estimated: they keep their value and variance, and add to the uncertainty of the others
+(Schmidt, "Application of state-space methods to navigation problems", 1966). The information is computed from the
+innovations' sensitivity to θ (Friedland, "Treatment of bias in recursive filtering", 1969).
 """
 
 import equinox as eqx
@@ -24,12 +22,12 @@ TAKES_PART = 0.1  # share from which a parameter is part of what samples do not 
 
 
 class Excitation(eqx.Module):
-    """What samples of late tell of p parameters.
+    """Information of recent samples about p parameters.
 
     Attributes:
-        sensitivity: of the error of the estimated x to that of θ.
-        root: a square root of the matrix that has, in place of each eigenvalue I of the information of a sample,
-            1 / (1 + I / `Tuning.excitation`); each parameter over its share.
+        sensitivity: sensitivity of the error of the estimated x to the error of θ.
+        root: a square root of the matrix with 1 / (1 + I / `Tuning.excitation`) instead of each eigenvalue I of the
+            information of a sample; each parameter over its share.
     """
 
     sensitivity: Float[Array, "*n d p"]
@@ -37,11 +35,11 @@ class Excitation(eqx.Module):
 
     @classmethod
     def begin(cls, d: int, p: int, dtype) -> "Excitation":
-        """Before the first sample, which has told nothing."""
+        """Initialise before the first sample, without information."""
         return cls(jnp.zeros((d, p), dtype), jnp.eye(p, dtype=dtype))
 
     def considered(self) -> Float[Array, "*n p p"]:
-        """The projection on the directions that samples do not tell."""
+        """The projection on the directions that are not excited."""
         found = self.root @ self.root.mT
         for _ in range(SHARPER):
             twice = found @ found
@@ -59,13 +57,7 @@ def after_sample(
     periods: float,
     tuning: Tuning,
 ) -> Excitation:
-    """After a period with this Jacobian, and the sample at its end.
-
-    Args:
-        walk: of each parameter, its deviation after a second; what walks, as in gusts, hides what others do.
-        share: of each, how willingly it takes what a sum of parameters explains.
-        periods: length of one, over the pace [s].
-    """
+    """Update after a sample; `walk` is the random walk [1/√s] and `share` the weight of each parameter."""
     d, root = len(sample.x), excitation.root
     sensitivity = jnp.where(sample.restart, 0.0, slope[:, :d] @ excitation.sensitivity + slope[:, d:])
     sensitivity = jnp.where(sample.acted | sample.restart, sensitivity, excitation.sensitivity)
@@ -85,7 +77,7 @@ def after_sample(
 def consider(
     before: Belief, after: Belief, correction: Correction, told: Excitation, share: Float[Array, " p"]
 ) -> tuple[Belief, Float[Array, "d p"]]:
-    """What a sample corrected, but with θ where it was along what is considered; and the gains of θ."""
+    """Undo the correction of θ along considered directions; also return the gains of θ."""
     d, considered = len(correction.white), told.considered() * share[:, None] / share
     gains = correction.gains[:, d:]
     held = gains @ considered.T

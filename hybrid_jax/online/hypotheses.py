@@ -1,4 +1,4 @@
-"""Hypotheses on a change: its few parameters, as a user names them and as the filters of `multiple_model` have them."""
+"""Hypotheses on a change of a few parameters, as the user defines them and as `multiple_model` uses them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,23 +12,23 @@ from hybrid_jax import checks
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A few parameters that may change together, such as those of a load.
+    """A few parameters that may change together, for example with a load.
 
         Hypothesis("inertia", {"Ix": 0.3, "Iy": 0.3})
         Hypothesis("mass", together=({"efficiency": -0.2, "Ix": -0.2, "Iy": -0.2},))
         Hypothesis("wind", {"disturbance[vx]": 3.0, "disturbance[vy]": 3.0}, rates={"disturbance[vx]": 1.5}, lead=0.1)
 
     Attributes:
-        name: of the hypothesis, in messages.
-        parameters: standard deviation of the change of each, independent of the others, in the physics' own
-            parametrisation; by name, of one entry, efficiency[0], or of all of an array, efficiency.
-        together: each a number of standard deviation one, times which several parameters change, such as a mass.
-        rates: standard deviation of the rate at which a parameter of `parameters` goes on changing [1/s]. The rate is
-            a random walk, which moves by as much in half a second.
-        lead: how far ahead the delivered model has those parameters [s].
+        name: name of the hypothesis in messages.
+        parameters: standard deviation of the independent change of each parameter, in the physics' own
+            parametrisation, by name: efficiency[0] is one entry, efficiency a whole array.
+        together: shared factors (unit variance) that scale several parameters, for example a mass.
+        rates: standard deviation of the rate of change of a parameter in `parameters` [1/s]. The rate is a random walk
+            that moves by as much in half a second.
+        lead: how far ahead those parameters are extrapolated in the model [s].
 
     Raises:
-        ValueError: no parameter, a deviation or a lead out of range, or a rate of a parameter that it does not have.
+        ValueError: there is no parameter, a number is out of range, or a rate's parameter is not in `parameters`.
     """
 
     name: str
@@ -50,13 +50,13 @@ class Hypothesis:
 
 
 class Subspace(NamedTuple):
-    """A hypothesis in the order of θ, of p parameters in their prior standard deviations: numbers a of which θ = S a.
+    """A hypothesis of numbers a with θ = S a, in prior standard deviations of p parameters.
 
     Attributes:
         effects: the k rows of Sᵀ.
-        own: of each parameter, whether a number moves it alone.
-        rates: of each number, the deviation of its rate over its own [1/s]; 0 for none.
-        lead: how far ahead the delivered model is [s].
+        own: whether each parameter has its own number.
+        rates: standard deviation of each number's rate over the number's [1/s]; 0 for none.
+        lead: how far ahead the model is extrapolated [s].
     """
 
     effects: tuple[tuple[float, ...], ...]
@@ -66,15 +66,15 @@ class Subspace(NamedTuple):
 
 
 class ModelSet(NamedTuple):
-    """h hypotheses of as many numbers each: the parameters are the field's own, then those of the user.
+    """h hypotheses with equally many numbers each: first the field's own parameters, then the user's hypotheses.
 
     Attributes:
         effects: S.
-        ahead: S of the delivered model, which knows rates.
-        transition: the numbers of the next period by those of this.
-        prior: variances after a change; 0 for numbers that only fill up.
+        ahead: S of the extrapolated model, including rates.
+        transition: state transition of the numbers over one period.
+        prior: variances after a change; 0 for padding.
         diffusion: variance of rates [1/s].
-        outside: 1 for parameters that have no number of their own, else 0.
+        outside: 1 for parameters without their own number, else 0.
     """
 
     effects: Float[np.ndarray, "h p k"]
@@ -86,11 +86,7 @@ class ModelSet(NamedTuple):
 
 
 def subspace_of(hypothesis: Hypothesis, names: tuple[str, ...], scales: tuple[float, ...]) -> Subspace:
-    """The hypothesis among parameters of these names and prior standard deviations.
-
-    Raises:
-        ValueError: a name that is unknown, or of a parameter that is held, with a prior of zero.
-    """
+    """Express a hypothesis in the order of θ; raise ValueError for an unknown or constant parameter."""
     known = [name for name, scale in zip(names, scales, strict=True) if scale]
 
     def places(name: str) -> list[int]:
@@ -110,7 +106,7 @@ def subspace_of(hypothesis: Hypothesis, names: tuple[str, ...], scales: tuple[fl
 
 
 def model_set(hypotheses: tuple[Subspace, ...], p: int, dt: float) -> ModelSet:
-    """Arrays of all hypotheses, filled up with numbers that move nothing."""
+    """Stack all hypotheses in arrays, padded with numbers without effect."""
     sizes = [len(hypothesis.effects) + int(np.count_nonzero(hypothesis.rates)) for hypothesis in hypotheses]
     h, k = len(hypotheses) + 1, max(sizes)
     effects, prior, diffusion = np.zeros((h, p, k)), np.zeros((h, k)), np.zeros((h, k))

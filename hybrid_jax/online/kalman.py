@@ -1,8 +1,8 @@
 """Steps of an extended Kalman filter of z = [x, a]: the state of a system, and numbers a that move its parameters.
 
-Samples enter one number after the other, so that an update needs no matrix inverse, and a covariance is kept by a
-square root (Potter's method; Bierman, "Factorization methods for discrete sequential estimation", 1977, ch. II). All
-functions are pure and map over filters of one size.
+Measurements are processed sequentially without a matrix inverse, and covariances are stored as square roots (Potter's
+method; Bierman, "Factorization methods for discrete sequential estimation", 1977, ch. II). All functions are pure and
+map over filters of one size.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ Field = Callable[[Array, Array], Array]  # ẋ as a function of x and a
 
 
 class Belief(NamedTuple):
-    """Mean of z, and a square root of its covariance, which rounding cannot make negative.
+    """Mean of z and a square root of its covariance, which therefore stays positive semidefinite.
 
     Attributes:
         z: the mean.
@@ -33,21 +33,20 @@ class Belief(NamedTuple):
 
     @property
     def covariance(self) -> Float[Array, "n n"]:
-        """Of z."""
         return self.root @ self.root.T
 
 
 class FilterModel(NamedTuple):
-    """What all filters have in common in a period.
+    """The model and settings that all filters share in a period.
 
     Attributes:
         field: ẋ as a function of x and θ, under the input of the period.
-        unit: the state x as it is usually given, such as with a unit quaternion; see `StateSpace.normalise`.
-        variances: of a sample.
-        process_noise: variance that a period adds to x.
+        unit: normalises x, for example its quaternion; see `StateSpace.normalise`.
+        variances: measurement variances.
+        process_noise: process noise variance of x per period.
         dt: length of a period [s].
-        tuning: of the filters.
-        each: turns a function of one filter into one of arrays of several.
+        tuning: settings of the filters.
+        each: maps a function over several filters.
     """
 
     field: Field
@@ -59,19 +58,19 @@ class FilterModel(NamedTuple):
     each: Each
 
     def tidy(self, belief: Belief) -> Belief:
-        """With a unit quaternion, and a within its bounds."""
+        """Normalise the quaternion and clip a to its bounds."""
         z, d, bound = belief.z, len(self.variances), self.tuning.bound
         return Belief(jnp.concatenate([self.unit(z[:d]), jnp.clip(z[d:], -bound, bound)]), belief.root)
 
 
 class Correction(NamedTuple):
-    """What a sample did.
+    """The correction of the filter by a sample.
 
     Attributes:
         white: innovations over their standard deviations.
-        sizes: these standard deviations.
-        gains: of z by these.
-        log_likelihood: of the sample, but for a constant.
+        sizes: standard deviations of the innovations.
+        gains: gains of z for the whitened innovations.
+        log_likelihood: log-likelihood of the sample up to a constant.
     """
 
     white: Float[Array, " d"]
@@ -83,7 +82,7 @@ class Correction(NamedTuple):
 def step_with_jacobian(
     model: FilterModel, field: Field, x: Float[Array, " d"], a: Float[Array, " k"]
 ) -> tuple[Array, Array]:
-    """The next x by RK4, and its Jacobian in x and a, which one Jacobian of ẋ midway gives up to O(dt³)."""
+    """Compute the next x by RK4 and its Jacobian in x and a, to O(dt³) from one Jacobian of ẋ at the midpoint."""
     moved = model.unit(rk4_step(field, x, a, model.dt))
     push = jax.linearize(field, (x + moved) / 2, a)[1]
     d, eye = len(x), jnp.eye(len(x) + len(a), dtype=x.dtype)
@@ -100,13 +99,7 @@ def predict(
     diffusion: Float[Array, " k"],
     acted: Bool[Array, ""],
 ) -> tuple[Belief, Float[Array, "d n"]]:
-    """One period later, if a known input acted in it, and the Jacobian of the next x.
-
-    Args:
-        field: ẋ as a function of x and a.
-        transition: the next a as a matrix times a; None if it stays.
-        diffusion: variance that the period adds to a.
-    """
+    """Predict one period if a known input was applied; also return the Jacobian of the next x."""
     z, root = belief
     d = len(model.variances)
     moved, slope = step_with_jacobian(model, field, z[:d], z[d:])
@@ -123,7 +116,7 @@ def predict(
 def reset_state(
     belief: Belief, sample: Sample, restart: Bool[Array, ""] | bool, variances: Float[Array, " d"]
 ) -> Belief:
-    """With x as the sample has it, if `restart`; a stays. The belief is triangular, or predicted from such a one."""
+    """Reset x to the sample if `restart`; keep a. The belief is triangular, or predicted from a triangular one."""
     z, root = belief
     d, k = len(variances), len(z) - len(variances)
     fresh = jnp.diag(jnp.sqrt(jnp.where(sample.seen, variances, 1e4 * variances)))
@@ -133,7 +126,7 @@ def reset_state(
 
 
 def triangular(belief: Belief, d: int) -> Belief:
-    """With a root of as many columns as rows, first a triangle for a, by the modified Gram-Schmidt method."""
+    """Make the root square, triangular for a first, by the modified Gram-Schmidt method."""
     rows, columns = jnp.concatenate([belief.root[d:], belief.root[:d]]), []
     for i in range(len(rows)):
         size = jnp.sqrt(jnp.sum(jnp.square(rows[0])))
@@ -147,7 +140,7 @@ def triangular(belief: Belief, d: int) -> Belief:
 
 
 def correct(belief: Belief, sample: Sample, model: FilterModel) -> tuple[Belief, Correction]:
-    """With one measured number after the other; innovations are cut off at some standard deviations."""
+    """Process each measured number of a sample; innovations are clipped."""
     (z, root), variances, clip = belief, model.variances, model.tuning.clip
     white, sizes, gains, likelihood = [], [], [], jnp.zeros((), z.dtype)
     for i, noise in enumerate(variances):
@@ -168,7 +161,7 @@ def correct(belief: Belief, sample: Sample, model: FilterModel) -> tuple[Belief,
 
 
 def limit_covariance(belief: Belief, prior: Float[Array, " k"]) -> Belief:
-    """No number a becomes less certain than the prior, also if nothing excites it for long."""
+    """Limit the variance of each number a to its prior."""
     z, root = belief
     d = len(z) - len(prior)
     variance, most = jnp.sum(jnp.square(root[d:]), axis=1), jnp.where(prior > 0, prior, 1.0)
@@ -177,6 +170,6 @@ def limit_covariance(belief: Belief, prior: Float[Array, " k"]) -> Belief:
 
 
 def diagonal_root(x: Float[Array, " d"], a: Float[Array, " k"]) -> Float[Array, "n n"]:
-    """A square root, as `triangular` makes one, of independent numbers of these variances."""
+    """Return the `triangular` square root of a diagonal covariance with these variances."""
     own, state = jnp.diag(jnp.sqrt(a)), jnp.diag(jnp.sqrt(x))
     return jnp.concatenate([jnp.pad(state, ((0, 0), (len(a), 0))), jnp.pad(own, ((0, 0), (0, len(x))))])

@@ -1,18 +1,14 @@
-"""Which hypothesis explains the samples? A filter for each, weighed by the likelihood of its innovations.
+"""A filter for each hypothesis, weighted by the likelihood of its innovations.
 
-A change is mostly one of few parameters: those of a load, or the efficiency of one rotor. A filter of these alone knows
-them after a few samples, where a filter of all parameters has to tell them from each other first. Which one it was, the
-samples say: each filter predicts them, and Bayes' rule weighs the filters by how likely they were, as in the static
+Most changes affect few parameters: a load, or the efficiency of one rotor. A filter of these converges after a few
+samples, before a filter of all parameters can distinguish them. Bayes' rule weights the filters, as in the static
 multiple-model estimator (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001,
-ch. 11.6). The estimate is that of their mixture. The hypotheses are, in this order:
+ch. 11.6), and the estimate is the mixture's mean. The hypotheses are, in this order: no change since before the last
+alarm; the field's own parameters; each hypothesis of the user; any change (the filter of all parameters, which is
+stored elsewhere).
 
-- it is as it was before the last alarm,
-- the parameters are the field's own,
-- what one of the hypotheses of the user says has changed,
-- anything has changed: the filter of all parameters, which lies elsewhere.
-
-At the start the first is certain, so that the estimate stays as it is until a change is found. An alarm opens each
-hypothesis to its prior. Weights have a lower bound, so that a hypothesis may come back without an alarm.
+At the start, the first has weight one. An alarm resets each hypothesis to its prior. Weights have a lower bound, so
+that a hypothesis can recover without an alarm.
 """
 
 from typing import NamedTuple
@@ -36,13 +32,13 @@ LEAST = 1e-3  # weight, relative to the largest, up to which one is left out of 
 
 
 class Mixture(eqx.Module):
-    """The state of h hypotheses of as many numbers each, and the weight of one more; θ in prior standard deviations.
+    """Filters of h hypotheses with equally many numbers, and h + 1 weights; θ in prior standard deviations.
 
     Attributes:
-        z: of each, x and the numbers that move θ.
-        root: of each, a square root of the covariance of z.
-        previous: 1 for the one of the others that the first was before the last alarm, else 0.
-        log_weights: logarithms of the weights, the largest 0; the last is that of the filter of all parameters.
+        z: x and the numbers that move θ, for each hypothesis.
+        root: a square root of the covariance of each z.
+        previous: 1 for the hypothesis that the first one was before the last alarm, else 0.
+        log_weights: logarithms of the weights, the largest 0; the last belongs to the filter of all parameters.
         test: the change test of the estimate.
     """
 
@@ -54,14 +50,14 @@ class Mixture(eqx.Module):
 
 
 class Verdict(NamedTuple):
-    """What the hypotheses say after a sample.
+    """The result of all hypotheses after a sample.
 
     Attributes:
         mixture: their filters and weights; None without hypotheses.
         theta: the mean of the mixture.
-        squares: of its innovations over their standard deviations.
+        squares: mean square of the mixture's white innovations.
         changed: whether θ has changed.
-        unexplained: and no hypothesis says how, so that the filter of all parameters is to open.
+        unexplained: θ has changed but no hypothesis explains it, so the filter of all parameters is reset.
     """
 
     mixture: Mixture | None
@@ -72,7 +68,7 @@ class Verdict(NamedTuple):
 
 
 def initial(models: ModelSet, x: Float[Array, " d"], variances: Float[Array, " d"]) -> Mixture:
-    """Before the first sample x."""
+    """Initialise before the first sample x."""
     h, p, k = models.effects.shape
     none = jnp.zeros(k, x.dtype)
     z = jnp.tile(jnp.concatenate([x, none]), (h + 1, 1))
@@ -83,23 +79,22 @@ def initial(models: ModelSet, x: Float[Array, " d"], variances: Float[Array, " d
 
 
 def weights(mixture: Mixture) -> Float[Array, " h+1"]:
-    """Of the hypotheses; exactly zero for one that has less than LEAST of the largest."""
+    """Posterior weights; those below LEAST × max are set to zero."""
     found = jnp.maximum(jnp.exp(mixture.log_weights) - LEAST, 0.0)
     return found / jnp.sum(found)
 
 
 def with_previous(mixture: Mixture, own: Float[Array | np.ndarray, "h-1 ..."]) -> Float[Array, "h ..."]:
-    """Arrays of the models with those of the first hypothesis, which is one of the others as it was."""
+    """Prepend the entry of the first hypothesis, which is one of the others before the last alarm."""
     own = jnp.asarray(own, mixture.z.dtype)
     before = mixture.previous.reshape(-1, *(1,) * (own.ndim - 1))
     return jnp.concatenate([jnp.sum(before * own, axis=0, keepdims=True), own])
 
 
 def covariance(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "p p"]:
-    """Of θ in the mixture: that within its parts, and of these around the mean.
+    """Covariance of θ: within the mixture's components and between their means.
 
-    A parameter for which a hypothesis has no number of its own may have changed by as much as the samples would not
-    tell: its variance is that in the filter of all parameters.
+    A parameter without its own number in a hypothesis has the variance of the filter of all parameters.
     """
     share, means = weights(mixture), _means(mixture, models, joint)
     effects = with_previous(mixture, models.ahead)
@@ -113,7 +108,7 @@ def covariance(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array
 
 
 def _means(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "h+1 p"]:
-    """θ of each hypothesis, as far ahead as it says."""
+    """θ of each hypothesis, extrapolated by its lead."""
     effects = with_previous(mixture, models.ahead)
     d = len(joint.z) - effects.shape[1]
     return jnp.concatenate([jnp.sum(effects * mixture.z[:, None, d:], axis=2), joint.z[None, d:]])
@@ -128,7 +123,7 @@ def update(
     correction: Correction,
     gains: Float[Array, "d p"],
 ) -> Verdict:
-    """After a sample, with the filter of all parameters as that sample corrected it, and the gains of its θ."""
+    """Process a sample, given the filter of all parameters after its correction and the gains of its θ."""
     shares, periods = weights(mixture), model.dt / model.tuning.pace
     mixture, white, likelihoods = filtered(mixture, models, model, sample)
     white = jnp.concatenate([white, correction.white[None]])
@@ -151,7 +146,7 @@ def update(
 def filtered(
     mixture: Mixture, models: ModelSet, model: FilterModel, sample: Sample
 ) -> tuple[Mixture, Float[Array, "h d"], Float[Array, " h"]]:
-    """After a sample, in which all hypotheses learn; and of each the white innovations and their likelihood."""
+    """Update all hypotheses; also return their white innovations and log-likelihoods."""
     prior = with_previous(mixture, models.prior)
     drift = model.tuning.drift**2 / model.tuning.pace * prior
     diffusion = model.dt * sample.elapsed * (with_previous(mixture, models.diffusion) + drift)
@@ -173,7 +168,7 @@ def filtered(
 def reinitialised(
     mixture: Mixture, models: ModelSet, model: FilterModel, sample: Sample, alarm: Bool[Array, ""]
 ) -> Mixture:
-    """After an alarm: each hypothesis anew at its prior, and the likeliest hypothesis as it is beside them."""
+    """After an alarm, reset each hypothesis to its prior and keep the likeliest one beside them."""
     d, h = len(sample.x), len(mixture.z)
     likeliest = jnp.where(mixture.log_weights == 0, 1.0, 0.0)
     likeliest = likeliest / jnp.sum(likeliest)

@@ -1,4 +1,4 @@
-"""Samples of a state, of which some numbers may be missing or frozen."""
+"""Samples of a state with missing or frozen numbers."""
 
 from typing import NamedTuple
 
@@ -9,14 +9,14 @@ HUGE = 1e15  # a number beyond it, or NaN, was not measured
 
 
 class Sample(NamedTuple):
-    """What was measured at the end of a period, and what acted in it.
+    """A measurement at the end of a period and the input over the period.
 
     Attributes:
         x: the sample.
         u: the input; zero where it is unknown.
-        seen: what was measured.
-        acted: whether one period has passed, with a known input.
-        restart: whether the state is taken from the sample.
+        seen: whether each number was measured.
+        acted: whether exactly one period has passed with a known input.
+        restart: whether the state is reset to the sample.
         elapsed: periods since the last sample.
     """
 
@@ -29,22 +29,22 @@ class Sample(NamedTuple):
 
     @property
     def used(self) -> Bool[Array, " d"]:
-        """What corrects the estimate."""
+        """Whether each number corrects the estimate."""
         return self.seen & ~self.restart
 
     @property
     def measured(self) -> Bool[Array, ""]:
-        """Whether anything does; a sum in place of `any`, which the export to C does not know."""
+        """Whether any number does; a sum, because the export to C does not support `any`."""
         return jnp.sum(jnp.where(self.used, 1.0, 0.0)) > 0
 
 
 class SampleHistory(NamedTuple):
-    """What samples were like until now.
+    """Statistics of the past samples.
 
     Attributes:
-        last: the last sample; of a number that was not measured, the last that was.
-        equal: how many samples in a row were equal.
-        silent: time since something was measured [s].
+        last: the last measured value of each number.
+        equal: number of equal samples in a row.
+        silent: time since the last measurement [s].
         unseen: 1 where the last sample was not used, else 0.
     """
 
@@ -55,7 +55,7 @@ class SampleHistory(NamedTuple):
 
 
 def classify(x, u, elapsed, history: SampleHistory, dt: float, gap: float) -> tuple[Sample, SampleHistory]:
-    """The sample x after some periods of dt [s], and what they were like; after a gap [s] it begins restart."""
+    """Classify the sample x after some periods of dt [s]; after a `gap` [s] the state restarts from it."""
     equal = jnp.where(x == history.last, history.equal + 1, 0.0)
     seen = (jnp.abs(x) < HUGE) & (equal == 0)
     # Sums in place of `all` and `any`, which the export to C does not know.

@@ -1,4 +1,4 @@
-"""What an `OnlineAdaptation` carries from sample to sample, and what its parameters are called."""
+"""The state that an `OnlineAdaptation` carries between samples, and the names of its parameters."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -25,23 +25,23 @@ Numbers = float | tuple[float, ...] | np.ndarray
 
 
 class OnlineState(eqx.Module):
-    """State of an `OnlineAdaptation` of d states and p parameters; all of it numbers, which a C program can hold.
+    """State of an `OnlineAdaptation` of d states and p parameters, all numbers, so that it can be exported to C.
 
     Attributes:
         x: estimated state.
-        theta: change of θ in prior standard deviations, as the filter of all parameters has it.
+        theta: change of θ in prior standard deviations, from the filter of all parameters.
         root: a square root of the covariance of both, in these units.
-        excitation: what samples of late tell of θ.
+        excitation: information of recent samples about θ.
         test: the change test of the filter of all parameters.
         mixture: the filters of the hypotheses and their weights; None without hypotheses.
-        trusted: the last θ that was consistent, which the model has.
-        settled: the last of these before alarms began, to which it returns if they do not end.
-        doubt: count of alarms of late.
-        haste: logarithm of how much faster each parameter walks than `Tuning.drift`, as a disturbance does in gusts.
-        nis: mean normalised innovation squared, 1 if noise and model are as stated.
-        history: what samples were like until now.
-        changes: how many alarms there were.
-        restarts: how often the filter had to begin anew, since a number was not finite.
+        trusted: the last consistent θ, which the model uses.
+        settled: the last of these before alarms began, restored if they persist.
+        doubt: number of recent alarms.
+        haste: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.
+        nis: mean normalised innovation squared, 1 if noise and model are correct.
+        history: statistics of the past samples.
+        changes: number of alarms.
+        restarts: number of restarts after a number that was not finite.
     """
 
     x: Float[Array, "*n d"]
@@ -61,26 +61,26 @@ class OnlineState(eqx.Module):
 
     @property
     def joint(self) -> Belief:
-        """z = [x, θ] of the filter of all parameters."""
+        """Belief of z = [x, θ] of the filter of all parameters."""
         return Belief(jnp.concatenate([self.x, self.theta]), self.root)
 
     @property
     def covariance(self) -> Float[Array, "*n d+p d+p"]:
-        """Of x and θ, in the units of `theta`."""
+        """Covariance of x and θ, in the units of `theta`."""
         return self.root @ self.root.mT
 
 
 class Flags(NamedTuple):
-    """What is wrong, or was found.
+    """Problems and changes detected by the filter.
 
     Attributes:
-        missing: of each state, not measured in the last sample: NaN, or equal to the one before.
-        frozen: of each state, a sensor that repeats its last value.
+        missing: states not measured in the last sample: NaN, or equal to the previous value.
+        frozen: states whose sensor repeats its last value.
         gap: nothing was measured for longer than `Tuning.gap`.
         changed: an alarm in the last second.
-        inconsistent: errors are too large for the model at any θ, or alarms do not end, as with a sensor of wrong sign,
-            unit or place: the last good estimate is used.
-        unexcited: parameters that samples of late do not tell, by themselves or in a sum with others.
+        inconsistent: errors are too large for the model at any θ, or alarms persist, for example because a sensor has a
+            wrong sign, unit or position: the last good estimate is used.
+        unexcited: parameters that recent samples do not excite, separately or in combination with others.
         at_bound: parameters at the end of their range.
     """
 
@@ -94,7 +94,7 @@ class Flags(NamedTuple):
 
 
 def flags_of(state: OnlineState, tuning: Tuning) -> Flags:
-    """What is wrong with samples, parameters and model in a state, or in stacked ones, or was found."""
+    """Evaluate the flags of a state or of stacked states."""
     considered, test = state.excitation.considered(), state.test if state.mixture is None else state.mixture.test
     return Flags(
         missing=state.history.unseen > 0,
@@ -110,7 +110,7 @@ def flags_of(state: OnlineState, tuning: Tuning) -> Flags:
 def named_priors(
     field: AbstractVectorField, prior: float | Mapping[str, float], disturbance: Numbers
 ) -> tuple[tuple[str, ...], tuple[float, ...]]:
-    """Name and prior standard deviation of each parameter of the physics, in the order of the vector of all."""
+    """Return the name and prior standard deviation of each parameter in the order of θ."""
     names = _names(field)
     groups = [name.partition("[")[0] for name in names]
     own = prior if isinstance(prior, Mapping) else dict.fromkeys(groups, prior)
@@ -133,7 +133,7 @@ def named_priors(
 
 
 def _names(field: AbstractVectorField) -> tuple[str, ...]:
-    """The name of each parameter; the field may be traced."""
+    """Name each parameter; the field may be traced."""
     with jax.ensure_compile_time_eval():
         like = jax.tree.map(lambda a: jnp.zeros(a.shape, jnp.result_type(a)) if eqx.is_inexact_array(a) else a, field)
         theta, unravel = ravel_parameters(like)

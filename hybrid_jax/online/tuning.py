@@ -1,4 +1,4 @@
-"""How an `OnlineAdaptation` is tuned."""
+"""Settings of an `OnlineAdaptation`."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -14,31 +14,31 @@ SLOWEST = 0.05  # period up to which a pace of 1 is right
 
 @dataclass(frozen=True)
 class Tuning:
-    """How fast an `OnlineAdaptation` forgets, and what it calls a change.
+    """Settings of forgetting and change detection of an `OnlineAdaptation`.
 
-    The values were tuned by hand on simulated flights of a quadrotor at 100 Hz, of other seeds than those of the report
-    on online adaptation. They count in standard deviations of the prior and of the noise, so that they carry over to
-    other systems once `prior`, `noise` and `process` are right. If you change anything, begin with `alarm` (missed
+    The values were tuned by hand on simulated flights of a quadrotor at 100 Hz, with other seeds than the report on
+    online adaptation. They are in standard deviations of the prior and of the noise, so they should carry over to your
+    system once `prior`, `noise` and `process` are right. If you change anything, you should begin with `alarm` (missed
     changes against false alarms), `drift` and `caution` (intervals that are too narrow), and with `pace` if your system
     is much slower or sampled much less often.
 
     Attributes:
-        pace: factor on all times of the filter but `gap`; 0 for 1, or the period over 0.05 s if that is more.
+        pace: factor on all times of the filter except `gap`; 0 for 1, or the period over 0.05 s if larger.
         drift: random walk of a parameter, as a share of its prior standard deviation [1/√s, for a pace of 1].
-        gusts: how many times as fast a disturbance may walk while it is pulled to one side, as in gusts.
-        alarm: value of the change test that gives an alarm, of a standard normal number if nothing has changed.
-        reject: mean normalised innovation squared, NIS, from which the filter is not believed.
-        alarms: count of alarms in 10 s from which it is not believed, until it has fallen to half of twice as many.
-        clip: standard deviations at which an innovation is cut off, so that an outlier does little.
-        gap: after so long without a sample the state is taken from the next one [s]; 0 for 0.1 s times the pace.
-        frozen: equal samples in a row from which a sensor counts as frozen.
+        gusts: largest factor on the random walk of a disturbance while innovations are biased, for example in gusts.
+        alarm: threshold of the change test, which is standard normal without a change.
+        reject: mean normalised innovation squared (NIS) above which the estimate is not used.
+        alarms: alarms in 10 s above which the estimate is not used, until their count has halved from twice as many.
+        clip: standard deviations at which innovations are clipped against outliers.
+        gap: time without samples after which the state is reset to the next one [s]; 0 for 0.1 s times the pace.
+        frozen: number of equal samples in a row that mark a sensor as frozen.
         bound: prior standard deviations that a parameter may move.
-        excitation: information of a sample, in units of the prior, below which a direction of θ is not learned; 0 to
-            learn all.
-        caution: share of what uncertain parameters do to a step that counts as noise, for its nonlinearity.
+        excitation: information of a sample, in units of the prior, below which a direction of θ is not estimated; 0 to
+            estimate all.
+        caution: share of the effect of uncertain parameters on a step that counts as noise, because of nonlinearity.
 
     Raises:
-        ValueError: a number that is negative, or zero where it must be positive.
+        ValueError: a number is negative, or zero although it must be positive.
     """
 
     pace: float = 0.0
@@ -62,7 +62,7 @@ class Tuning:
         checks.count("frozen", self.frozen)
 
     def at(self, dt: float) -> "Tuning":
-        """With a pace and a gap for samples every dt [s].
+        """Return the settings with pace and gap for samples every dt [s].
 
         Args:
             dt: time between two samples [s].
