@@ -1,8 +1,9 @@
 """A model predictive controller for a multirotor: real-time Gauss–Newton on any vector field of the library.
 
-The real-time iteration (Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal
-feedback control", 2005) with condensing (Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal
-control problems", 1984). Rotor speeds are a smooth function of unbounded variables and so stay within their limits.
+It combines the real-time iteration (Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in
+optimal feedback control", 2005) and condensing (Bock and Plitt, "A multiple shooting algorithm for direct solution of
+optimal control problems", 1984). Rotor speeds are a smooth function of unbounded variables, which enforces their
+limits.
 """
 
 import math
@@ -39,9 +40,9 @@ class Plan(eqx.Module):
     """State of the controller between calls.
 
     Attributes:
-        variables: (t, rotors); tanh maps them to shares of the rotor speeds' range, held over each interval.
-        cost: predicted by the controller's model.
-        damping: of the best Gauss–Newton step.
+        variables: (t, rotors); tanh maps them to shares of the rotor speeds' range, constant in each interval.
+        cost: cost predicted by the controller's model.
+        damping: damping of the best Gauss–Newton step.
     """
 
     variables: Float[Array, "t rotors"]
@@ -56,7 +57,7 @@ _Start = tuple[State, Input]  # state and rotor speeds
 def checked_states(
     name: str, x: State, reference: Float[Array, "n 13"], plan: Plan, steps: int | None = None
 ) -> tuple[State, Float[Array, "n 13"], Plan]:
-    """x, a reference (of that many steps) and the plan in one dtype, as the carry of a loop must keep its own."""
+    """Check x, a reference and the plan and convert them to one dtype, which a loop's carry must keep."""
     x, reference = checks.floating(name, x), checks.floating("reference", reference)
     fits = reference.ndim == 2 and reference.shape[1] == STATE_SIZE and steps in (None, len(reference))
     if x.shape != (STATE_SIZE,) or not fits:
@@ -70,11 +71,11 @@ def checked_states(
 
 @dataclass(frozen=True)
 class Controller:
-    """Model predictive controller. It holds hyper-parameters only; the plan is passed in and returned.
+    """Model predictive controller with hyper-parameters only; you pass the plan in and get the new one back.
 
     Attributes:
-        vehicle: gives the limits and the initial guess, hover; the model passed to a call gives the dynamics.
-        weights: of the cost.
+        vehicle: defines the limits and the initial guess (hover); the dynamics are the model that you pass to a call.
+        weights: weights of the cost.
         steps: intervals of the horizon.
         interval: length of one [s]; one step of RK4.
         period: time between two calls [s].
@@ -82,10 +83,10 @@ class Controller:
         damping: lower bound of the damping.
         min_speed: lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's.
         unit_quaternion: normalise the quaternion after each step of the prediction.
-        rotor_lag: time constant with which rotors follow their commands [s]; see `lagged_speeds`.
+        rotor_lag: time constant of the rotors [s]; see `lagged_speeds`.
 
     Raises:
-        ValueError: an argument is of another type or out of range, or `interval` is no multiple of `period`.
+        ValueError: an argument has a wrong type or value, or `interval` is not a multiple of `period`.
     """
 
     vehicle: Vehicle
@@ -123,7 +124,7 @@ class Controller:
         return max(round(self.interval / self.period), 1)
 
     def begin(self) -> Plan:
-        """The plan for the first call: hover throughout."""
+        """Return the plan for the first call: hover throughout."""
         middle, half = self._range()
         hover = math.atanh((self.vehicle.hover_speed - middle) / half)
         # With the dtype of later plans, or the second call would compile again.
@@ -131,21 +132,21 @@ class Controller:
         return Plan(variables, jnp.asarray(jnp.inf, float), jnp.asarray(INITIAL_DAMPING, float))
 
     def speeds(self, plan: Plan) -> Float[Array, "t rotors"]:
-        """The rotor speeds [rad/s] of a plan, within the limits.
+        """Return the rotor speeds [rad/s] of a plan, within the limits.
 
         Args:
-            plan: what a call returned.
+            plan: a plan that a call returned.
         """
         return self._speeds(jnp.tanh(plan.variables))
 
     def horizon(self, reference: Float[Array, "n 13"], i: int | Scalar) -> Float[Array, "t 13"]:
-        """The reference at the end of each interval of a call at sample i, from one sample per period.
+        """Return the reference at the end of each interval of a call at sample i, from one sample per period.
 
-        For a traced i the last sample, with its velocity, stands for all beyond the end.
+        If i is traced, the last sample is repeated beyond the end.
 
         Args:
             reference: a state for each period (n, 13).
-            i: number of the sample, from 0.
+            i: index of the sample, from 0.
 
         Raises:
             ValueError: a concrete i is negative, or its horizon ends after the reference.
@@ -164,16 +165,16 @@ class Controller:
         plan: Plan,
         speeds: Input | None = None,
     ) -> tuple[Input, Plan]:
-        """Rotor speeds [rad/s] to command for one period from state x, and the new plan.
+        """Compute the rotor speeds [rad/s] to command for one period from state x, and the new plan.
 
         Args:
             reference: the state to reach by the end of each interval (see `horizon`).
-            plan: that of the last call, or `begin()`.
-            speeds: of the rotors at state x [rad/s], by default those that the plan commands; without lag unused.
+            plan: plan of the last call, or `begin()`.
+            speeds: rotor speeds at state x [rad/s], by default the plan's commands; ignored without lag.
 
         Raises:
-            ValueError: something does not fit; for concrete values also if one is not finite or a quaternion is not of
-                length 1. A compiled call normalises that of x.
+            ValueError: shapes or types do not match; for concrete values also if one is not finite or a quaternion's
+                norm is not 1. A compiled call normalises the quaternion of x.
         """
         if not callable(model):
             raise ValueError(f"model must be a vector field, got {checks.short_repr(model)}")
@@ -201,7 +202,7 @@ class Controller:
         return middle + half * share
 
     def _initial_guess(self, model, reference, start: _Start, plan: Plan) -> _Point:
-        """The shifted plan or the attitude recovery, whichever costs less."""
+        """Choose the shifted plan or the attitude recovery by cost."""
         # One period later, interpolated; the last interval stays.
         following = jnp.concatenate([plan.variables[1:], plan.variables[-1:]])
         shifted = plan.variables + (following - plan.variables) / self.stride
@@ -220,11 +221,7 @@ class Controller:
         return Plan(best[0], best[1], plan.damping), best[2]
 
     def _recovery(self, wanted: State, x: State) -> Float[Array, " rotors"]:
-        """Decision variables for hover thrust and −30 φ − 10 (ω − ω_ref) [rad/s²], φ the attitude error.
-
-        After a large initial rate the shifted plan may contain a full roll, at a hundred times the least cost, and
-        every small change of it costs more.
-        """
+        """Hover thrust and −30 φ − 10 (ω − ω_ref) [rad/s²], φ the attitude error, to leave a roll in the plan."""
         vehicle, (middle, half) = self.vehicle, self._range()
         angle = attitude_error(wanted[QUATERNION], x[QUATERNION])
         acceleration = -ATTITUDE_GAIN * angle - RATE_GAIN * (x[BODY_RATES] - wanted[BODY_RATES])
@@ -236,12 +233,11 @@ class Controller:
         return jnp.arctanh(jnp.clip(share, -math.tanh(VARIABLE_BOUND), math.tanh(VARIABLE_BOUND)))
 
     def _step(self, model: AbstractVectorField, start: _Start, variables: Float[Array, " rotors"]) -> _Start:
-        """State and rotor speeds at the end of an interval."""
         command = self._speeds(jnp.tanh(variables))
         return advance_lagged(model, *start, command, self.rotor_lag, self.interval, self.unit_quaternion)
 
     def _improve(self, model, reference, start: _Start, point: _Point) -> _Point:
-        """Take the best of the damped Gauss–Newton steps, if it lowers the cost, and keep its damping."""
+        """Take the best damped Gauss–Newton step if it lowers the cost, and keep its damping."""
         plan, states = point
         path = jnp.concatenate([start[0][None], states])
         matrix, gradient = self._quadratic(model, reference, path, start[1], plan.variables)
@@ -270,7 +266,7 @@ class Controller:
         return Plan(best.variables, best.cost, jnp.where(converged, INITIAL_DAMPING, best.damping)), states
 
     def _quadratic(self, model, reference, x: Float[Array, "t+1 13"], before: Input, variables):
-        """JᵀJ and Jᵀr for the residuals r of the cost and their Jacobian J in the decision variables."""
+        """Return JᵀJ and Jᵀr for the cost's residuals r and their Jacobian J in the decision variables."""
         factor = stage_factors(self.weights, self.steps)
         weighted = partial(deviations, self.weights)
         residual = jax.vmap(weighted)(reference, x[1:])

@@ -18,16 +18,16 @@ Scalar = Float[Array, ""]
 class Weights:
     """Weights of cost = Σ (weight × deviation)²; a deviation of 1 / weight costs 1.
 
-    Tilt and rotor speed must differ from their reference in a steady wind or under an error of k. Tilt therefore costs
-    little, and of rotor speeds only the changes cost; otherwise position would pay for it.
+    In a steady wind or with a wrong k, tilt and rotor speeds must differ from their reference. Tilt should therefore
+    cost little, and only changes of rotor speeds cost; otherwise position errors would grow.
 
     Attributes:
-        position: of the distance [1/m].
-        tilt: of the attitude error about the body's x and y axes [1/rad].
-        yaw: of the attitude error about the body's z axis [1/rad].
-        velocity: of the velocity's error [s/m].
-        body_rates: of the body rates' error [s/rad].
-        change: of a rotor's speed from one interval to the next, as a share of half its range.
+        position: weight of the distance [1/m].
+        tilt: weight of the attitude error about the body's x and y axes [1/rad].
+        yaw: weight of the attitude error about the body's z axis [1/rad].
+        velocity: weight of the velocity error [s/m].
+        body_rates: weight of the body rates' error [s/rad].
+        change: weight of the change of a rotor speed between intervals, as a share of half its range.
         terminal: factor on all deviations of the last state of the horizon.
 
     Raises:
@@ -49,7 +49,7 @@ class Weights:
 
 
 def deviations(weights: Weights, reference: State, x: State) -> Float[Array, "12"]:
-    """Weighted deviations of a state from its reference: position, attitude, velocity, body rates."""
+    """Weight the deviations of a state from its reference: position, attitude, velocity, body rates."""
     difference = x - reference
     attitude = jnp.array([weights.tilt, weights.tilt, weights.yaw], x.dtype)
     attitude = attitude * attitude_error(reference[QUATERNION], x[QUATERNION])
@@ -58,20 +58,20 @@ def deviations(weights: Weights, reference: State, x: State) -> Float[Array, "12
 
 
 def stage_factors(weights: Weights, steps: int) -> Float[np.ndarray, " t"]:
-    """Factor on the deviations of each state of the horizon."""
+    """Return the factor on the deviations of each state of the horizon."""
     return np.append(np.ones(steps - 1, np.float32), np.float32(weights.terminal))
 
 
 def plan_cost(
     weights: Weights, reference: Float[Array, "t 13"], x: Float[Array, "t 13"], share: Float[Array, "t 4"]
 ) -> Scalar:
-    """Cost of inputs (shares −1 … 1 of their range) and of the states x that they lead to."""
+    """Compute the cost of inputs (shares −1 … 1 of their range) and of the resulting states x."""
     weighted = jax.vmap(lambda wanted, found: deviations(weights, wanted, found))(reference, x)
     tracking = jnp.sum(jnp.square(stage_factors(weights, len(x))[:, None] * weighted))
     return tracking + jnp.sum(jnp.square(weights.change * jnp.diff(share, axis=0)))
 
 
 def input_rate_penalty(weights: Weights, steps: int) -> Float[np.ndarray, "t t"]:
-    """Matrix M such that the changes of one rotor's shares s cost sᵀ M s."""
+    """Return the matrix M for which the changes of one rotor's shares s cost sᵀ M s."""
     differences = weights.change * np.diff(np.eye(steps, dtype=np.float32), axis=0)
     return differences.T @ differences

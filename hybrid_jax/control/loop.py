@@ -1,4 +1,4 @@
-"""The closed loop: a plant, a controller with its prediction model and estimator, and how well it flew."""
+"""The closed loop of a plant and a controller with its prediction model and estimator, and its tracking performance."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,10 +30,10 @@ class Flight(eqx.Module):
 
     Attributes:
         x: true states (t + 1, 13), the initial one first.
-        u: rotor speeds that are commanded over each period (t, 4) [rad/s].
-        plans: of the controller at each call.
+        u: rotor speed commands in each period (t, 4) [rad/s].
+        plans: plan of the controller at each call.
         estimates: state of the estimator at each call.
-        speeds: of the rotors at the start of each period (t, 4) [rad/s].
+        speeds: rotor speeds at the start of each period (t, 4) [rad/s].
     """
 
     x: Float[Array, "*n t+1 13"]
@@ -45,15 +45,16 @@ class Flight(eqx.Module):
 
 @dataclass(frozen=True)
 class Hardware:
-    """What stands between controller and vehicle. ValueError if a number is negative or not finite.
+    """Latency, rotor lag and noise between controller and vehicle.
 
-    A sample at time t decides what is commanded from t + latency on, and the rotors follow with a lag. The plant is
-    told their mean speed over each period. Sensors add white noise to each entry of the state.
+    A sample at time t sets the command from t + latency on, and the rotors follow with a lag; the plant's input is
+    their mean speed over each period. Sensors add white noise to each entry of the state. Negative or infinite numbers
+    raise ValueError.
 
     Attributes:
         latency: time from a sample to its command [s], a multiple of the controller's period.
-        rotor_lag: time constant [s].
-        noise: standard deviations of position [m], quaternion, velocity [m/s] and body rates [rad/s].
+        rotor_lag: time constant of the rotors [s].
+        noise: noise standard deviations of position [m], quaternion, velocity [m/s] and body rates [rad/s].
     """
 
     latency: float = 0.0
@@ -69,10 +70,10 @@ class Hardware:
             checks.not_negative("noise", size)
 
     def delay(self, period: float) -> int:
-        """The latency in periods.
+        """Return the latency in periods.
 
         Args:
-            period: of the controller [s].
+            period: period of the controller [s].
         """
         periods = round(self.latency / period)
         if abs(periods * period - self.latency) > 1e-6 * period:
@@ -80,14 +81,14 @@ class Hardware:
         return periods
 
     def measure(self, x: State, key: PRNGKeyArray) -> State:
-        """The state as the sensors see it."""
+        """Add sensor noise to the state."""
         if not any(self.noise):
             return x
         x = x + jnp.asarray(self.sizes(), x.dtype) * jax.random.normal(key, x.shape, x.dtype)
         return x.at[QUATERNION].set(normalise(x[QUATERNION]))
 
     def sizes(self) -> Float[np.ndarray, "13"]:
-        """The standard deviation of each entry of the state."""
+        """Return the standard deviation of each entry of the state."""
         return np.repeat(self.noise, [3, 4, 3, 3])
 
 
@@ -95,10 +96,10 @@ class Performance(eqx.Module):
     """Tracking performance of a flight.
 
     Attributes:
-        position_rmse: [m].
-        yaw_rmse: [rad].
-        largest_error: of position [m].
-        crashed: below the ground, too far from the reference, or not finite.
+        position_rmse: RMS position error [m].
+        yaw_rmse: RMS yaw error [rad].
+        largest_error: largest position error [m].
+        crashed: whether it went below the ground, too far from the reference, or not finite.
         saturation: share of the rotor speeds at a limit.
     """
 
@@ -110,7 +111,7 @@ class Performance(eqx.Module):
 
 
 class Moment(eqx.Module):
-    """Everything that a closed loop carries from one period to the next."""
+    """The state of a closed loop between two periods."""
 
     x: State  # true
     seen: State  # by the sensors
@@ -122,11 +123,11 @@ class Moment(eqx.Module):
 
 
 class Loop(NamedTuple):
-    """A closed loop that can be stopped and continued, which `fly` is made of.
+    """A closed loop that you can stop and continue; `fly` is made of it.
 
     Attributes:
         controller: plans at each period.
-        hardware: what stands between controller and vehicle.
+        hardware: latency, rotor lag and noise.
         estimator: an `AbstractEstimator`, or one with its methods.
     """
 
@@ -135,11 +136,11 @@ class Loop(NamedTuple):
     estimator: Any
 
     def begin(self, x0: State, plan: Plan, key: PRNGKeyArray) -> Moment:
-        """At the state x0, with the rotors at the speeds of the plan.
+        """Begin at the state x0, with the rotors at the speeds of the plan.
 
         Args:
             x0: true state (13,).
-            plan: that the rotors follow at first.
+            plan: initial plan, which sets the rotor speeds.
         """
         key, now = jax.random.split(key)
         seen, speeds = self.hardware.measure(x0, now), self.controller.speeds(plan)[0].astype(x0.dtype)
@@ -149,15 +150,15 @@ class Loop(NamedTuple):
     def tick(
         self, plant: Plant, reference: Float[Array, "n 13"], now: Moment, i: Int[Array, ""]
     ) -> tuple[Moment, Input]:
-        """One period, the i-th; also returns what is commanded [rad/s].
+        """Simulate the i-th period; also return the command [rad/s].
 
-        The controller plans from where its model expects the vehicle when the command arrives.
+        The controller plans from the predicted state at the arrival of the command.
 
         Args:
             plant: the true vehicle, as in `fly`.
             reference: a state for each period (n, 13).
-            now: what `begin` or the last `tick` returned.
-            i: number of the period, from 0.
+            now: result of `begin` or the last `tick`.
+            i: index of the period, from 0.
         """
         controller, estimator, period = self.controller, self.estimator, self.controller.period
         model, x, speeds = estimator.model(now.estimate), now.seen, now.speeds
@@ -189,9 +190,9 @@ def fly(
 ) -> Flight:
     """Fly a plant along a reference for n − 1 − horizon periods.
 
-    The function is pure: use it under `jit`, and under `vmap` over any argument. A crash does not stop a flight; one
-    that diverges continues as infinity or NaN. `plans` and `estimates`, the largest parts of the result, cost nothing
-    if a compiled function does not return them.
+    The function is pure: you can use it under `jit`, and under `vmap` over any argument. A crash does not stop a
+    flight; divergence continues as infinity or NaN. `plans` and `estimates`, the largest parts of the result, cost
+    nothing if your compiled function does not return them.
 
     Args:
         x0: true state at the start (13,).
@@ -199,15 +200,14 @@ def fly(
         plant: returns the state one period later.
         model: prediction model of the controller and of the observer.
         reference: one state per period (see `references.sample`).
-        bandwidth: of the disturbance observer [rad/s]; 0 for none.
-        hardware: latency, rotor lag and noise, by default none. Give the controller the same `rotor_lag`.
-        estimator: in place of the observer, with the methods of `AbstractEstimator`, such as an `OnlineAdaptation`; it
-            then has the model.
-        key: of the noise; required for it.
+        bandwidth: bandwidth of the disturbance observer [rad/s]; 0 for none.
+        hardware: latency, rotor lag and noise, by default none. The controller should have the same `rotor_lag`.
+        estimator: replaces the observer and supplies the model; for example an `OnlineAdaptation`.
+        key: random key, required for noise.
 
     Raises:
-        ValueError: shapes do not fit, or the reference is no longer than the horizon; for concrete values also if one
-            is not finite, a quaternion is not of length 1, or the bandwidth is negative; noise without a key.
+        ValueError: shapes do not match, the reference is not longer than the horizon, or noise has no key; for concrete
+            values also if one is not finite, a quaternion's norm is not 1, or the bandwidth is negative.
     """
     checks.not_negative("bandwidth", bandwidth)
     hardware = Hardware() if hardware is None else hardware
@@ -236,14 +236,14 @@ def performance(
     ground: float = 0.0,
     crash_distance: float = 10.0,
 ) -> Performance:
-    """Tracking performance after the initial state.
+    """Compute the tracking performance after the initial state.
 
     Args:
-        flight: what `fly` returned.
+        flight: a flight from `fly`.
         reference: a state for each period (n, 13).
-        controller: that flew; gives the limits of the rotor speeds.
+        controller: the flight's controller, for the limits of the rotor speeds.
         ground: altitude below which a flight counts as crashed [m].
-        crash_distance: distance from the reference beyond which it does [m].
+        crash_distance: distance from the reference beyond which a flight counts as crashed [m].
     """
     x, wanted = flight.x[1:], reference[1 : len(flight.x)]
     error = jnp.linalg.norm(x[:, POSITION] - wanted[:, POSITION], axis=-1)
@@ -265,18 +265,18 @@ def open_loop_costs(
     calls: Sequence[int],
     hardware: Hardware | None = None,
 ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-    """Predicted cost of the plans of these calls, and the actual one if they run to their end in the plant.
+    """Compare the predicted cost of the plans of some calls with the cost when the plant executes them to their end.
 
-    Plans that run to their end show the model's errors unhidden. A plan begins when its command arrives, so that a call
-    must be earlier than the end by the latency.
+    Plans that are executed to their end reveal the model's full error. A plan begins when its command arrives, so a
+    call must be earlier than the end by the latency.
 
     Args:
         plant: the true vehicle, as in `fly`.
-        flight: what `fly` returned.
+        flight: a flight from `fly`.
         reference: a state for each period (n, 13).
-        controller: that flew.
-        calls: numbers of the controller's calls, from 0.
-        hardware: of the flight; by default none.
+        controller: the flight's controller.
+        calls: indices of the controller's calls, from 0.
+        hardware: the flight's hardware, by default none.
     """
     hardware = Hardware() if hardware is None else hardware
     stride, delay = controller.stride, hardware.delay(controller.period)

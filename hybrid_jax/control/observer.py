@@ -1,4 +1,4 @@
-"""The disturbance observer: a constant acceleration beyond the model, between sensors and controller."""
+"""A disturbance observer, which estimates a constant acceleration that the model does not include."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,15 +28,15 @@ class Watched(eqx.Module):
 
 
 class Observer(AbstractEstimator):
-    """A constant acceleration beyond a prediction model, from one-step prediction errors.
+    """Estimate a constant acceleration beyond a prediction model from one-step prediction errors.
 
-    The discrete-time form of Chen, Yang, Guo and Li, "Disturbance-observer-based control and related methods", 2016:
-    the prediction error divided by the period is the error of d, and a first-order filter of bandwidth β adds the share
-    1 − exp(−β period) of it to d.
+    This is the discrete-time form of Chen, Yang, Guo and Li, "Disturbance-observer-based control and related methods",
+    2016: the prediction error divided by the period is the error of d, and a first-order filter of bandwidth β adds the
+    share 1 − exp(−β period) of it to d.
 
     Attributes:
         field: the prediction model without a disturbance.
-        bandwidth: of the observer [rad/s]; 0 leaves the disturbance at zero.
+        bandwidth: bandwidth of the observer [rad/s]; 0 keeps the disturbance at zero.
         period: time between two samples [s].
     """
 

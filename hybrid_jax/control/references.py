@@ -1,8 +1,8 @@
-"""Reference paths, and their sampling as reference states.
+"""Reference paths and their conversion to reference states.
 
-A path maps time [s] to position [m, world] and yaw [rad]. Differential flatness gives the rest: thrust is along a + g
+A path maps time [s] to position [m, world] and yaw [rad]; differential flatness gives the rest, with thrust along a + g
 (Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors", 2011). All functions raise
-ValueError for numbers that are not finite, or not positive where they must be.
+ValueError for numbers that are not finite, or not positive where they should be.
 """
 
 import math
@@ -26,11 +26,11 @@ X, Y, Z = np.eye(3).tolist()
 
 
 def sample(path: Path, controller: Controller, duration: float) -> Float[Array, "n 13"]:
-    """One reference state per period, for a flight of `duration` [s] and the horizon of its last call.
+    """Sample one reference state per period, for a flight of `duration` [s] and the horizon of its last call.
 
     Args:
-        path: such as `hover()`: a function of time [s] to position [m] and yaw [rad].
-        controller: gives the period, the horizon and gravity.
+        path: function of time [s] to position [m] and yaw [rad], for example `hover()`.
+        controller: defines the period, the horizon and gravity.
         duration: length of the flight [s].
     """
     if not callable(path):
@@ -42,7 +42,7 @@ def sample(path: Path, controller: Controller, duration: float) -> Float[Array, 
 
 
 def reference_state(path: Path, t: Scalar, gravity: float) -> State:
-    """The state at time t of a multirotor that follows the path without drag."""
+    """Return the state of a multirotor without drag that follows the path, at time t."""
 
     def moving(t):
         return jax.jvp(lambda t: path(t)[0], (t,), (jnp.ones_like(t),))
@@ -57,7 +57,7 @@ def reference_state(path: Path, t: Scalar, gravity: float) -> State:
 
 
 def attitude_along(thrust: Float[Array, "3"], yaw: Scalar) -> Quaternion:
-    """The attitude with this yaw whose z axis points along `thrust`: rotations about z, then y, then x."""
+    """Return the attitude with z along `thrust` and this yaw: rotations about z, then y, then x."""
     ahead = jnp.cos(yaw) * thrust[0] + jnp.sin(yaw) * thrust[1]
     left = jnp.cos(yaw) * thrust[1] - jnp.sin(yaw) * thrust[0]
     pitch = jnp.arctan2(ahead, thrust[2])
@@ -82,7 +82,7 @@ def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.
     """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, a [m], φ̇ constant; fastest at its centre, √2 a φ̇ [m/s].
 
     Args:
-        top_speed: at the centre [m/s].
+        top_speed: speed at the centre [m/s].
         half_width: a, the largest distance from the centre along x [m].
         altitude: height above the origin [m].
         yaw: constant angle about the world's z axis [rad].
@@ -107,7 +107,7 @@ def step(to: tuple[float, float, float], at: float = 1.0, yaw: float = 0.0, alti
     Args:
         to: jump of the position (x, y, z) [m].
         at: time of the jump [s].
-        yaw: yaw after the jump [rad]; before it is 0.
+        yaw: yaw after the jump [rad]; 0 before it.
         altitude: height before the jump [m].
     """
     _check_vector("to", to)
@@ -127,7 +127,7 @@ def low_flyby(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: f
     The altitude follows cos⁴, which is flat at the bottom: 40 % of the time is spent in the lowest tenth.
 
     Args:
-        speed: along x [m/s].
+        speed: speed along x [m/s].
         low: lowest altitude [m], above 0.
         high: highest altitude [m].
         every: time from one highest point to the next [s].
@@ -147,11 +147,11 @@ def low_flyby(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: f
 
 
 def add_body_rates(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> State:
-    """The state with body rates [rad/s] added: a large-rate initial condition.
+    """Add body rates [rad/s] to a state, for example as a difficult initial condition.
 
     Args:
-        state: of a multirotor (13,).
-        rates: what is added to the body rates (x, y, z) [rad/s].
+        state: state of a multirotor (13,).
+        rates: increments of the body rates (x, y, z) [rad/s].
     """
     state = checks.floating("state", state)
     if state.shape != (STATE_SIZE,):

@@ -1,4 +1,4 @@
-"""One RK4 step of a model under rotors that may lag, and its Jacobian, which condensing needs.
+"""One RK4 step of a model with rotor lag, and its Jacobian for condensing.
 
 The derivative of a Runge–Kutta step is a step of the same method on ẋ = f(x, u), Ṡ = ∂f/∂x S + ∂f/∂u: internal
 numerical differentiation (Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", 1981).
@@ -21,16 +21,16 @@ from hybrid_jax.state import QUATERNION, STATE_SIZE, Input, State
 
 
 def lagged_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple[Input, Input]:
-    """The mean speeds [rad/s] over dt [s] of rotors that follow a command with a lag, τ ẇ = c − w, and those after it.
+    """Compute the mean and final speeds [rad/s] of rotors that follow a command with τ ẇ = c − w over dt [s].
 
-    Exact for a command that is held. To take the mean as speeds that are held is right for velocities, to first order
-    of the change; over an interval as long as the lag, positions and angles need `stage_shares`.
+    Exact for a constant command. Applying the mean over the whole interval is correct for velocities to first order of
+    the change; if the interval is as long as the lag, positions and angles need `stage_shares`.
 
     Args:
-        speeds: of the rotors at the start [rad/s].
-        command: held over dt [rad/s].
-        lag: τ, time constant [s]; 0 for none.
-        dt: time that passes [s].
+        speeds: rotor speeds at the start [rad/s].
+        command: constant command over dt [rad/s].
+        lag: time constant τ [s]; 0 for none.
+        dt: length of the interval [s].
     """
     if not lag:
         return command, command
@@ -39,12 +39,11 @@ def lagged_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple
 
 
 def stage_shares(lag: float, dt: float) -> tuple[float, float, float]:
-    """Shares a, b, c of the speeds before an interval that rotors have at the start, middle and end of it, for RK4.
+    """Shares a, b, c of the previous speeds at the start, middle and end of an RK4 step.
 
-    A step of RK4 of a chain of integrators whose input is f(s), 0 ≤ s ≤ 1, finds ∫ f as (a + 4 b + c)/6, ∫ (1 − s) f
-    as a/6 + b/3 and ½ ∫ (1 − s)² f as (a + b)/12. These shares make all three right for f = exp(−s dt/τ): as a force
-    moves velocity and position, and a torque rates, attitude and velocity. True shares 1, exp(−dt/2τ), exp(−dt/τ) do
-    so for a lag that is long beside dt alone.
+    For a chain of integrators with input f(s), 0 ≤ s ≤ 1, RK4 approximates ∫ f by (a + 4 b + c)/6, ∫ (1 − s) f by a/6 +
+    b/3 and ½ ∫ (1 − s)² f by (a + b)/12. These shares make all three exact for f = exp(−s dt/τ). The true values 1,
+    exp(−dt/2τ), exp(−dt/τ) do so only if the lag is long compared with dt.
     """
     rate = dt / lag
     kept = math.exp(-rate)
@@ -57,25 +56,24 @@ def stage_shares(lag: float, dt: float) -> tuple[float, float, float]:
 
 
 def lag_matrix(lag: float, dt: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the speeds before the first of some intervals (t), and the commands of all (t, t), add to those before each
-    interval."""
+    """Map the speeds before the first interval (t), and all commands (t, t), to the speeds before each interval."""
     kept, k = math.exp(-dt / lag) if lag else 0.0, np.arange(steps)
     since = np.maximum(k[:, None] - k - 1, 0)
     return kept**k, np.tril((1 - kept) * kept**since, -1)
 
 
 def step_of(derivative: Derivative, x: State, inputs: Sequence[Any], dt: float) -> State:
-    """One step of RK4 over dt [s] with these inputs at its start, middle and end."""
+    """One RK4 step over dt [s] with these inputs at its start, middle and end."""
     evaluate = traced_once(derivative, x)
     term = diffrax.ODETerm(lambda t, x, _: evaluate(x, inputs[round(2 * float(t) / dt)]))
     return RK4().step(term, 0.0, dt, x, None, None, made_jump=False)[0]
 
 
 def advance(model: AbstractVectorField, x: State, u: Input, dt: float, unit_quaternion: bool = True) -> State:
-    """The state after dt [s] with u held: one step of classical RK4.
+    """Compute the state after dt [s] with constant u by one step of classical RK4.
 
     Args:
-        model: ẋ = f(x, u) of a rigid body.
+        model: a rigid body's ẋ = f(x, u).
         dt: length of the step [s].
         unit_quaternion: normalise the quaternion afterwards.
     """
@@ -86,7 +84,7 @@ def advance(model: AbstractVectorField, x: State, u: Input, dt: float, unit_quat
 def advance_lagged(
     model: AbstractVectorField, x: State, speeds: Input, command: Input, lag: float, dt: float, unit_quaternion=True
 ) -> tuple[State, Input]:
-    """State and rotor speeds after dt [s], while the rotors follow a command with a lag, or at once if that is 0."""
+    """Compute state and rotor speeds after dt [s]; rotors follow the command with a lag, or at once if it is 0."""
     if not lag:
         return advance(model, x, command, dt, unit_quaternion), command
     inputs = [command + share * (speeds - command) for share in stage_shares(lag, dt)]
@@ -97,7 +95,7 @@ def advance_lagged(
 def advance_with_jacobian(
     model: AbstractVectorField, x: State, speeds: Input, command: Input, lag: float, dt: float, unit_quaternion=True
 ) -> tuple[State, Float[Array, "13 n"]]:
-    """The state of `advance_lagged`, and its Jacobian in x, the command and, if they lag, the rotors' speeds."""
+    """Return the state of `advance_lagged` and its Jacobian in x, the command and (with lag) the rotor speeds."""
     d, m = len(x), len(command)
     one, none = jnp.eye(m, dtype=x.dtype), jnp.zeros((m, d), x.dtype)
     if lag:
@@ -121,7 +119,7 @@ def advance_with_jacobian(
 def condensed(
     model, x: Float[Array, "t 13"], before: Input, commands: Float[Array, "t 4"], lag: float, dt: float, unit_quaternion
 ) -> Float[Array, "t 13 t 4"]:
-    """∂(state at the end of each interval) / ∂(all commands); `before`: the rotors' speeds at first."""
+    """∂(state at the end of each interval) / ∂(all commands); `before` are the initial rotor speeds."""
     d, (t, m) = STATE_SIZE, commands.shape
     kept, mixed = (part.astype(x.dtype) for part in lag_matrix(lag, dt, t))
     speeds = kept[:, None] * before + mixed @ commands
