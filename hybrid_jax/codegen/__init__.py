@@ -1,3 +1,3 @@
-"""JAX programs as C: a walk over their operations, code as values, and a printer."""
+"""Translation of JAX programs to C: walk over the operations, build code as values, and print it."""
 
 __all__: list[str] = []

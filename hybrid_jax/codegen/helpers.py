@@ -1,4 +1,4 @@
-"""Functions of C that generated code may call, by name."""
+"""C helper functions for generated code, by name."""
 
 HELPERS = {
     "larger": """\

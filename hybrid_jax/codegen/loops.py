@@ -1,4 +1,4 @@
-"""Loops over columns: where their entries lie in arrays and tables, and statements that fill arrays."""
+"""Loops over columns: the layout of their entries in arrays and tables, and statements that fill arrays."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ LOOPED = 8  # so many entries are copied by a loop
 
 
 def is_contiguous(entries: np.ndarray) -> bool:
-    """Whether these are numbers, or follow each other in one array."""
+    """Whether all entries are numbers or contiguous in one array."""
     if all(isinstance(one, float) for one in entries):
         return True
     places = _places(entries)
@@ -31,7 +31,7 @@ def is_contiguous(entries: np.ndarray) -> bool:
 
 
 def address(tables: Tables, entries: np.ndarray, stride: int = 0) -> Address:
-    """Where contiguous entries begin, or in a loop those of the counter i0 if each has `stride` of them."""
+    """Return the start of contiguous entries; in a loop with counter i0, each step advances by `stride`."""
     first = entries[0]
     if isinstance(first, Entry):
         return Address(first.name, first.index or 0, (stride,))
@@ -39,7 +39,7 @@ def address(tables: Tables, entries: np.ndarray, stride: int = 0) -> Address:
 
 
 def indexed(tables: Tables, entries: np.ndarray, shape: tuple[int, ...]) -> Expression | None:
-    """The entry at the indices i0, i1, … of an array of this shape, or None if its place is not linear in them."""
+    """Return the entry at indices i0, i1, … of an array of this shape, or None if its place is not linear in them."""
     first = entries[0]
     if all(one == first for one in entries):
         return first
@@ -56,7 +56,7 @@ def indexed(tables: Tables, entries: np.ndarray, shape: tuple[int, ...]) -> Expr
 
 
 def _in_table(tables: Tables, grid: np.ndarray) -> Element:
-    """A constant, with one entry in the table along axes on which it does not depend."""
+    """Store a constant in a table, with one entry along axes on which it does not depend."""
     kept = [bool((grid != grid.take([0], axis)).any()) for axis in range(grid.ndim)]
     core = grid[tuple(slice(None) if keep else slice(0, 1) for keep in kept)]
     strides = tuple(stride if keep else 0 for stride, keep in zip(_strides(core.shape), kept, strict=True))
@@ -68,7 +68,7 @@ def _strides(shape: Sequence[int]) -> tuple[int, ...]:
 
 
 def _places(entries: np.ndarray) -> np.ndarray | None:
-    """The indices of entries that are of one array."""
+    """Return the indices of entries of one array."""
     first = entries[0]
     if not isinstance(first, Entry) or first.index is None:
         return None
@@ -78,12 +78,12 @@ def _places(entries: np.ndarray) -> np.ndarray | None:
 
 
 def mapping(out: str, value: Expression, shape: tuple[int, ...]) -> Statement:
-    """An array of this shape gets, at each of its indices, a value that depends on these."""
+    """Set each entry of an array of this shape to a value that depends on its indices."""
     return nested(shape, Assign(Element(out, 0, _strides(shape)), value))
 
 
 def folding(out: str, name: str, operand: Expression, shape: tuple[int, int]) -> Statement:
-    """The entries of each row put together by an operation of two."""
+    """Reduce the entries of each row by a binary operation."""
     first = replace(operand, steps=operand.steps[:1]) if isinstance(operand, Element) else operand
     total = Entry("s")
     inner = Loop(1, shape[1], (Assign(total, Operation(name, (total, operand))),), start=1)
@@ -91,7 +91,7 @@ def folding(out: str, name: str, operand: Expression, shape: tuple[int, int]) ->
 
 
 def stores(out: str, entries: np.ndarray, begin: int = 0) -> tuple[Statement, ...]:
-    """Entries are written into an array, from `begin` on: the same number, and runs of another array, by loops."""
+    """Write entries into an array from `begin` on, with loops for equal numbers and runs of another array."""
     statements, i = [], 0
     while i < len(entries):
         first, (run, step) = entries[i], _run(entries[i:])
@@ -107,7 +107,7 @@ def stores(out: str, entries: np.ndarray, begin: int = 0) -> tuple[Statement, ..
 
 
 def _run(entries: np.ndarray) -> tuple[int, int]:
-    """How many of the first entries follow each other in one array, and how far apart, or are the same number."""
+    """Return the length and stride of the leading run in one array, or of equal numbers."""
     first, step = entries[0], 0
     if (places := _places(entries[:2])) is not None and len(places) > 1:
         step = int(places[1] - places[0])

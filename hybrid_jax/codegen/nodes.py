@@ -1,7 +1,7 @@
-"""Generated code as values: expressions, statements and functions, which a printer writes in a language.
+"""Generated code as values (expressions, statements and functions) that a printer writes in a language.
 
 An expression is a number (a float, a bool, or an int for a count), a `Reference` or an `Operation`, named as in JAX.
-The counters of loops are numbered from the outermost: i0, i1, …
+Loop counters are numbered from the outermost: i0, i1, …
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,24 +12,24 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Node:
-    """A piece of code, a frozen dataclass; pieces in it are its fields, or in tuples there."""
+    """A piece of code, a frozen dataclass; its children are fields, or in tuples there."""
 
 
 @dataclass(frozen=True)
 class Reference(Node):
-    """What has the name of a variable or an array."""
+    """A node with the name of a variable or an array."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class Entry(Reference):
-    """A variable, or an entry of an array at a place that is known.
+    """A variable, or an entry of an array at a known index.
 
     Attributes:
-        name: of the variable or array.
-        index: the place; None for a variable.
-        logical: whether it is an int, 0 or 1; else it is a real.
+        name: name of the variable or array.
+        index: index in the array; None for a variable.
+        logical: whether it is an int (0 or 1) instead of a real.
     """
 
     index: int | None = None
@@ -46,7 +46,7 @@ class Element(Reference):
 
 @dataclass(frozen=True)
 class Address(Reference):
-    """Where entries of an array begin, at a place as of `Element`."""
+    """The start of entries of an array, at an index like `Element`'s."""
 
     corner: int = 0
     steps: tuple[int, ...] = ()
@@ -65,7 +65,7 @@ Expression = float | bool | int | Reference | Operation
 
 @dataclass(frozen=True)
 class Variable(Node):
-    """A new variable with its value, which changes later only if it is not `constant`."""
+    """Define a variable, which changes later only if it is not `constant`."""
 
     name: str
     value: Expression
@@ -75,7 +75,7 @@ class Variable(Node):
 
 @dataclass(frozen=True)
 class Array(Node):
-    """A new array, which holds nothing yet."""
+    """Declare an uninitialised array."""
 
     name: str
     size: int
@@ -84,15 +84,13 @@ class Array(Node):
 
 @dataclass(frozen=True)
 class Assign(Node):
-    """An entry gets a value."""
-
     target: Entry | Element
     value: Expression
 
 
 @dataclass(frozen=True)
 class Loop(Node):
-    """Statements for each value of the counter from `start` to `stop` − 1."""
+    """Repeat statements for each value of the counter from `start` to `stop` − 1."""
 
     counter: int
     stop: int
@@ -102,7 +100,7 @@ class Loop(Node):
 
 @dataclass(frozen=True)
 class Call(Node):
-    """A function is called, which writes what it finds into some of its arguments."""
+    """Call a function, which writes its results into some of its arguments."""
 
     function: str
     arguments: tuple[Expression, ...]
@@ -113,7 +111,7 @@ Statement = Variable | Array | Assign | Loop | Call
 
 @dataclass(frozen=True)
 class Parameter(Node):
-    """A number that a function takes, or the entries of an array, which it may change if `written`."""
+    """A number argument of a function, or an array, which it may change if `written`."""
 
     name: str
     logical: bool = False
@@ -123,7 +121,7 @@ class Parameter(Node):
 
 @dataclass(frozen=True)
 class Function(Node):
-    """A function of the file, which returns nothing."""
+    """A function of the file without return value."""
 
     name: str
     parameters: tuple[Parameter, ...]
@@ -132,7 +130,7 @@ class Function(Node):
 
 @dataclass(frozen=True)
 class Step:
-    """Statements that make one variable, or one array, which is then still to be declared."""
+    """Statements that make one variable, or one array, which is not declared yet."""
 
     makes: str
     code: tuple[Statement, ...]
@@ -140,24 +138,24 @@ class Step:
 
     @cached_property
     def uses(self) -> frozenset[str]:
-        """The names of what it is made from."""
+        """Names that the statements read."""
         return names(self.code) - {self.makes}
 
 
 def walk(node: Any) -> Iterator[Any]:
-    """A node, or a tuple of nodes, and all that is in it."""
+    """Iterate over a node, or a tuple of nodes, and all its descendants."""
     yield node
     for inside in node if isinstance(node, tuple) else vars(node).values() if isinstance(node, Node) else ():
         yield from walk(inside)
 
 
 def names(node: Any) -> frozenset[str]:
-    """The names that references in a node have."""
+    """Names of the references in a node."""
     return frozenset(one.name for one in walk(node) if isinstance(one, Reference))
 
 
 def renamed(node: Any, others: Mapping[str, str]) -> Any:
-    """A node in which some variables and arrays have other names."""
+    """Rename some variables and arrays in a node."""
     if isinstance(node, tuple):
         return tuple(renamed(one, others) for one in node)
     if not isinstance(node, Node):
@@ -168,17 +166,16 @@ def renamed(node: Any, others: Mapping[str, str]) -> Any:
 
 
 def nested(shape: Sequence[int], *body: Statement) -> Statement:
-    """Statements in a loop over each axis, of which there is at least one."""
+    """Nest statements in a loop over each axis, of which there must be at least one."""
     for counter, size in reversed(list(enumerate(shape))):
         body = (Loop(counter, size, body),)
     return body[0]
 
 
 def arranged(steps: Sequence[Step], results: frozenset[str], end: Sequence[Statement]) -> tuple[Statement, ...]:
-    """The body of a function: the steps that its end needs, which reads `results`, with arrays declared, and the end.
+    """Assemble the body of a function: the steps that its end needs, which reads `results`, and the end.
 
-    An array takes the place of one of its type, and of its size or more, that is not read any more: compilers keep each
-    on the stack.
+    Arrays that are no longer read are reused if type and size allow, because compilers keep each on the stack.
     """
     steps = _needed(steps, results)
     last = {name: i for i, step in enumerate(steps) for name in step.uses}
@@ -202,7 +199,7 @@ def arranged(steps: Sequence[Step], results: frozenset[str], end: Sequence[State
 
 
 def _needed(steps: Sequence[Step], results: frozenset[str]) -> list[Step]:
-    """The steps without those that the results do not need."""
+    """Remove steps that the results do not need."""
     kept, wanted = [], set(results)
     for step in reversed(steps):
         if step.makes in wanted:

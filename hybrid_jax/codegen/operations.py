@@ -1,7 +1,7 @@
-"""Translate JAX programs into C99: few entries as expressions, of which zeros and ones vanish, many as loops.
+"""Translate JAX programs into C99: a few entries as expressions, simplified at zeros and ones, many as loops.
 
-A column is a NumPy array of objects: numbers (floats, or bools), and `Entry` for what is computed. Sparse Jacobians of
-physics thus become straight code, and layers of a network loops over tables and arrays.
+A column is a NumPy array of objects: numbers (floats or bools), and `Entry` for computed values. Sparse Jacobians of
+physics become straight-line code, and network layers become loops over tables and arrays.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -57,7 +57,7 @@ _NUMBERS: dict[str, Callable] = {
 
 @dataclass
 class CTranslation(Translation[np.ndarray]):
-    """Writes the body of one function; `tables` are shared by all functions of a file."""
+    """Translates the body of one function; `tables` are shared by all functions of a file."""
 
     language: ClassVar[str] = "C"
     operations: ClassVar[dict[str, Callable]] = dict.fromkeys(
@@ -102,7 +102,7 @@ class CTranslation(Translation[np.ndarray]):
         return column(self._scalar(name, operands) if one is None else one for one, operands in pairs)
 
     def scan(self, equation, inputs):
-        """A function of one of the arrays, called in a loop; none of them may need the result of another."""
+        """Call a function of one array in a loop; no iteration may need the result of another."""
         inner, count, shared = (equation.params[key] for key in ("jaxpr", "length", "num_consts"))
         if equation.params["num_carry"]:
             raise self._refusal(equation)
@@ -129,7 +129,7 @@ class CTranslation(Translation[np.ndarray]):
         return [Entries(part, one.aval.shape) for part, one in parts]  # pyright: ignore[reportAttributeAccessIssue]
 
     def _passed(self, value: Value, shape: tuple[int, ...], stride: int) -> "_Passed":
-        """How a value, or an array of this shape in it, comes into a function that is called for each of these."""
+        """Pass a value, or each array of this shape in it, to a function."""
         if not stride and not isinstance(value, Entries):
             return _Passed(value)  # a constant, which the function may as well have
         entries, size = self._column(value), int(np.prod(shape))
@@ -144,7 +144,7 @@ class CTranslation(Translation[np.ndarray]):
     def body(
         self, results: Sequence[np.ndarray], outs: Sequence[str], begins: Iterable[int] = repeat(0)
     ) -> tuple[Statement, ...]:
-        """The statements of a function that fills some arrays with these results, from some places on."""
+        """Generate the statements that fill arrays with results, from `begins` on."""
         filled = zip(outs, results, begins, strict=False)
         end = [one for out, result, begin in filled for one in loops.stores(out, result, begin)]
         return arranged(self.steps, frozenset().union(*(names(tuple(one)) for one in results)), end)
@@ -174,7 +174,7 @@ class CTranslation(Translation[np.ndarray]):
         return result.ravel()
 
     def _loops(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """A B as loops: of a matrix and a vector if one of them is one, else of two matrices."""
+        """A B as loops, for a matrix and a vector or for two matrices."""
         (m, k), n = a.shape, b.shape[1]
         if m == 1 and n > 1 and loops.is_contiguous(b.T.ravel()):
             return self._loops(b.T, a.T).T
@@ -200,7 +200,7 @@ class CTranslation(Translation[np.ndarray]):
         return self._scalar(name, operands) if simple is None else simple
 
     def _simple(self, name: str, operands: Sequence) -> Any:
-        """The result where it needs no operation, or None."""
+        """Return the result if no operation is needed, else None."""
         if name in _NUMBERS and all(isinstance(one, float) for one in operands):
             return _NUMBERS[name](*operands)
         match name, *operands:
@@ -225,7 +225,7 @@ class CTranslation(Translation[np.ndarray]):
         return found
 
     def _loop(self, name: str, columns: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray | None:
-        """An operation on each entry as a loop, or None if the columns do not have their entries in order."""
+        """Apply an operation to each entry in a loop; None if the entries of a column are not in order."""
         operands = [loops.indexed(self.tables, one, shape) for one in columns]
         known = [one for one in operands if one is not None]
         if len(known) < len(operands):
@@ -234,7 +234,7 @@ class CTranslation(Translation[np.ndarray]):
         return self._filled(int(np.prod(shape)), lambda out: loops.mapping(out, value, shape), name in LOGICAL)
 
     def _gathered(self, entries: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
-        """The entries, of an array of this shape, one after the other in one array, copied there unless they are."""
+        """Make entries contiguous in one array, by copying if necessary."""
         if loops.is_contiguous(entries):
             return entries
         logical = any(self._is_logical(one) for one in entries)
@@ -243,7 +243,7 @@ class CTranslation(Translation[np.ndarray]):
         return self._filled(len(entries), lambda out: loops.stores(out, entries), logical)
 
     def _compact(self, entries: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Entries of an array of this shape, of which each that is there along a whole axis is copied once."""
+        """Make entries addressable in a loop; entries that repeat along an axis are copied once."""
         if loops.indexed(self.tables, entries, shape) is not None:
             return entries
         grid = entries.reshape(shape)
@@ -255,7 +255,7 @@ class CTranslation(Translation[np.ndarray]):
     def _filled(
         self, size: int, fill: Callable[[str], Statement | tuple[Statement, ...]], logical: bool = False
     ) -> np.ndarray:
-        """A new array; `fill` gives the statements that fill that of a name."""
+        """Make a new array filled by the statements of `fill(name)`."""
         name = self.tables.name("a")
         code = fill(name)
         self.steps.append(Step(name, code if isinstance(code, tuple) else (code,), Array(name, size, logical)))
@@ -267,7 +267,7 @@ class CTranslation(Translation[np.ndarray]):
 
 
 class _Passed(NamedTuple):
-    """A value as a function has it, and how it comes in; a constant does not."""
+    """A value inside a function and its argument, except for constants."""
 
     inside: Value
     parameter: Parameter | None = None
@@ -279,7 +279,6 @@ def _operation(name: str, operands: Sequence[Expression]) -> Operation:
 
 
 def column(entries: Iterable[Any]) -> np.ndarray:
-    """An array of objects."""
     listed = list(entries)
     made = np.empty(len(listed), object)
     made[:] = listed
@@ -287,5 +286,4 @@ def column(entries: Iterable[Any]) -> np.ndarray:
 
 
 def is_zero(entries: np.ndarray) -> bool:
-    """Whether these are numbers, and all 0."""
     return all(isinstance(one, float) and one == 0 for one in entries)

@@ -1,4 +1,4 @@
-"""Nodes as C99: the one place that knows how C looks."""
+"""Print nodes as C99."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -27,12 +27,12 @@ OPERATIONS = (*MATH, *CALLED, *PREFIX, *INFIX, "select_n")
 
 @dataclass(frozen=True)
 class CPrinter:
-    """Writes nodes in double precision, or in single."""
+    """Prints nodes in double or single precision."""
 
     double: bool
 
     def number(self, value: float) -> str:
-        """A number, in brackets if it is negative."""
+        """Print a number, in brackets if negative."""
         if not np.isfinite(value):
             return "((real)NAN)" if value != value else f"((real){'-' if value < 0 else ''}INFINITY)"
         digits = repr(value) if self.double else f"{np.float32(value):.9g}"
@@ -41,7 +41,7 @@ class CPrinter:
         return f"({digits})" if value < 0 else digits
 
     def expression(self, node: Any) -> str:
-        """An expression, without brackets around it."""
+        """Print an expression without brackets around it."""
         match node:
             case bool() | int():
                 return str(int(node))
@@ -75,7 +75,7 @@ class CPrinter:
         return ", ".join(map(self.expression, expressions))
 
     def statement(self, node: nodes.Statement) -> str:
-        """A statement, on one line."""
+        """Print a statement on one line."""
         match node:
             case nodes.Variable(name, value, logical, constant):
                 return f"{'const ' * constant}{_kind(logical)} {name} = {self.expression(value)};"
@@ -91,22 +91,19 @@ class CPrinter:
                 return f"for (int {i} = {start}; {i} < {stop}; ++{i}) " + (inside if alone else f"{{ {inside} }}")
 
     def body(self, statements: Iterable[nodes.Statement]) -> str:
-        """The lines of a function's body."""
         return "\n".join(f"    {self.statement(one)}" for one in statements)
 
     def function(self, node: nodes.Function) -> str:
-        """The definition of a function."""
         parameters = ", ".join(map(_parameter, node.parameters))
         return f"static void {node.name}({parameters}) {{\n{self.body(node.body)}\n}}\n"
 
     def table(self, name: str, numbers: np.ndarray) -> str:
-        """The definition of a table."""
         rows = (", ".join(self.number(float(one)) for one in numbers[i : i + 8]) for i in range(0, len(numbers), 8))
         lines = ",\n    ".join(rows)
         return f"static const real {name}[{len(numbers)}] = {{\n    {lines}}};"
 
     def shared(self, tables: Tables, *bodies: Sequence[nodes.Statement]) -> dict[str, str]:
-        """The tables and the functions that bodies of functions use, as parts of a template."""
+        """Print the tables and functions that bodies use, as parts of a template."""
         code = (*tables.functions, *bodies)
         read, every = nodes.names(code), list(nodes.walk(code))
         called = {one.function for one in every if isinstance(one, nodes.Call)}

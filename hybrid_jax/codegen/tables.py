@@ -1,4 +1,4 @@
-"""What the functions of one file share."""
+"""Tables, functions and names that the functions of one file share."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,12 +10,12 @@ from hybrid_jax.codegen.nodes import Function, Parameter, Statement
 
 @dataclass
 class Tables:
-    """Tables of numbers, functions that others call, and names that are not taken.
+    """Tables of numbers, called functions, and unused names.
 
     Attributes:
-        double: whether numbers are kept in double precision, else in single.
+        double: whether numbers are in double instead of single precision.
         numbers: tables by name.
-        functions: each after those that it calls.
+        functions: functions, each after the functions that it calls.
     """
 
     double: bool
@@ -25,17 +25,16 @@ class Tables:
     _count: int = 0
 
     def name(self, letter: str) -> str:
-        """A new name."""
         self._count += 1
         return f"{letter}{self._count}"
 
     def function(self, parameters: Sequence[Parameter], body: tuple[Statement, ...]) -> str:
-        """The name of a new function."""
+        """Add a function and return its name."""
         self.functions.append(Function(self.name("f"), tuple(parameters), body))
         return self.functions[-1].name
 
     def table(self, numbers: np.ndarray) -> str:
-        """The name of a table of these numbers."""
+        """Add a table, or reuse an equal one, and return its name."""
         numbers = np.asarray(numbers, float if self.double else np.float32)
         name = self._known.setdefault(numbers.tobytes(), f"c{len(self._known)}")
         self.numbers[name] = numbers

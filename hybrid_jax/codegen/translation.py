@@ -1,7 +1,7 @@
-"""Walk a JAX program operation by operation, to write it in another language.
+"""Walk a JAX program operation by operation to translate it into another language.
 
-A value that does not depend on the arguments is a NumPy array. One that does is a column of its entries, in row-major
-order, and its shape; what a column is, the language says (`Translation`).
+A value that does not depend on the arguments is a NumPy array. Any other value is a shape and a column of its entries
+in row-major order; each language defines its columns (`Translation`).
 """
 
 from abc import ABC, abstractmethod
@@ -28,41 +28,41 @@ Value = np.ndarray | Entries
 
 
 class Translation(ABC, Generic[Column]):
-    """How the operations of a program look in a language, on columns."""
+    """Operations of a program on the columns of a language."""
 
     language: ClassVar[str]
     operations: ClassVar[dict[str, Callable]]  # entry by entry, name → from columns, and the exponent of integer_pow
 
     @abstractmethod
     def known(self, array: np.ndarray) -> Column:
-        """A column of numbers."""
+        """Make a column of numbers."""
 
     @abstractmethod
     def join(self, columns: Sequence[Column]) -> Column:
-        """One column below the other."""
+        """Concatenate columns."""
 
     @abstractmethod
     def take(self, column: Column, places: Sequence[int]) -> Column:
-        """The entries at these indices."""
+        """Select entries by index."""
 
     @abstractmethod
     def entrywise(self, name: str, columns: Sequence[Column], shape: tuple[int, ...], parameters: tuple) -> Column:
-        """An operation on columns of the entries of arrays of this shape, or of one entry."""
+        """Apply an operation entrywise to columns of this shape, or of one entry."""
 
     @abstractmethod
     def fold(self, name: str, rows: Sequence[Column]) -> Column:
-        """The sum, product, maximum or minimum of the rows, entry by entry."""
+        """Reduce the rows entrywise by sum, product, maximum or minimum."""
 
     @abstractmethod
     def matrix_product(self, left: Column, right: Column, sizes: tuple[int, int, int]) -> Column:
-        """A B of A (m × k) and B (k × n), sizes (m, k, n)."""
+        """Multiply A (m × k) by B (k × n), sizes (m, k, n)."""
 
     def scan(self, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """The same program on each of several arrays, which most languages here do not know."""
+        """Apply one program to each of several arrays; unsupported by most languages here."""
         raise self._refusal(equation)
 
     def run(self, program: ClosedJaxpr, arguments: Sequence["Value"]) -> list[Column]:
-        """The results of a program as columns; ValueError, with its name, for an unknown operation."""
+        """Translate a program and return its results as columns; raise ValueError for an unknown operation."""
         return [self._column(value) for value in self._run(program.jaxpr, program.consts, arguments)]
 
     def _run(self, program: Jaxpr, constants: Sequence[Any], arguments: Sequence[Value]) -> list[Value]:
@@ -118,14 +118,14 @@ class Translation(ABC, Generic[Column]):
         return self.entrywise(name, [self._spread(value, shape) for value in inputs], shape, parameters)
 
     def _spread(self, value: Value, shape: tuple[int, ...]) -> Column:
-        """The column of a value broadcast to a shape, as in NumPy; single entries stay one."""
+        """Broadcast a value to a shape as in NumPy; single entries stay single."""
         column = self._column(value)
         if value.shape == shape or np.prod(value.shape) == 1:
             return column
         return self.take(column, np.broadcast_to(_places(value), shape).ravel().tolist())
 
     def _moved(self, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """Operations that only move entries: JAX moves their indices, then the entries are taken at these."""
+        """Translate operations that only move entries, by applying them to indices in JAX."""
         columns, sent, count = [], list(inputs), 0
         for i in MOVES[equation.primitive.name](len(inputs)):
             places = _places(inputs[i])
@@ -144,7 +144,7 @@ class Translation(ABC, Generic[Column]):
         return [entries(places) for places in _evaluated(equation, sent)]
 
     def _linear(self, equation: JaxprEqn, inputs: list[Value]) -> Column:
-        """Operations that are linear in their data, as a matrix times each column."""
+        """Translate operations that are linear in their data, as a matrix times each column."""
         data = LINEAR[equation.primitive.name]
         if any(isinstance(value, Entries) for i, value in enumerate(inputs) if i not in data):
             raise self._refusal(equation, " at a place that depends on x or u")
@@ -167,14 +167,14 @@ class Translation(ABC, Generic[Column]):
         return self.fold(FOLDS[name], [self.take(column, row.tolist()) for row in rows])
 
     def _product(self, left: Value, right: Value, dimension_numbers) -> Column:
-        """dot_general: the axes of the result are the batch axes, those of the left and those of the right."""
+        """dot_general: the result's axes are the batch axes, then the left's, then the right's."""
         (of_left, of_right), (common_left, common_right) = dimension_numbers
         rows, m, k = self._matrices(left, of_left, common_left, last=True)
         columns, n, _ = self._matrices(right, of_right, common_right, last=False)
         return self.join([self.matrix_product(a, b, (m, k, n)) for a, b in zip(rows, columns, strict=True)])
 
     def _matrices(self, value: Value, contracted, common, last: bool) -> tuple[list[Column], int, int]:
-        """For each index of the batch axes a matrix, its contracted axes last or first, and the sizes of its axes."""
+        """Return a matrix per batch index, contracted axes last or first, and the sizes of its axes."""
         free = [axis for axis in range(len(value.shape)) if axis not in (*contracted, *common)]
         inner = (*free, *contracted) if last else (*contracted, *free)
         batches, m, k = (int(np.prod([value.shape[axis] for axis in axes])) for axes in (common, free, contracted))
@@ -184,7 +184,7 @@ class Translation(ABC, Generic[Column]):
 
 
 def _evaluated(equation: JaxprEqn, inputs: Sequence[Any]) -> list[Any]:
-    """The results of an operation on numbers: by NumPy for what is frequent, else by JAX, which compiles each anew."""
+    """Evaluate an operation on numbers, with NumPy if it is frequent, because JAX compiles each anew."""
     if (move := _BY_NUMPY.get(equation.primitive.name)) is not None:
         return [move(equation.params, *map(np.asarray, inputs))]
     found = equation.primitive.bind(*map(jnp.asarray, inputs), **equation.params)
@@ -227,7 +227,7 @@ _BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
 
 
 def _places(value: Value) -> np.ndarray:
-    """The index in its column of each entry of a value, in the value's shape."""
+    """Return the index in its column of each entry, in the value's shape."""
     return np.arange(int(np.prod(value.shape))).reshape(value.shape)
 
 
