@@ -1,6 +1,6 @@
-"""Kernels in C++ for rollouts of many windows; where they do not serve, JAX does the same to rounding.
+"""C++ kernels for rollouts of many windows in single precision with AVX2; otherwise JAX gives the same to rounding.
 
-They serve single precision on a processor with AVX2. A run should be continued the way it began.
+You should resume a run with the same kernels that it began with.
 """
 
 from hybrid_jax.kernels.fields import REFUSED
@@ -13,7 +13,7 @@ __all__ = ["status"]  # the rest is for the library's own modules
 
 
 def status() -> str:
-    """Whether kernels are used in this process: "used", or why not; and of which fields not, in a line for each."""
+    """Say whether this process uses kernels ("used" or why not), with a line for each unsupported field."""
     if (reason := obstacle()) is not None:
         return f"not used: {reason}"
     return "\n".join(["used", *(f"not for {name}: {why}" for name, why in sorted(REFUSED.items()))])

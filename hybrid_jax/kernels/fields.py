@@ -1,8 +1,8 @@
-"""Fields as kernels: what a field computes of one sample, as source.
+"""Generate kernels from fields, as source code for one sample.
 
-A field is taken apart into weights, functions of what it learns that JAX evaluates once a rollout, and a program of one
-sample of these, x and u: forward, and backward by `jax.vjp`. Batch normalisation couples samples: the program then is
-of its result n as well, and returns beside ẋ what it is made of, z and the weights W, γ and β; see cpp/rollout.h.
+A field is split into weights, functions of its parameters that JAX evaluates once per rollout, and a program of one
+sample of these, x and u: forward, and backward by `jax.vjp`. Batch normalisation couples samples, so the program also
+takes its result n and returns z and the weights W, γ and β besides ẋ; see cpp/rollout.h.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ REFUSED: dict[str, str] = {}  # a field, as `_name` has it → why there is no k
 
 
 class Sizes(NamedTuple):
-    """Numbers of x, of u, and of what the layer with batch normalisation reads and has of units, or 0."""
+    """Sizes of x, u, and the input and output of the layer with batch normalisation, or 0."""
 
     d: int
     m: int
@@ -37,7 +37,7 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """What serves a field: the library, and how the field's arrays become its weights."""
+    """The library for a field, and the conversion of the field's arrays to its weights."""
 
     prefix: str
     sizes: Sizes
@@ -46,17 +46,17 @@ class Kernel:
     epsilon: float
 
     def weights(self, field: PyTree) -> Array:
-        """The weights of a field in one array."""
+        """Concatenate the weights of a field."""
         return _joined(self.forward, jax.tree.leaves(eqx.filter(field, _is_array)))
 
     def apart(self, weights: Array) -> list[Array]:
-        """The weights from one array."""
+        """Split the weights into arrays."""
         shapes = self.forward.shapes
         parts = jnp.split(weights, np.cumsum([one.size for one in shapes])[:-1]) if shapes else []
         return [part.reshape(one.shape) for part, one in zip(parts, shapes, strict=True)]
 
     def back_weights(self, weights: Array) -> Array:
-        """Those of the way back."""
+        """Compute the weights of the backward pass."""
         assert self.back is not None
         return _joined(self.back, self.apart(weights))
 
@@ -71,7 +71,7 @@ def _joined(apart: Split, arrays: Sequence[Array]) -> Array:
 
 
 def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
-    """The kernel of a field of d states and m inputs, or None; `REFUSED` then has the reason."""
+    """Return the kernel of a field with d states and m inputs, or None with the reason in `REFUSED`."""
     arrays, rest = eqx.partition(field, _is_array)
     shapes, structure = jax.tree.flatten(jax.tree.map(lambda leaf: Shape(jnp.shape(leaf), leaf.dtype), arrays))
     static, frame = jax.tree.flatten(rest)
@@ -96,7 +96,7 @@ _KNOWN: dict[Any, Kernel] = {}
 
 
 def _name(field: Any) -> str:
-    """The class of a field, with those of the modules in it, or the name of a function."""
+    """Name the class of a field with its modules' classes, or a function."""
     modules = [part for part in vars(field).values() if isinstance(part, eqx.Module)] if _is_module(field) else []
     own = getattr(field, "__qualname__", type(field).__name__)
     return f"{own}({', '.join(map(_name, modules))})" if modules else own
@@ -107,7 +107,7 @@ def _is_module(node: Any) -> bool:
 
 
 def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
-    """The kernel of a field of shapes in place of arrays."""
+    """Make the kernel of a field whose arrays are replaced by shapes."""
     shapes, structure = jax.tree.flatten(eqx.filter(field, _is_shape))
     rest, norm = eqx.filter(field, _is_shape, inverse=True), _norm_of(field) if training else None
     epsilon, units = (norm.epsilon, norm.gain.size) if norm else (0.0, 0)
@@ -143,7 +143,7 @@ def _norm_of(field: PyTree) -> BatchNorm | None:
 
 
 class _Given(AbstractNorm):
-    """In place of batch normalisation: it tells what that is made of, and returns what it is given."""
+    """Replaces batch normalisation: records its arguments and returns a given result."""
 
     norm: BatchNorm
     normal: Array
@@ -155,7 +155,7 @@ class _Given(AbstractNorm):
 
 
 def _apart(field: PyTree, x: Array, u: Array, n: Array) -> list[Array]:
-    """ẋ where batch normalisation returns n, and what that is made of: z, W, γ and β."""
+    """Compute ẋ with a given result n of batch normalisation, and its inputs z, W, γ and β."""
     read: list[list[Array]] = []
     norm = _norm_of(field)
     assert norm is not None
@@ -168,7 +168,7 @@ def _apart(field: PyTree, x: Array, u: Array, n: Array) -> list[Array]:
 
 
 def _check_methods(node: Any, method: str) -> None:
-    """Refuse a field with a batched form of a user's own, which may be another function than that of one sample."""
+    """Reject a field with a user-defined batched method, which may differ from the method for one sample."""
     own = getattr(type(node), method, None)
     if own is not None and not own.__module__.startswith("hybrid_jax."):
         raise ValueError(f"{type(node).__name__} has a {method} of its own")

@@ -1,10 +1,8 @@
-"""A library of C++ that XLA calls: compiled by GCC at first use, kept in the user's cache folder, checked and loaded.
+"""Compile C++ with GCC for XLA at first use, cache it in the user's folder, verify it and load it.
 
-GCC works while XLA compiles what calls the library; the first call waits for it. So results do not depend on when it is
-there, and a run that is resumed goes on as it began.
-
-What is kept is code, so the folder must be the user's alone, and a library that is not as it was written is compiled
-anew. HYBRID_JAX_NATIVE=0 switches kernels off; `obstacle` tells what else does.
+GCC runs while XLA compiles the caller, and the first call waits for it, so results do not depend on timing. Because the
+cache contains code, its folder must belong to the user, and a library whose checksum is wrong is recompiled.
+HYBRID_JAX_NATIVE=0 disables kernels; `obstacle` reports other reasons.
 """
 
 import contextlib
@@ -41,12 +39,12 @@ _LOCK = threading.Lock()  # programs are traced in several threads
 
 
 class Unusable(Exception):
-    """Why there is no library."""
+    """The library is unavailable."""
 
 
 @cache
 def obstacle() -> str | None:
-    """Why there are no kernels in this process, or None."""
+    """Return why kernels are unavailable in this process, or None."""
     try:
         _check_machine()
         _folder()
@@ -58,13 +56,13 @@ def obstacle() -> str | None:
 
 
 def compiled(source: str, needs_math: bool) -> str:
-    """What the names of XLA's targets of a source begin with, once it is compiled and registered; else Unusable."""
+    """Compile and register a source; return the prefix of its XLA targets, or raise Unusable."""
     with _LOCK:
         return _registered(source, needs_math)
 
 
 def call(handler: str, results: Results, *arrays, numbers: Sequence[float] = ()):
-    """What a kernel makes of the arrays, whose number, type and shapes it does not check, and of some fixed numbers.
+    """Call a kernel on arrays, whose number, type and shapes are not checked, and constants.
 
     Lanes under `vmap` are one call.
     """
@@ -73,7 +71,7 @@ def call(handler: str, results: Results, *arrays, numbers: Sequence[float] = ())
 
 
 def with_derivative(kernel: Callable, plain: Callable) -> Callable:
-    """The kernel, which for a second derivative becomes the same in plain JAX."""
+    """Wrap a kernel so that its second derivative uses plain JAX."""
     function = jax.custom_jvp(kernel)
     function.defjvp(lambda arrays, tangents: jax.jvp(plain, arrays, tangents))
     return function
@@ -96,7 +94,7 @@ def _compiler() -> str | None:
 
 @cache
 def _registered(source: str, needs_math: bool) -> str:
-    """Registers the library if it is there, else doors to it, behind which it is compiled."""
+    """Register the library if it exists, else placeholders that wait for its compilation."""
     begin = f"hybrid_jax_{_digest(source)}_"
     handlers = HANDLERS if "#define TRAINING 1" in source else HANDLERS[:1]
     try:
@@ -144,14 +142,14 @@ def _digest(source: str) -> str:
 
 @cache
 def _made_by() -> str:
-    """What a library depends on besides its source."""
+    """Describe what a library depends on besides its source."""
     compiler = Path(_compiler() or "").resolve()
     made_by = compiler, compiler.stat().st_mtime_ns, OPTIONS, jax.__version__, runtime.machine()[-2:]
     return "".join(path.read_text() for path in sorted(SOURCES.iterdir())) + repr(made_by)
 
 
 def _folder() -> Path:
-    """The folder of libraries, which nobody else may read or write."""
+    """Return the cache folder, which must not be accessible to others."""
     folder = Path(platformdirs.user_cache_dir("hybrid_jax")) / "kernels"
     folder.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
@@ -163,7 +161,7 @@ def _folder() -> Path:
 
 
 def _checked_library(digest: str, source: str, needs_math: bool) -> Path:
-    """The file of the library, compiled if there is none, or none that is as it was written."""
+    """Return the library's file, compiled if it is missing or corrupt."""
     library = _folder() / f"{digest}.so"
     if not _is_whole(library):
         _compile(library, source, needs_math)
@@ -172,7 +170,7 @@ def _checked_library(digest: str, source: str, needs_math: bool) -> Path:
 
 
 def _is_whole(library: Path) -> bool:
-    """Whether the checksum at its end, which loaders do not read, is that of the rest."""
+    """Whether the checksum at the end, which loaders ignore, matches the rest."""
     content = library.read_bytes() if library.exists() else b""
     return content[-CHECKSUM:] == hashlib.sha256(content[:-CHECKSUM]).digest()
 

@@ -1,4 +1,4 @@
-"""Rollouts of many windows by the kernel of a field: all intervals in one call, and its derivative in another."""
+"""Rollouts of many windows by a field's kernel: one call for all intervals, and one for the derivative."""
 
 from functools import partial
 from typing import Any
@@ -19,19 +19,19 @@ VECTOR = 16  # numbers in a vector, at most: of windows the kernels take at leas
 
 
 def serves_training(field, x0: Shaped, u: Shaped, solver: Solver, windows_axis: int) -> bool:
-    """Whether `trained` serves a minibatch of these shapes, whose windows lie along an axis."""
+    """Whether `trained` supports a minibatch of these shapes with windows along an axis."""
     return _kernel(field, x0, u, solver, 1, windows_axis, True) is not None
 
 
 def trained(field, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1) -> Any:
-    """The trajectories (t, d, b) of a minibatch in training mode, or None if no kernel is for them."""
+    """Return the trajectories (t, d, b) of a minibatch in training mode, or None without a kernel."""
     if (kernel := _kernel(field, x0, u, solver, substeps, -1, True)) is None:
         return None
     return _rollout((kernel, float(dt)), kernel.weights(field), jnp.asarray(x0), jnp.asarray(u))
 
 
 def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, solver: Solver):
-    """The trajectories (n, t, d) of windows x0 (n, d), u (n, t, m) in inference mode, or None without a kernel."""
+    """Return the trajectories (n, t, d) for x0 (n, d), u (n, t, m) in inference mode, or None without a kernel."""
     if (kernel := _kernel(field, x0, u, solver, 1, 0, False)) is None:
         return None
     last = jnp.moveaxis(jnp.asarray(x0), 0, -1), jnp.moveaxis(jnp.asarray(u), 0, -1)
@@ -39,7 +39,7 @@ def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, s
 
 
 def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, substeps: int, axis: int, training: bool) -> Kernel | None:
-    """The kernel for these arrays, of which it checks no shapes itself."""
+    """Return the kernel for these arrays, whose shapes it does not check itself."""
     if type(solver) is not RK4 or (solver.substeps, substeps) != (1, 1) or (x0.ndim, u.ndim) != (2, 3):
         return None
     if x0.shape[axis] != u.shape[axis] or x0.shape[axis] < VECTOR or library.obstacle() is not None:
@@ -52,7 +52,7 @@ def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, substeps: int, axis: i
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _rollout(kernel_and_dt: tuple[Kernel, float], *arrays: Array) -> Float[Array, "t d b"]:
-    """`_plain`, each way in one call."""
+    """Compute `_plain` by one call forward and one backward."""
     return _called(kernel_and_dt, 0, *arrays)[0]
 
 
@@ -75,7 +75,7 @@ def _plain(kernel_and_dt: tuple[Kernel, float], weights: Array, x0: Array, u: Ar
 
 
 def _called(kernel_and_dt: tuple[Kernel, float], kept: int, *arrays: Array) -> list[Array]:
-    """The states, and what is kept of each evaluation for the way back: so many numbers."""
+    """Return the states and the `kept` numbers per evaluation for the backward pass."""
     (kernel, dt), x0, u = kernel_and_dt, *arrays[-2:]
     results = [jax.ShapeDtypeStruct(shape, x0.dtype) for shape in ((len(u), *x0.shape), (kept,))]
 
@@ -97,7 +97,7 @@ def _forward(kernel_and_dt: tuple[Kernel, float], *arrays: Array):
 
 
 def _whole(count: int) -> int:
-    """A number of numbers in whole vectors."""
+    """Round a count up to whole vectors."""
     return -(-count // VECTOR) * VECTOR
 
 

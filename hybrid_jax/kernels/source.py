@@ -1,4 +1,4 @@
-"""The C++ of a field: programs of one sample, for a vector of samples at a time, before cpp/rollout.h."""
+"""Generate a field's C++: programs of one sample, vectorised over samples, for cpp/rollout.h."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ LARGEST = 8192  # numbers of arrays that a function holds for each sample
 
 
 class SampleTranslation(CTranslation):
-    """Of one sample of many: weights and constants are the same for all, and a matrix of them need not be copied."""
+    """Translates for one of many samples: weights and constants are shared, so their matrices are not copied."""
 
     language: ClassVar[str] = "kernels"
 
@@ -45,7 +45,7 @@ class SampleTranslation(CTranslation):
         return self._filled(m, lambda out: Call(f"dense<{m}, {k}>", (*given, Address(out)))).reshape(m, 1)
 
     def body(self, results, outs, begins):
-        """Loops over entries have in them what is cheap to compute, in place of arrays of it."""
+        """Inline cheap values in loops over entries instead of storing arrays."""
         filled = zip(outs, results, begins, strict=False)
         end = [one for out, result, begin in filled for one in loops.stores(out, result, begin)]
         known: dict[tuple[int, ...], dict[Any, Expression]] = {}  # shape → entry of an array → what it is
@@ -57,7 +57,7 @@ class SampleTranslation(CTranslation):
 
 
 def _inlined(statement: Statement, known: dict[tuple[int, ...], dict[Any, Expression]], makes: str = "") -> Statement:
-    """A loop over entries with known ones written out; what it makes is known then, if it is cheap."""
+    """Inline known entries in a loop; also record its result if that is cheap."""
     shape, inner = [], statement
     while isinstance(inner, nodes.Loop) and len(inner.body) == 1 and not inner.start:
         shape, inner = [*shape, inner.stop], inner.body[0]
@@ -78,7 +78,7 @@ def _inlined(statement: Statement, known: dict[tuple[int, ...], dict[Any, Expres
 
 
 def _merged(statements: Sequence[Statement]) -> list[Statement]:
-    """Loops of the same length as one."""
+    """Fuse loops of equal length."""
     bodies: dict[int, list[Statement]] = {}
     for one in statements:
         if isinstance(one, nodes.Loop):
@@ -88,7 +88,7 @@ def _merged(statements: Sequence[Statement]) -> list[Statement]:
 
 
 class SamplePrinter(CPrinter):
-    """Numbers of each sample are vectors, those of all samples are not; see cpp/samples.h."""
+    """Prints numbers of each sample as vectors and shared numbers as scalars; see cpp/samples.h."""
 
     def number(self, value: float) -> str:
         return super().number(value).replace("(real)", "")
@@ -127,7 +127,7 @@ Outputs = list[tuple[str, int]]  # arrays, and where in them the results begin
 
 
 class Source:
-    """The functions of a field, of its weights and of one sample: x, u, and n; see cpp/rollout.h."""
+    """Functions of a field's weights and of one sample: x, u, and n; see cpp/rollout.h."""
 
     def __init__(self, forward: Split, of_sample: Sequence[Shape], training: bool):
         self.tables = Tables(double=False)
@@ -140,7 +140,7 @@ class Source:
             self._add(name, given, program, self.places, ("x", "u", "n"), [("out", 0)])
 
     def _add_backward(self, forward: Split, of_sample: Sequence[Shape]) -> Split:
-        """`slope_back`, `products` and `read_back`, and what they take for weights, as a function of the weights."""
+        """Add `slope_back`, `products` and `read_back`; return their weights as a function of the weights."""
         count, (slope, read, *_) = len(forward.shapes), forward.program.out_avals
         parts = [jaxpr_as_fun(outputs_of(forward.program, [i])) for i in range(2)]
 
@@ -161,7 +161,7 @@ class Source:
         return back
 
     def _factors(self, products: Products) -> Outputs:
-        """Where the factors of products begin; `products` is the function that multiplies and sums them."""
+        """Return where the factors of products begin; `products` multiplies and sums them."""
         outputs, at, calls = [], 0, []
         for i, pairs in products.items():
             for rows, columns in pairs:
@@ -175,7 +175,7 @@ class Source:
         return outputs
 
     def _add(self, name: str, parameters: str, program: ClosedJaxpr, weights, inputs, outputs: Outputs) -> None:
-        """A function of weights, which begin at these places of `w`, and inputs, that fills the outputs."""
+        """Add a function of inputs and weights, which begin at these places of `w`, that fills the outputs."""
         starts = [*(("w", place) for place in weights), *((name, 0) for name in inputs)]
         arguments = [
             Entries(column(Entry(array, first + k) for k in range(one.size)), one.shape)
@@ -194,7 +194,6 @@ class Source:
         self.functions.append(f"void {name}({GIVEN}{parameters}) {{\n{text}\n}}\n")
 
     def text(self, constants: dict[str, int]) -> str:
-        """The whole source."""
         printer, read = SamplePrinter(double=False), nodes.names(tuple(self.bodies))
         head = [f"#define TRAINING {int(self.back is not None)}", '#include "samples.h"', "namespace {"]
         head += [f"constexpr int64_t {name} = {value};" for name, value in (constants | {"F": self.factors}).items()]
@@ -203,11 +202,11 @@ class Source:
         return "\n".join([*lines, "}  // namespace", '#include "rollout.h"', ""])
 
     def needs_math(self) -> bool:
-        """Whether functions of glibc's library of vectors are called."""
+        """Whether functions of glibc's vector library are called."""
         every = (one for one in nodes.walk(tuple(self.bodies)) if isinstance(one, Operation))
         return any(one.name in MATH and one.name not in ("floor", "ceil", "sqrt", "abs", "rem") for one in every)
 
 
 def _places(shapes: Sequence[Shape]) -> list[int]:
-    """Where each array begins of arrays one after the other."""
+    """Return where each array begins in the concatenation of all."""
     return np.cumsum([0, *(one.size for one in shapes)])[:-1].tolist()

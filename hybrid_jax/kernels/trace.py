@@ -1,4 +1,4 @@
-"""Programs of JAX taken apart: what depends on weights alone, what on each sample, and products that weights get."""
+"""Split JAX programs into a part of the weights, a part of each sample, and products for weight gradients."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -13,14 +13,14 @@ _NAMELESS = jax.make_jaxpr(lambda: ())().jaxpr.debug_info
 
 
 class Split(NamedTuple):
-    """A function of parameters and samples as one of weights and samples, with weights a function of parameters."""
+    """A function of parameters and samples, split into weights(parameters) and a program of weights and samples."""
 
     weights: ClosedJaxpr
     program: ClosedJaxpr
     shapes: list[Any]  # of the weights
 
     def place(self, output: int) -> int:
-        """Where among all weights an output begins, 0 if it is of no size; ValueError if it is none of them."""
+        """Return an output's offset among all weights, 0 if it is empty; raise ValueError if it is not a weight."""
         found, weights = self.program.jaxpr.outvars[output], self.program.jaxpr.invars[: len(self.shapes)]
         if not found.aval.size:  # pyright: ignore[reportAttributeAccessIssue]
             return 0
@@ -30,7 +30,7 @@ class Split(NamedTuple):
 
 
 def traced(function: Callable, *shapes: Any) -> ClosedJaxpr:
-    """The program of a function of arrays, with calls written out."""
+    """Trace a function of arrays and inline its calls."""
     program = jax.make_jaxpr(function)(*shapes)
     return jax.make_jaxpr(lambda *arrays: _evaluated(program.jaxpr, program.consts, arrays))(*shapes)
 
@@ -60,7 +60,7 @@ def _variables(atoms: Sequence[Any]) -> list[Var]:
 
 
 def outputs_of(program: ClosedJaxpr, outputs: Sequence[Any]) -> ClosedJaxpr:
-    """What these outputs, values of a program or their numbers, need of it."""
+    """Reduce a program to these outputs, given as values or indices."""
     jaxpr = program.jaxpr
     outs = [jaxpr.outvars[one] if isinstance(one, int) else one for one in outputs]
     return _program(jaxpr.eqns, jaxpr.invars, outs, program)
@@ -77,7 +77,7 @@ def _program(equations: Sequence[JaxprEqn], inputs: Sequence[Var], outputs: Sequ
 
 
 def split(program: ClosedJaxpr, parameters: int) -> Split:
-    """A program apart, whose first so many inputs are parameters; the others are samples."""
+    """Split a program whose first `parameters` inputs are parameters; the others are samples."""
     inputs, outputs = program.jaxpr.invars, program.jaxpr.outvars
     constant, known = set(program.jaxpr.constvars), set(inputs[:parameters])
     ahead, after, wanted = [], [], []
@@ -100,7 +100,7 @@ def split(program: ClosedJaxpr, parameters: int) -> Split:
 
 
 def with_factors(program: ClosedJaxpr, count: int) -> tuple[ClosedJaxpr, Products]:
-    """The program with, behind the other outputs, a and b in place of those of the first `count` that are Σ a bᵀ."""
+    """Replace the first `count` outputs that are Σ a bᵀ by a and b, appended to the other outputs."""
     made = {out: equation for equation in program.jaxpr.eqns for out in equation.outvars}
     outputs = program.jaxpr.outvars
     found = {i: pairs for i in range(count) if (pairs := _factors(outputs[i], made))}
@@ -111,7 +111,7 @@ def with_factors(program: ClosedJaxpr, count: int) -> tuple[ClosedJaxpr, Product
 
 
 def _factors(out: Any, made: dict[Any, JaxprEqn]) -> list[tuple[Any, Any]]:
-    """Each a and b of an array that is Σ a bᵀ; none if it is not."""
+    """Return each a and b of an array that is Σ a bᵀ; empty if it is not."""
     if isinstance(out, Literal) or out not in made:
         return []
     equation = made[out]
