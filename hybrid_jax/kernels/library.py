@@ -33,6 +33,15 @@ HANDLERS = "forward", "backward"
 OPTIONS = ["-std=c++17", "-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
 LONGEST = 300  # s to compile
 CHECKSUM = 32  # bytes
+# Runs a command; once standard input is closed, ends it with all that it began, and deletes the folder $0.
+WATCHED = """
+exec 3<&0
+{ read -r _ <&3; trap '' TERM; kill 0; rm -rf "$0"; } &
+"$@" 3<&- </dev/null
+code=$?
+kill $!
+exit $code
+"""
 
 Results = jax.ShapeDtypeStruct | Sequence[jax.ShapeDtypeStruct]
 _LOCK = threading.Lock()  # programs are traced in several threads
@@ -186,16 +195,30 @@ def _compile(library: Path, source: str, needs_math: bool) -> None:
             file.flush()
             os.fsync(file.fileno())  # there whole or not at all, also after a power cut
         os.replace(linked, library)
-    for path in library.parent.glob("*"):  # of other sources or compilers, and what a kill left half written
+    for path in library.parent.glob("*"):  # of other sources or compilers, and what was left half written
         with contextlib.suppress(FileNotFoundError):  # deleted by another process
-            if time.time() - path.stat().st_mtime > runtime.UNUSED:
+            if time.time() - path.stat().st_mtime > (2 * LONGEST if path.is_dir() else runtime.UNUSED):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _run_compiler(arguments: list[str]) -> None:
-    command = [_compiler() or "g++", *OPTIONS, *arguments]
+    """Compile into the folder of the last argument; if this process ends first, so do compiler and folder."""
+    command, folder = [_compiler() or "g++", *OPTIONS, *arguments], Path(arguments[-1]).parent
+    inside, held = os.pipe()  # closed by the system when this process ends, also by SIGKILL
     try:
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=LONGEST, start_new_session=True)
+        subprocess.run(
+            ["sh", "-c", WATCHED, folder, *command],
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=LONGEST,
+            stdin=inside,
+            env=os.environ | {"TMPDIR": str(folder)},
+            start_new_session=True,
+        )
     except subprocess.SubprocessError as error:
         said = [line for line in (getattr(error, "stderr", None) or "").splitlines() if "error" in line]
         raise Unusable(f"it could not be compiled: {(said or [f'{command[0]} fails'])[0]}") from error
+    finally:
+        os.close(inside)
+        os.close(held)

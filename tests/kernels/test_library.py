@@ -3,6 +3,8 @@
 import hashlib
 import itertools
 import os
+import subprocess
+import sys
 import threading
 import time
 
@@ -68,6 +70,25 @@ def test_a_library_is_compiled_once_and_whole_beside_its_checksum(cache):
     assert [one.name for one in folder.iterdir()] == [path.name]
 
 
+def test_a_killed_process_leaves_no_compiler_and_no_file(tmp_path):
+    compiler, alive = tmp_path / "compiler", tmp_path / "alive"
+    os.mkfifo(alive)
+    compiler.write_text(f"#!/bin/sh\nexec 9>{alive}\ntouch $TMPDIR/part\nsleep 40\n")  # sleep is a child, as cc1plus
+    compiler.chmod(0o700)
+    code = "from hybrid_jax.kernels import library; library._checked_library('0123', 'int source;', False)"
+    environment = os.environ | {"CXX": str(compiler), "XDG_CACHE_HOME": str(tmp_path)}
+    process = subprocess.Popen([sys.executable, "-c", code], env=environment)
+    with alive.open() as held:  # once the compiler runs
+        process.kill()
+        process.wait()
+        began = time.monotonic()
+        held.read()  # until the last that holds it has ended
+    assert time.monotonic() - began < 20
+    while any((tmp_path / "hybrid_jax" / "kernels").iterdir()):
+        assert time.monotonic() - began < 20
+        time.sleep(0.02)
+
+
 DAMAGES = {
     "cut in half": lambda path: path.write_bytes(path.read_bytes()[:4]),
     "empty": lambda path: path.write_bytes(b""),
@@ -91,7 +112,11 @@ def test_libraries_that_nobody_used_are_deleted_when_another_is_compiled(cache):
         (folder / name).touch()
     for name in ("unused.so", ".half.part"):
         os.utime(folder / name, (LONG_AGO, LONG_AGO))
+    for name, age in (("left", 3 * library.LONGEST), ("at_work", 0)):  # folders in which somebody compiled, or does
+        (folder / name).mkdir()
+        os.utime(folder / name, (time.time() - age,) * 2)
     path = checked()
+    (folder / "at_work").rmdir()
     assert {one.name for one in folder.iterdir()} == {path.name, "used.so"}
     os.utime(path, (LONG_AGO, LONG_AGO))
     assert checked().stat().st_mtime > LONG_AGO + 3600  # what is loaded counts as used
