@@ -201,7 +201,7 @@ class StateSpace:
         return sum(quantity.tangent_size for quantity in self.quantities)
 
     def padded(self, d: int) -> "StateSpace":
-        """This space extended to d numbers by quantities x[i]; empty if d is too small.
+        """This space extended to d numbers by quantities x[i]; only these if d is too small.
 
         Args:
             d: how many numbers a state has.

@@ -1,10 +1,10 @@
-"""From a motor's command to its rotor's speed: a static curve with the battery's voltage, and a first-order lag.
+"""Actuators: a static curve from motor command to rotor speed, which depends on the battery voltage, and a lag.
 
     w∞ = W(c (V / V₀)^γ),   τ ẇ = w∞ − w,   τ = τ_up where the rotor speeds up, τ_down where it slows down
 
-c is the command as a share of the largest, V the voltage [V]. W is a polynomial that gives the speed [rad/s], or the
-root of one that gives the thrust [N] of a rotor: W = √(f / k) with the nominal k of the vehicle. The voltage's exponent
-γ is 0 of a vehicle that corrects for its battery, and near 1 of one that does not.
+c is the command as a fraction of the largest, V the voltage [V]. W is a polynomial that gives the speed [rad/s], or
+W = √(f / k) with a polynomial f for the thrust [N] of a rotor and the vehicle's nominal k. The voltage exponent γ is 0
+for a vehicle that compensates for its battery voltage, and near 1 for one that does not.
 """
 
 from dataclasses import dataclass, replace
@@ -34,18 +34,18 @@ QUICKEST = 1e-3  # s, least time constant that is learned
 
 @dataclass(frozen=True)
 class Actuator:
-    """What stands between command and rotor: the table `[actuator]` of a vehicle file.
+    """The map from command to rotor speed: the table `[actuator]` of a vehicle file.
 
     Attributes:
         curve: coefficients c0, c1, … of Σ ci command^i, in the unit of what it gives.
         gives: "speed" of a rotor [rad/s], or its "thrust" [N].
-        time_constants: speeding up and slowing down [s]; one number stands for both.
+        time_constants: for speeding up and slowing down [s]; you can give one number for both.
         nominal_voltage: V₀ [V]; 0 if the voltage does not matter.
         voltage_exponent: γ.
-        delay: by which commands act later than the log says [s], one for a log.
+        delay: by how much commands act later than logged [s]; constant over a log.
 
     Raises:
-        ValueError: what a field is told to hold, and what it was given.
+        ValueError: an invalid field, with what was expected and the value.
     """
 
     curve: tuple[float, ...]
@@ -77,16 +77,16 @@ class Actuator:
 
 
 class Actuated(AbstractVectorField):
-    """A multirotor that is told commands: x = [state, rotor speeds] (13 + n), or (13) if nothing lags, u = [c, V].
+    """A multirotor driven by commands: x = [state, rotor speeds] (13 + n), or (13) without lag, u = [c, V].
 
-    u is one command for each rotor, and after them the battery's voltage where `nominal_voltage` is given.
+    u has one command for each rotor, followed by the battery voltage if `nominal_voltage` is given.
 
     Parameters are deviations from the nominal actuator that start at zero: of `curve` in units of its value at full
-    command, of time constants as logarithms, of the others as they are. `delay` shifts a log (`delayed`); the equations
-    do not know it.
+    command, of time constants as logarithms, of the others in their own unit. `delay` shifts a log (`delayed`); the
+    equations do not use it.
 
     Attributes:
-        body: the field that is told rotor speeds.
+        body: the field driven by rotor speeds.
         deviations: of each learned parameter, by name.
         actuator: nominal values of the curve, the lag, the voltage and the delay.
 
@@ -105,7 +105,7 @@ class Actuated(AbstractVectorField):
 
     @property
     def rotor_states(self) -> int:
-        """How many states follow the 13 of the body."""
+        """How many rotor speeds follow the 13 states of the body."""
         lags = {"time_constant", "time_constants"} & self.deviations.keys() or self.actuator.time_constants[0]
         return self.body.vehicle.rotors if lags else 0
 
@@ -122,17 +122,17 @@ class Actuated(AbstractVectorField):
 
     @property
     def state_size(self) -> int:
-        """How many numbers x has: 13, and the rotor speeds if they lag."""
+        """The size of x: 13, plus the rotor speeds if they lag."""
         return STATE_SIZE + self.rotor_states
 
     @property
     def input_size(self) -> int:
-        """How many numbers u has: a command for each rotor, and the voltage if it matters."""
+        """The size of u: a command for each rotor, plus the voltage if it matters."""
         return self.body.vehicle.rotors + self.reads_voltage
 
     @property
     def reads_voltage(self) -> bool:
-        """Whether the last input is the battery's voltage."""
+        """Whether the last input is the battery voltage."""
         return self.actuator.nominal_voltage > 0
 
     def theta(self) -> dict[str, Array]:
@@ -140,7 +140,6 @@ class Actuated(AbstractVectorField):
         return self.body.theta() | {name: self._value(name) for name in self.deviations}
 
     def _value(self, name: str) -> Array:
-        """A parameter of the actuator, learned or known."""
         at, known = self.deviations.get(name, 0.0), self.actuator
         if name == "curve":
             return jnp.asarray(known.curve) + abs(sum(known.curve) or 1.0) * jnp.asarray(at)
@@ -152,7 +151,7 @@ class Actuated(AbstractVectorField):
 
     @property
     def delay(self) -> Array:
-        """By how much commands act later than the log says [s]."""
+        """By how much commands act later than logged [s]."""
         return self._value("delay")
 
     def time_constants(self) -> Float[Array, "2"]:
@@ -163,7 +162,7 @@ class Actuated(AbstractVectorField):
         return self._value("time_constants")
 
     def steady_speeds(self, u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
-        """w∞ [rad/s]: the speeds at which the rotors settle under commands and voltage."""
+        """w∞ [rad/s]: the steady rotor speeds under commands and voltage."""
         vehicle = self.body.vehicle
         commands = u[: vehicle.rotors]
         if self.reads_voltage:
@@ -175,7 +174,7 @@ class Actuated(AbstractVectorField):
         return jnp.sqrt(jnp.maximum(value / vehicle.thrust_coefficient, least**2))
 
     def speeds(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
-        """w [rad/s]: of the state, or at once those of the commands."""
+        """w [rad/s]: the rotor speeds in the state or, without lag, the steady ones."""
         return x[STATE_SIZE:] if self.rotor_states else self.steady_speeds(u)
 
     def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
@@ -190,12 +189,10 @@ class Actuated(AbstractVectorField):
         return jnp.concatenate([changed, residual[STATE_SIZE:]])
 
     def settled(self, u: Float[Array, "t m"], dt: float) -> Float[Array, " n"]:
-        """The rotor speeds [rad/s] after the inputs u (t, m), that began in equilibrium with the first.
-
-        Exact for inputs that are held.
+        """The rotor speeds [rad/s] after the inputs u (t, m), from equilibrium; exact for piecewise constant inputs.
 
         Args:
-            dt: for how long each input is held [s].
+            dt: duration of each input [s].
         """
         targets, (up, down) = self.steady_speeds(u.T).T, self.time_constants()
         kept = jnp.exp(-dt / up), jnp.exp(-dt / down)
@@ -207,15 +204,15 @@ class Actuated(AbstractVectorField):
 
 
 def actuated(body: RigidBody, actuator: Actuator, learn: tuple[str, ...] = ()) -> Actuated:
-    """The body behind its actuators.
+    """The body with its actuators.
 
     Args:
-        body: the field that is told rotor speeds.
-        actuator: nominal values of what stands between command and rotor.
-        learn: names of the actuators' parameters that are learned, of `actuators.NAMES`; by default none.
+        body: the field driven by rotor speeds.
+        actuator: nominal values of the map from command to rotor speed.
+        learn: names of learned actuator parameters, from `actuators.NAMES`; by default none.
 
     Raises:
-        ValueError: as of `check_actuator_names`.
+        ValueError: see `check_actuator_names`.
     """
     check_actuator_names(learn, actuator, tuple(body.deviations))
     shapes = {"curve": (len(actuator.curve),), "time_constants": (2,)}
@@ -223,7 +220,7 @@ def actuated(body: RigidBody, actuator: Actuator, learn: tuple[str, ...] = ()) -
 
 
 def check_actuator_names(learn: tuple[str, ...], actuator: Actuator, of_body: tuple[str, ...] = ()) -> None:
-    """Raise ValueError for names not in `NAMES`, or that cannot be told apart or from those of the body."""
+    """Raise ValueError for names not in `NAMES`, or not identifiable together or with parameters of the body."""
     for name in learn:
         if name not in NAMES:
             raise ValueError(f"learn must be names of {', '.join(NAMES)}, got {checks.short_repr(name)}")
@@ -237,13 +234,13 @@ def check_actuator_names(learn: tuple[str, ...], actuator: Actuator, of_body: tu
 def rotor_speeds(
     field: Actuated, t: Float[np.ndarray, " n"], commands: Float[np.ndarray, "n m"], edges: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "k-1 r"]:
-    """The mean rotor speed [rad/s] of each interval, one row for each: a log of commands as one of rotor speeds.
+    """The mean rotor speed [rad/s] in each interval, one row each, to convert a log of commands to rotor speeds.
 
     Args:
-        field: the body behind its actuators.
-        t: times from which each input is held until the next (n) [s].
-        commands: inputs u of the field at these times, the voltage [V] last where it reads one (n, m).
-        edges: of the intervals, ascending (k) [s].
+        field: the body with its actuators.
+        t: times [s] (n,), from each of which an input is held until the next.
+        commands: inputs u of the field at these times, with the voltage [V] last if the field reads it (n, m).
+        edges: of the intervals, ascending (k,) [s].
     """
     u = np.asarray(held_means(jnp.asarray(t), jnp.asarray(commands), jnp.asarray(edges), field.delay))
     targets = np.asarray(field.steady_speeds(jnp.asarray(u.T)).T)
@@ -260,7 +257,7 @@ def rotor_speeds(
 def held_means(t: Numbers, values: Numbers, edges: Numbers, delay: Array | float = 0.0) -> Float[Array, "k-1 m"]:
     """The mean over each interval between `edges` (k) [s] of values (n, m) held from times t (n), `delay` [s] later.
 
-    Before the first time the first value holds. The derivative by the delay is right between jumps.
+    The first value also applies before the first time. The derivative by the delay is exact between jumps.
     """
     area = jnp.concatenate([jnp.zeros((1, values.shape[1])), jnp.cumsum(values[:-1] * jnp.diff(t)[:, None], axis=0)])
     at = edges - delay

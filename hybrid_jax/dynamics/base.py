@@ -29,11 +29,11 @@ Columns = Float[Array, "d c"]  # derivatives of d numbers in c directions
 class AbstractVectorField(eqx.Module):
     """ẋ = f(x, u). Every inexact array inside is learned (see `trainable`).
 
-    Its methods evaluate it on a batch, features first: x (d, b), u (m, b). Their defaults serve code for one sample; a
-    subclass overrides what it can do faster, and `as_field` gives them to any function.
+    Other methods evaluate it on a batch, features first: x (d, b), u (m, b). The defaults work for single-sample code;
+    override those that you can make faster. `as_field` adds them to any function.
 
     Attributes:
-        accepts_batch: whether `__call__` also accepts x (d, b) and u (m, b), for instance since it reads x[0], x[1], …
+        accepts_batch: whether `__call__` also accepts x (d, b) and u (m, b), for example because it reads x[0], x[1], …
     """
 
     accepts_batch: ClassVar[bool] = False
@@ -56,15 +56,15 @@ class AbstractVectorField(eqx.Module):
         return with_moved_stats(self, x, u)
 
     def apply_residual(self, x: Float[Array, " d *b"], residual: Float[Array, " d *b"]) -> Float[Array, " d *b"]:
-        """What a residual adds to ẋ of this physics: itself, unless its state shows forces elsewhere.
+        """The contribution of a residual to ẋ of this physics; by default the residual itself.
 
         Args:
-            residual: what a network returned, in units of ẋ (d,).
+            residual: output of a network, in units of ẋ (d,).
         """
         return residual
 
     def linearize(self, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns):
-        """ẋ of one sample in inference mode, and its derivative (d, c) along c directions.
+        """ẋ of one sample in inference mode, and its derivatives (d, c) along c directions.
 
         Args:
             dx: directions of the state, in columns (d, c).
@@ -73,7 +73,7 @@ class AbstractVectorField(eqx.Module):
         return jvp_columns(self, (x, u), (dx, du))
 
     def parameter_columns(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Columns:
-        """The derivative of ẋ of one sample along each of p learned numbers (d, p)."""
+        """The derivative of ẋ of one sample with respect to p learned numbers (d, p)."""
         theta, at = ravel_learned(self)
         return jax.jacfwd(lambda theta: at(theta)(x, u))(theta)
 
@@ -88,19 +88,18 @@ class AbstractVectorField(eqx.Module):
 
     @property
     def state_space(self) -> StateSpace:
-        """What its state is: by default what the first field inside it says that knows, else nothing."""
+        """The state space; by default that of the first field inside it that has one, else empty."""
         spaces = (part.state_space for part in _fields_inside(self))
         return next((space for space in spaces if space.quantities), StateSpace())
 
     @property
     def parameter_units(self) -> dict[str, str]:
-        """Units such as "kg m²" of its learned parameters, by name; by default those of the fields inside it."""
+        """Units of learned parameters by name, for example "kg m²"; by default those of the fields inside it."""
         inside = (part.parameter_units for part in _fields_inside(self))
         return {name: unit for units in inside for name, unit in units.items()}
 
 
 def _fields_inside(tree) -> list[AbstractVectorField]:
-    """The outermost fields in a tree, which is none of them."""
 
     def is_inside(node) -> bool:
         return node is not tree and isinstance(node, AbstractVectorField)
@@ -109,29 +108,28 @@ def _fields_inside(tree) -> list[AbstractVectorField]:
 
 
 def state_space(field: AbstractVectorField, d: int | None = None) -> StateSpace:
-    """What a state is to a field, or to what is no `AbstractVectorField` but has one inside.
+    """The state space of a field, or of the first field inside another callable.
 
     Args:
         field: any field.
-        d: how many numbers a state has: those of which the field says nothing are quantities of their own.
+        d: size of a state; the numbers that the field does not describe become quantities of their own.
     """
     own = as_field(field).state_space
     return own if d is None else own.padded(d)
 
 
 def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> Trajectories:
-    """The windows, where need be with other numbers for the same states, so that none jumps, and in double precision.
+    """The windows without jumps between representations of a state, in double precision if the parameters are.
 
-    An angle that is given within a turn, or the sign of a quaternion, may jump where the state does not. A field whose
-    parameters are in double precision needs windows that are. Traced windows are returned as they are.
+    An angle within one turn, or the sign of a quaternion, may jump where the state does not. Traced ones are unchanged.
 
     Args:
-        field: it says what a state is.
+        field: determines the state space and the precision.
         windows: of any system.
         name: what messages call them.
 
     Raises:
-        ValueError: malformed windows, or states that are none to the field.
+        ValueError: malformed windows, or states that are invalid in the state space.
     """
     check(windows, name)
     space = state_space(field, windows.x0.shape[-1])
@@ -141,7 +139,7 @@ def check_windows(field: AbstractVectorField, windows: Trajectories, name: str =
 
 
 def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectories:
-    """As `check_windows`, without a look at the states."""
+    """`check_windows` without the check of the states."""
     double = any(eqx.is_inexact_array(leaf) and leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(field))
     if double and windows.x0.dtype != jnp.float64:  # a step of the solver keeps a type
         windows = replace(windows, **{part: getattr(windows, part).astype(jnp.float64) for part in ("x0", "u", "x")})
@@ -169,7 +167,7 @@ class _Function(AbstractVectorField):
 
 
 def as_field(field: Callable) -> AbstractVectorField:
-    """The field itself, or a function of x and u with the methods of one."""
+    """The field itself, or a function of x and u wrapped as a field."""
     return field if isinstance(field, AbstractVectorField) else _Function(field)
 
 
@@ -180,10 +178,10 @@ def jvp_columns(function, values: tuple, columns: tuple) -> tuple[Float[Array, "
 
 
 def trainable(field: Any) -> Any:
-    """A tree with True at each leaf that the optimiser may move, for `equinox.partition`.
+    """A tree with True at each leaf that the optimiser may change, for `equinox.partition`.
 
     Args:
-        field: the field that the tree is like; its arrays of floating-point numbers are learned, unless frozen.
+        field: any field; its floating-point arrays are learned unless frozen.
     """
 
     def fixed(node) -> bool:

@@ -1,7 +1,4 @@
-"""The simplest predictions of a vehicle's motion, as vector fields: the reference that a model must beat.
-
-A linear residual is another: see `hybrid_jax.adaptation.ridge`.
-"""
+"""Baseline predictions of a vehicle's motion as vector fields; for a linear one see `hybrid_jax.adaptation.ridge`."""
 
 from typing import ClassVar
 
@@ -25,7 +22,7 @@ class HoldState(AbstractVectorField):
 
 
 class Kinematics(AbstractVectorField):
-    """ṗ = v and q̇ = ½ q ⊗ [0, ω], which hold without any knowledge of forces, with v̇ = ω̇ = 0."""
+    """ṗ = v and q̇ = ½ q ⊗ [0, ω] with v̇ = ω̇ = 0: exact kinematics without knowledge of forces."""
 
     accepts_batch: ClassVar[bool] = True
 
@@ -39,7 +36,7 @@ class Kinematics(AbstractVectorField):
 
 
 class FrozenRates(AbstractWrapper):
-    """The field inside with ω̇ = 0: thrust accelerates the vehicle, which keeps its body rates."""
+    """The field inside with ω̇ = 0: thrust accelerates the vehicle at constant body rates."""
 
     def write(self, x, inside):
         return inside.at[BODY_RATES].set(0.0)

@@ -1,4 +1,4 @@
-"""A field that is written for one sample on a minibatch, with batch normalisation over the named axis of its `vmap`."""
+"""Evaluate a single-sample field on a minibatch, with batch normalisation over the named axis of its `vmap`."""
 
 from abc import abstractmethod
 from typing import Self
@@ -29,26 +29,26 @@ class AbstractBatchNorm(eqx.Module):
 
     @abstractmethod
     def training_mode(self, seen: Moments) -> eqx.Module:
-        """The layer to use for one sample of a minibatch, which calls `record_moments(_, seen)`."""
+        """The layer for one sample of a minibatch, which calls `record_moments(_, seen)`."""
 
     def moved(self, batch: RunningStats) -> Self:
-        """This with the running statistics moved towards the minibatch's by the momentum."""
+        """This layer with running statistics moved towards the minibatch's by the momentum."""
         move = self.momentum
         running = jax.tree.map(lambda old, new: (old + move * (new - old)).astype(old.dtype), self.running, batch)
         return eqx.tree_at(lambda norm: norm.running, self, running)
 
 
 class AbstractInferenceOnly(eqx.Module):
-    """A module that training neither moves nor evaluates in training mode."""
+    """A module that training neither changes nor evaluates in training mode."""
 
 
 def over_samples(function, axis: int = -1):
-    """`function` on all samples of a minibatch, which lie along an axis of its arguments and its result."""
+    """`function` on all samples of a minibatch, which lie along `axis` of its arguments and its result."""
     return jax.vmap(function, in_axes=axis, out_axes=axis, axis_name=SAMPLES)
 
 
 def expand_trailing(values: Float[Array, " r"], rows: Float[Array, " _ *b"]) -> Float[Array, " r *b"]:
-    """The values with trailing axes of length 1, one for each batch axis of `rows`."""
+    """The values with a trailing axis of length 1 for each batch axis of `rows`."""
     return jnp.reshape(values, values.shape + (1,) * (rows.ndim - 1))
 
 
@@ -60,8 +60,7 @@ def batch_norms(tree: PyTree) -> list[AbstractBatchNorm]:
 def like(tree: PyTree, leader: Float[Array, "..."]) -> PyTree:
     """The tree unchanged, but batched under `vmap` where the leader is: for the initial carry of a scan.
 
-    JAX traces the body of a scan again when part of its carry turns out to be batched that was not at the start. In
-    nested scans that doubles at every level.
+    JAX traces the body of a scan again when part of its carry becomes batched, which doubles at every level of nesting.
     """
     number = jnp.ravel(leader)[0]
     return jax.tree.map(lambda leaf: jnp.where(number > 0, leaf, leaf), tree)
@@ -79,19 +78,19 @@ def training_mode(tree: PyTree, seen: list[Moments] | None = None) -> PyTree:
 
 
 def moments_of(field, x, u) -> list[Moments]:
-    """What each `AbstractBatchNorm` records when the field is evaluated on a minibatch, x (d, b) and u (m, b).
+    """The moments that each `AbstractBatchNorm` records on a minibatch, x (d, b) and u (m, b).
 
-    The moments are the derivative with respect to an input that does nothing (`_record`): they add up through any jit,
-    scan or vmap around the layer, where values stored during tracing would leak.
+    They are the derivative with respect to an input without effect (`_record`): they add up through any jit, scan or
+    vmap around the layer, where values stored during tracing would leak.
     """
     slope, pullback = jax.vjp(lambda seen: over_samples(training_mode(field, seen))(x, u), _unseen(field))
     return pullback(jnp.zeros_like(slope))[0]
 
 
 def with_moved_stats(field, x: Batch, u: Float[Array, "m b"]):
-    """The field with running statistics moved by an evaluation on a minibatch; itself if it holds none.
+    """The field with running statistics moved by a minibatch; unchanged without batch normalisation.
 
-    A layer that is evaluated more than once for a sample sees the mean of the moments; one that is not keeps its own.
+    A layer that is evaluated several times per sample uses the mean of the moments; one that is not evaluated stays.
     """
     if not (norms := batch_norms(field)):
         return field
@@ -104,10 +103,7 @@ def with_moved_stats(field, x: Batch, u: Float[Array, "m b"]):
 
 
 def record_moments(hidden: Float[Array, " h *a"], seen: Moments):
-    """Mean, centred values and variance of a layer's values over the minibatch; adds the moments to `seen`.
-
-    Call inside `over_samples`. The mean is also over all axes of the sample but the first.
-    """
+    """Mean (over the minibatch and all axes but the first), centred values and variance; adds the moments to `seen`."""
 
     def centre(hidden):
         mean = jax.lax.pmean(jnp.mean(hidden, axis=tuple(range(1, hidden.ndim))), SAMPLES)
@@ -121,7 +117,7 @@ def record_moments(hidden: Float[Array, " h *a"], seen: Moments):
 
 @jax.custom_vjp
 def _record(hidden: Float[Array, " h *a"], seen: Moments, moments: Moments) -> Float[Array, " h *a"]:
-    """`hidden` as it is. In reverse mode the moments are added to the derivative with respect to `seen`."""
+    """The identity; in reverse mode the moments are added to the derivative with respect to `seen`."""
     return hidden
 
 

@@ -1,4 +1,4 @@
-"""Fields made of fields: physics plus a residual, the mean of models, a view of the state, a frozen field."""
+"""Fields made of fields: physics plus a residual, a mean of models, a view of the state, a frozen field."""
 
 from abc import abstractmethod
 from collections.abc import Iterable
@@ -28,10 +28,10 @@ class AbstractComposite(AbstractVectorField):
 
     @abstractmethod
     def write(self, x: Float[Array, " d *b"], *inside: Float[Array, " n *b"]) -> Float[Array, " d *b"]:
-        """ẋ from what the fields inside returned.
+        """ẋ from the outputs of the fields inside.
 
         Args:
-            inside: what each field inside returned (n).
+            inside: output of each field inside (n).
         """
 
     @property
@@ -71,11 +71,11 @@ class AbstractComposite(AbstractVectorField):
 
 
 class Hybrid(AbstractComposite):
-    """ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus what physics leaves out (paper, Eq. 4).
+    """ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus a residual for unmodelled dynamics (paper, Eq. 4).
 
     Attributes:
         physics: f_p.
-        residual: f_d, a network or any other field; physics maps what it returns, see `apply_residual`.
+        residual: f_d, a network or any other field; physics maps its output, see `apply_residual`.
     """
 
     physics: AbstractVectorField
@@ -104,7 +104,7 @@ class Hybrid(AbstractComposite):
 
 
 class Blend(AbstractComposite):
-    """ẋ = the mean of several fields, such as models between which the data cannot decide.
+    """ẋ = the mean of several fields, for example models between which the data cannot decide.
 
     Attributes:
         fields: one or more, of the same state and input.
@@ -144,7 +144,7 @@ class AbstractWrapper(AbstractComposite):
 
 
 class Frozen(AbstractWrapper, AbstractInferenceOnly):
-    """A field in inference mode that training does not change: neither parameters nor running statistics move."""
+    """A field in inference mode that training does not change: neither parameters nor running statistics."""
 
     def train_batch(self, x, u):
         return self.infer_batch(x, u)
@@ -157,7 +157,7 @@ def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
     """The field without its `Frozen` wrappers.
 
     Args:
-        field: any field; parts of it may be frozen, or all.
+        field: any field, entirely or partly frozen.
     """
 
     def frozen(node) -> bool:
@@ -169,10 +169,10 @@ def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
 def check_batch_norm(
     field: AbstractVectorField, x: Float[Array | np.ndarray, "d b"], u: Float[Array | np.ndarray, "m b"]
 ) -> None:
-    """Refuse a field whose batch normalisation would be trained, but whose running statistics could not be.
+    """Reject a field with batch normalisation that would be trained but whose running statistics could not be updated.
 
     Raises:
-        ValueError: at any x and u it does not evaluate a `BatchNorm` that it holds, or hides it from differentiation.
+        ValueError: a `BatchNorm` in the field is not evaluated at x and u, or is hidden from differentiation.
     """
     if _is_wrapped(field) and not all(all(count.tolist()) for count, *_ in moments_of(field, x, u)):
         raise ValueError(
@@ -182,7 +182,7 @@ def check_batch_norm(
 
 
 def _is_wrapped(field) -> bool:
-    """Whether a module of which the library knows nothing stands around a batch normalisation."""
+    """Whether a module of unknown class contains a batch normalisation."""
     if getattr(type(field), "update_running_stats", None) in (None, AbstractVectorField.update_running_stats):
         return bool(batch_norms(field))
     return any(_is_wrapped(part) for part in vars(field).values() if isinstance(part, AbstractVectorField))

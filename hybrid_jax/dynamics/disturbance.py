@@ -1,4 +1,4 @@
-"""A constant disturbance of the state derivative: steady wind, a load off centre, a biased actuator."""
+"""A constant disturbance of the state derivative, for example steady wind, an off-centre load or a biased actuator."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -20,7 +20,7 @@ class ConstantDisturbance(AbstractVectorField):
     Attributes:
         value: d (k), one number for each disturbed state in its unit per second, or a scalar for every state.
         indices: the disturbed states; by default the last k.
-        points: of a grid; each number is that of so many states in a row.
+        points: number of consecutive states that share each number, for a grid.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -40,10 +40,10 @@ class ConstantDisturbance(AbstractVectorField):
         """ẋ at any x and u.
 
         Args:
-            d: how many numbers the state has.
+            d: size of the state.
 
         Raises:
-            ValueError: indices that a state of d numbers has not.
+            ValueError: indices out of range for d.
         """
         if self.value.ndim == 0:
             return jnp.broadcast_to(self.value, (d,))
@@ -61,7 +61,7 @@ def disturbed(field: AbstractVectorField, value: Float[Array, " k"], indices: tu
     """ẋ = f(x, u) + d.
 
     Args:
-        field: f, the undisturbed one.
+        field: f, the undisturbed field.
         value: d (k), one number for each disturbed state in its unit per second, or a scalar for every state.
         indices: the disturbed states; by default the last k.
     """
@@ -69,15 +69,15 @@ def disturbed(field: AbstractVectorField, value: Float[Array, " k"], indices: tu
 
 
 def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None = None) -> AbstractVectorField:
-    """The field with a constant disturbance in its physics, of zero if it has none yet.
+    """The field with a constant disturbance in its physics, zero unless it already has one.
 
     Args:
         field: physics, or physics and a residual.
-        indices: the disturbed states; by default those that the state space of the physics says, such as v̇ and ω̇ of
-            a rigid body, or each component of physics on a `Grid` (one number for all points).
+        indices: the disturbed states; by default given by the state space of the physics, for example v̇ and ω̇ of a
+            rigid body, or each component of physics on a `Grid` (one number for all points).
 
     Raises:
-        ValueError: the field has a disturbance of other states that is not zero.
+        ValueError: the field already has a nonzero disturbance of other states.
     """
     if (known := disturbance_of(field)) is not None:
         if indices is None or indices == known.indices:
@@ -100,7 +100,7 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
 
 
 def without_disturbance(field: AbstractVectorField) -> AbstractVectorField:
-    """The field without the constant disturbance of its physics, if it has one."""
+    """The field without the constant disturbance of its physics."""
     physics = physics_of(field)
     return with_physics(field, physics.physics) if isinstance(physics, Hybrid) else field
 
@@ -114,25 +114,25 @@ def sized(field: AbstractVectorField, d: int) -> AbstractVectorField:
 
 
 def physics_of(field: AbstractVectorField) -> AbstractVectorField:
-    """f_p, with its constant disturbance if it has one: the physics of a hybrid, or the field itself."""
+    """f_p with its constant disturbance, if any: the physics of a hybrid, or the field itself."""
     while isinstance(field, Hybrid) and not isinstance(field.residual, ConstantDisturbance):
         field = field.physics
     return field
 
 
 def with_physics(field: AbstractVectorField, physics: AbstractVectorField) -> AbstractVectorField:
-    """The field with other physics in the place of `physics_of(field)`."""
+    """The field with `physics_of(field)` replaced."""
     return eqx.tree_at(physics_of, field, physics)
 
 
 def disturbance_of(field: AbstractVectorField) -> ConstantDisturbance | None:
-    """The constant disturbance of the field's physics, if it has one."""
+    """The constant disturbance of the field's physics, or None."""
     physics = physics_of(field)
     return physics.residual if isinstance(physics, Hybrid) else None  # pyright: ignore[reportReturnType]
 
 
 def disturbance_units(field: AbstractVectorField) -> dict[str, str]:
-    """A name for each number of the field's disturbance, disturbance[vx] or disturbance[0], and its unit, or ""."""
+    """The name of each number of the field's disturbance, disturbance[vx] or disturbance[0], and its unit, or ""."""
     if (found := disturbance_of(field)) is None:
         return {}
     space = state_space(field)
@@ -144,7 +144,7 @@ def disturbance_units(field: AbstractVectorField) -> dict[str, str]:
 
 
 def _indices(field: AbstractVectorField, found: ConstantDisturbance) -> Sequence[int]:
-    """Of the disturbed states; of a grid, of the disturbed components."""
+    """Indices of the disturbed states; for a grid, of the disturbed components."""
     if found.indices is not None:
         return found.indices
     k = jnp.size(found.value)
@@ -152,7 +152,7 @@ def _indices(field: AbstractVectorField, found: ConstantDisturbance) -> Sequence
 
 
 def without_zeros(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with a constant disturbance of those states alone where it is not zero; outside of compiled code."""
+    """The field with its constant disturbance restricted to nonzero entries; outside of compiled code."""
     found = disturbance_of(field)
     if found is None or np.asarray(found.value).all():
         return field

@@ -1,4 +1,4 @@
-"""Equations of motion of a multirotor, in the entries of θ_p, x and u, which spares stacking them; see `rigid_body`."""
+"""Equations of motion of a multirotor on the entries of θ_p, x and u, without stacking them; see `rigid_body`."""
 
 from collections.abc import Callable
 from functools import partial
@@ -62,7 +62,7 @@ def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
 
 
 def _specific_force(constants: Constants, velocity, torque):
-    """Specific force without thrust in the body frame [m/s²]: drag, and a cable that the rotors' torque balances."""
+    """Specific force without thrust [m/s², body frame]: drag, and a cable that the rotors' torque balances."""
     drag, pull, (mass,) = constants["drag"], constants["cable_pull"], constants["mass"]
     x, y, z = 0.0, 0.0, 0.0
     if is_present(drag):
@@ -75,7 +75,7 @@ def _specific_force(constants: Constants, velocity, torque):
 
 
 def _velocity_error(constants: Constants, velocity, force):
-    """ṗ less the estimated velocity, in the body frame [m/s]."""
+    """ṗ minus the estimated velocity [m/s, body frame]."""
     gain, lag = constants["velocity_gain"], constants["velocity_lag"]
     x, y, z = 0.0, 0.0, 0.0
     if is_present(gain, absent=1.0):
@@ -94,7 +94,7 @@ def _euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
 
 
 def in_world(attitude, parts) -> Float[Array, " 3 *b"]:
-    """A body vector, of which the entries that are not given are zero, in the world frame."""
+    """A body vector in the world frame; entries that are not given are zero."""
     return jnp.stack([dot(row[: len(parts)], parts) for row in attitude])
 
 
@@ -103,7 +103,7 @@ def dot(a, b) -> Array:
 
 
 def is_present(term, absent: float = 0.0) -> bool:
-    """Whether a term is learned, or known and does something."""
+    """Whether a term is learned or has an effect."""
     return any(not isinstance(number, int | float) or number != absent for number in term)
 
 
@@ -111,8 +111,8 @@ def is_present(term, absent: float = 0.0) -> bool:
 def evaluate_columns(of_rows: Callable, theta: PyTree, x: Float[Array, "13 b"], u: Float[Array, "rotors b"]):
     """`of_rows(theta, x, u)` on a minibatch, for scalar parameters.
 
-    Autodiff would keep some thirty rows of each evaluation for the way back and sum each parameter's derivative over
-    the minibatch once for each place where it stands. Here x and u are kept, and each parameter is summed once.
+    Autodiff would store some thirty rows of each evaluation and sum each parameter's derivative over the minibatch once
+    per occurrence. Here x and u are stored, and each parameter is summed once.
     """
     return of_rows(theta, tuple(x), tuple(u))
 

@@ -1,4 +1,4 @@
-"""What learns while a system runs: the protocol between sensors, model and controller."""
+"""The protocol of an online estimator, which updates the controller's model while the system runs."""
 
 from abc import abstractmethod
 from typing import Any
@@ -10,7 +10,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 
 
 class AbstractEstimator(eqx.Module):
-    """What learns in flight, between sensors and controller."""
+    """An estimator between sensors and controller that learns while the system runs."""
 
     @abstractmethod
     def begin(self, x: Float[Array, " d"]) -> Any:
@@ -18,10 +18,10 @@ class AbstractEstimator(eqx.Module):
 
     @abstractmethod
     def update(self, state: Any, x: Float[Array, " d"], u: Float[Array, " m"]) -> Any:
-        """After a period in which the input was u on average, and which ended with the sample x.
+        """The state of the estimator after one period, with mean input u and the sample x at its end.
 
         Args:
-            state: of the estimator, as `begin` and `update` return it.
+            state: of the estimator, as returned by `begin` and `update`.
         """
 
     @abstractmethod
@@ -29,21 +29,21 @@ class AbstractEstimator(eqx.Module):
         """The prediction model of the controller.
 
         Args:
-            state: of the estimator, as `begin` and `update` return it.
+            state: of the estimator, as returned by `begin` and `update`.
         """
 
     def command(self, state: Any, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The input to command where the controller asks for u at the state x; by default that.
+        """The input to command if the controller requests u at the state x; by default u.
 
         Args:
-            state: of the estimator, as `begin` and `update` return it.
+            state: of the estimator, as returned by `begin` and `update`.
         """
         return u
 
     def effective(self, state: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The input at which the model moves as the system does at u; by default that. It undoes `command`.
+        """The model input with the same effect as the system input u, the inverse of `command`; by default u.
 
         Args:
-            state: of the estimator, as `begin` and `update` return it.
+            state: of the estimator, as returned by `begin` and `update`.
         """
         return u

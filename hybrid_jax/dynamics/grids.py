@@ -1,4 +1,4 @@
-"""Fields on periodic grids: a state of `components` × grid points, its Laplacian, diffusion as physics."""
+"""Fields on periodic grids: a state of `components` × grid points, its Laplacian, and diffusion as physics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,15 +22,15 @@ SEAM = 3.0  # times the usual step between neighbours that one across the edge m
 
 @dataclass(frozen=True)
 class Grid:
-    """A periodic grid of equal spacing, and how many quantities live on it.
+    """A periodic grid of equal spacing with one or more quantities at each point.
 
-    A state is their values, one quantity after the other, each in row-major order; further axes are samples. Its
-    methods take and return `fields` of shape (components, *shape, *b).
+    A state contains one quantity after the other, each in row-major order; further axes are samples. Methods take and
+    return `fields` of shape (components, *shape, *b).
 
     Attributes:
         shape: points along each axis of space, at least three.
         spacing: between neighbours along every axis [m].
-        components: how many quantities have a value at each point.
+        components: number of quantities at each point.
 
     Raises:
         ValueError: a side of fewer than three points, a spacing that is not positive, no components.
@@ -50,12 +50,12 @@ class Grid:
 
     @property
     def points(self) -> int:
-        """How many points the grid has."""
+        """The number of grid points."""
         return prod(self.shape)
 
     @property
     def size(self) -> int:
-        """d, the numbers in a state."""
+        """d, the size of a state."""
         return self.components * self.points
 
     @property
@@ -70,17 +70,17 @@ class Grid:
         return range(1, 1 + len(self.shape))
 
     def fields(self, x: Float[Array, " d *b"]) -> Float[Array, " c *cells"]:
-        """The state as arrays over the grid (components, *shape, *b); ValueError if it is of another size."""
+        """The state as arrays over the grid (components, *shape, *b); ValueError if its size differs."""
         if x.shape[0] != self.size:
             sides = " × ".join(map(str, (self.components, *self.shape)))
             raise ValueError(f"a grid of {sides} needs states of {self.size} numbers, got {x.shape[0]}")
         return x.reshape(self.components, *self.shape, *x.shape[1:])
 
     def laplacian(self, fields: Float[Array, " c *cells"]) -> Float[Array, " c *cells"]:
-        """Δ of each component: the sum over neighbours of (neighbour − value) / spacing²; an error of O(spacing²).
+        """Δ of each component: the sum over neighbours of (neighbour − value) / spacing², with an error of O(spacing²).
 
         Args:
-            fields: as `fields` returns them.
+            fields: as returned by `fields`.
         """
         padded = self._padded(fields, 1)
         inside = {axis: slice(1, -1) for axis in self.axes}
@@ -92,10 +92,10 @@ class Grid:
         return (sum(near[1:], near[0]) - len(near) * fields) / self.spacing**2
 
     def moved(self, fields: Float[Array, " c *cells"], kernel: int) -> list[Float[Array, " c *cells"]]:
-        """The fields of each of the kernel × … × kernel neighbours, in row-major order of where these are.
+        """The fields of each of the kernel × … × kernel neighbours, in row-major order of their offsets.
 
         Args:
-            fields: as `fields` returns them.
+            fields: as returned by `fields`.
             kernel: points along each side of the neighbourhood, an odd number.
         """
         if kernel == 1:
@@ -105,14 +105,13 @@ class Grid:
         return [padded[(slice(None), *shift)] for shift in shifts]
 
     def _padded(self, fields: Float[Array, " c *cells"], reach: int) -> Float[Array, " c *cells"]:
-        """With more points at each edge, those of the opposite edge."""
+        """The fields with `reach` more points at each edge, copied from the opposite edge."""
         return jnp.pad(fields, [(reach * (i in self.axes),) * 2 for i in range(fields.ndim)], mode="wrap")
 
     def largest_step(self, diffusivity: float | Sequence[float] | np.ndarray | Array) -> float:
         """The longest step [s] for which RK4 is stable, by linear theory; infinite without diffusion.
 
-        The Laplacian's most negative eigenvalue is −4 n / spacing² in n dimensions, so the bound is 2.785 spacing² /
-        (4 n D), as that of Courant, Friedrichs and Lewy for advection is a bound on the step.
+        The Laplacian's most negative eigenvalue is −4 n / spacing² in n dimensions, hence 2.785 spacing² / (4 n D).
 
         Args:
             diffusivity: D [m²/s], one or several, of which the largest counts.
@@ -129,19 +128,19 @@ def check_grid(
     substeps: int = 1,
     name: str = "windows",
 ) -> None:
-    """Refuse windows that are not of the grid, not periodic, or sampled too slowly for the solver's steps.
+    """Reject windows that are not on the grid, not periodic, or too slowly sampled for the solver's steps.
 
-    Data count as not periodic if steps across an edge are more than three times as large as those between neighbours.
+    Data count as not periodic if steps across an edge are more than three times as large as between neighbours.
 
     Args:
-        grid: what each state is on.
+        grid: the grid of each state.
         windows: the data.
         diffusivity: one or several [m²/s], of which the largest bounds the step; 0 for no bound.
         substeps: steps of the solver in each interval of the windows.
         name: what messages call the windows.
 
     Raises:
-        ValueError: one of these, in one line; it names the bound and how many substeps would do.
+        ValueError: one of these, in one line with the bound and the substeps that you need.
     """
     size = check(windows, name).x0.shape[-1]
     if size != grid.size:
@@ -171,7 +170,7 @@ class Diffusion(AbstractVectorField):
 
     Attributes:
         log_diffusivity: logarithm of D [m²/s] of each component (c).
-        grid: what the state is on.
+        grid: the grid of the state.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -199,11 +198,11 @@ def diffusion(grid: Grid, diffusivity: Sequence[float]) -> Diffusion:
     """`Diffusion` from its diffusivities.
 
     Args:
-        grid: what the state is on.
+        grid: the grid of the state.
         diffusivity: D [m²/s] of each component.
 
     Raises:
-        ValueError: a diffusivity that is not positive, or not one for each component.
+        ValueError: a diffusivity that is not positive, or a number of diffusivities other than `components`.
     """
     if len(diffusivity) != grid.components:
         raise ValueError(f"diffusivity: {grid.components} expected, one for each component, got {len(diffusivity)}")

@@ -1,7 +1,7 @@
-"""Parts of a system that no sensor shows: lags, delays, disturbances that move, loads that swing.
+"""Unmeasured parts of a system: lags, delays, varying disturbances and swinging loads.
 
-Each adds states of its own behind those of a field, and acts on the field's inputs or on ẋ. Their initial states are
-unknown like any other, see `StateSpaceModel`.
+Each appends its own states to those of a field, and acts on the field's inputs or on ẋ. Their initial states are
+unknown, see `StateSpaceModel`.
 """
 
 from abc import abstractmethod
@@ -17,12 +17,11 @@ Indices = tuple[int, ...]
 
 
 def _at(places: Indices, values: Float[Array, " k"], d: int) -> Float[Array, " d"]:
-    """The values at their places among d numbers, the others zero."""
     return jnp.zeros(d).at[jnp.array(places)].set(values)
 
 
 class AbstractHidden(eqx.Module):
-    """A part with states z of its own. Every array inside is learned."""
+    """A hidden part with its own states z. Every array inside is learned."""
 
     @property
     @abstractmethod
@@ -40,7 +39,7 @@ class AbstractHidden(eqx.Module):
         """
 
     def inputs(self, z: Float[Array, " k"], u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The inputs that act on the field; by default they pass unchanged.
+        """The inputs that act on the field; by default unchanged.
 
         Args:
             z: its states (k,).
@@ -49,7 +48,7 @@ class AbstractHidden(eqx.Module):
         return u
 
     def added(self, z: Float[Array, " k"], d: int) -> Float[Array, " d"]:
-        """What is added to ẋ of the field; by default nothing.
+        """The contribution to ẋ of the field; by default zero.
 
         Args:
             z: its states (k,).
@@ -59,11 +58,11 @@ class AbstractHidden(eqx.Module):
 
 
 class Lag(AbstractHidden):
-    """Inputs that follow with a first-order lag: ż = (u − z) / τ, and z acts.
+    """Inputs with a first-order lag: ż = (u − z) / τ, and z acts on the field.
 
     Attributes:
         log_time_constant: ln τ of each of these inputs (k,), τ in seconds.
-        places: which inputs.
+        places: indices of the inputs.
     """
 
     log_time_constant: Float[Array, " k"]
@@ -81,13 +80,13 @@ class Lag(AbstractHidden):
 
 
 class Delay(AbstractHidden):
-    """Inputs that act later, by a chain of equal lags whose time constants add up to the delay.
+    """Delayed inputs, by a chain of equal lags whose time constants add up to the delay.
 
-    The delay of a chain is spread by delay / √order about its mean (MacDonald, Time Lags in Biological Models, 1978).
+    The response spreads by delay / √order about the delay (MacDonald, Time Lags in Biological Models, 1978).
 
     Attributes:
         log_delay: ln of the delay, the delay in seconds.
-        places: which inputs.
+        places: indices of the inputs.
         order: lags in the chain.
     """
 
@@ -109,10 +108,10 @@ class Delay(AbstractHidden):
 
 
 class RandomWalk(AbstractHidden):
-    """A disturbance of ẋ that stays as it is but for process noise: constant without, a random walk with it.
+    """A disturbance of ẋ that is a random walk under process noise, and constant without.
 
     Attributes:
-        places: which states of the field it acts on.
+        places: indices of the states of the field that it acts on.
     """
 
     places: Indices = eqx.field(static=True)
@@ -129,16 +128,16 @@ class RandomWalk(AbstractHidden):
 
 
 class Oscillator(AbstractHidden):
-    """A damped oscillator that pushes, such as a load on a cable.
+    """A damped oscillator that acts on the field, for example a load on a cable.
 
     Its states are a and ȧ, with ä = −ω² a − 2 ζ ω ȧ + w · (x, u); g a is added to ẋ.
 
     Attributes:
         log_frequency: ln ω, ω in rad/s.
         log_damping: ln ζ.
-        drive: w, what moves it, of each state and input (d + m,).
+        drive: w, the weight of each state and input (d + m,).
         gain: g of each state it acts on (k,).
-        places: which states of the field it acts on.
+        places: indices of the states of the field that it acts on.
     """
 
     log_frequency: Float[Array, ""]
@@ -166,7 +165,7 @@ class LinearDynamics(AbstractHidden):
         a: A (k, k).
         b: B, of each state and input (k, d + m).
         c: C, of each state it acts on (s, k).
-        places: which states of the field it acts on (s).
+        places: indices of the states of the field that it acts on (s).
     """
 
     a: Float[Array, "k k"]
@@ -186,11 +185,11 @@ class LinearDynamics(AbstractHidden):
 
 
 class WithHidden(AbstractVectorField):
-    """A field with hidden parts: its state is that of the field, then the states of each part in turn.
+    """A field with hidden parts; the states of the parts follow those of the field.
 
     Attributes:
         field: the field that the parts act on.
-        parts: the hidden parts; the first is told the inputs, each next one what the one before lets through.
+        parts: the hidden parts; the first receives the inputs, each further one the output of the one before.
     """
 
     field: AbstractVectorField
@@ -208,11 +207,11 @@ class WithHidden(AbstractVectorField):
 
 
 def with_hidden(field: AbstractVectorField, *parts: AbstractHidden) -> WithHidden:
-    """A field to which hidden parts are added, any number of each kind.
+    """A field with hidden parts, any number of each kind.
 
     Args:
         field: the field that the parts act on.
-        parts: such as `Lag`, `Delay`, `RandomWalk`, `Oscillator` and `LinearDynamics`.
+        parts: for example `Lag`, `Delay`, `RandomWalk`, `Oscillator` and `LinearDynamics`.
 
     Raises:
         ValueError: no part, or something else.

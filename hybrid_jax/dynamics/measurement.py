@@ -1,4 +1,4 @@
-"""What sensors measure of a multirotor: y = h(x, u), of states that need not be measured themselves."""
+"""Measurement models of a multirotor's sensors, y = h(x, u)."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,10 +15,10 @@ MEASURED = (*STATES, "body_velocity", "specific_force", "rotor_speed")
 def measure(
     quantity: str, field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], gravity: float = 9.81
 ) -> Float[Array, " k"]:
-    """h(x, u) of one of `MEASURED`, as `flights.recording.AXES` has it.
+    """h(x, u) of one of `MEASURED`, with axes as in `flights.recording.AXES`.
 
-    The specific force [m/s², body] is what an accelerometer in the centre of mass measures: Rᵀ (v̇ + g e_z), with v̇ of
-    the field.
+    The specific force [m/s², body frame] is the reading of an accelerometer at the centre of mass: Rᵀ (v̇ + g e_z),
+    with v̇ of the field.
     """
     if quantity in STATES:
         return x[STATES[quantity]]
@@ -29,6 +29,6 @@ def measure(
 
 
 def difference(quantity: str, y: Float[Array | np.ndarray, " k"], predicted: Float[Array, " k"]) -> Float[Array, " e"]:
-    """y less what was predicted; of attitudes the rotation vector between them in the body [rad] (3)."""
+    """y minus its prediction; for attitudes, the rotation vector between them [rad, body frame] (3)."""
     y = jnp.asarray(y)
     return rotation.attitude_error(predicted, y) if quantity == "attitude" else y - predicted

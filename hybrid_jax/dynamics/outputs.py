@@ -1,4 +1,4 @@
-"""A system of which not every state is measured: ẋ = f(x, u), y = h(x, u)."""
+"""Partially measured systems: ẋ = f(x, u), y = h(x, u)."""
 
 from collections.abc import Callable, Mapping
 
@@ -17,20 +17,20 @@ def _numbers(values) -> tuple[float, ...]:
 
 
 class StateSpaceModel(eqx.Module):
-    """ẋ = f(x, u) with measured outputs y = h(x, u), an initial state that need not be known, and process noise.
+    """ẋ = f(x, u) with measured outputs y = h(x, u), an initial state that may be unknown, and process noise.
 
-    Every array inside the field and the outputs is learned, so an output may be a module with a bias of its own; Python
+    Every array inside the field and the outputs is learned, so an output may be a module with its own bias; Python
     numbers are constants.
 
     Attributes:
         field: f.
         inputs: the names of the signals that make up u, in order.
         outputs: h by name: each a function of the state (d,) and the input (m,) that returns a scalar or (k,).
-        start: the initial state that is expected (d,).
+        start: the expected initial state (d,).
         spread: the standard deviation of the initial state about `start` (d,): 0 if it is known, infinite if nothing
-            is known of it. Where the field's state space has an attitude, this has three numbers, its rotation [rad].
-        process: the standard deviation of what acts on each state at random, per square root of a second, one number
-            for each of `spread`; by default 0. A state of which nothing but this noise acts is a random walk.
+            is known about it. An attitude in the field's state space has three numbers here, its rotation [rad].
+        process: the standard deviation of the process noise on each state, per square root of a second, one number
+            for each of `spread`; by default 0. A state with process noise and no dynamics is a random walk.
 
     Raises:
         ValueError: sizes that do not agree, or a negative deviation.
@@ -61,21 +61,21 @@ class StateSpaceModel(eqx.Module):
 
     @property
     def space(self) -> StateSpace:
-        """What a state is to the field; of states of which it says nothing, each is a quantity of its own."""
+        """The state space of the field; states that it does not describe are quantities of their own."""
         return state_space(self.field, self.size)
 
     def begin(self, x0: Float[Array, " d"], u: Float[Array, "t m"], dt: float):
-        """The state in which a piece of a record begins, and the inputs of its intervals.
+        """The initial state of a piece of a record, and the inputs of its intervals.
 
         Args:
-            x0: the state that is sought (d,).
+            x0: the unknown initial state (d,).
             u: the inputs (t, m).
             dt: length of an interval [s].
         """
         return x0, u
 
     def output(self, name: str, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " k"]:
-        """What is measured in a state.
+        """The measured output in a state.
 
         Args:
             name: of the output.
@@ -88,11 +88,11 @@ class StateSpaceModel(eqx.Module):
         return y
 
     def error(self, name: str, predicted: Float[Array, " k"], y: Float[Array, " k"]) -> Float[Array, " e"]:
-        """What was predicted less what was measured.
+        """The prediction minus the measurement.
 
         Args:
             name: of the output.
-            predicted: as of `output` (k,).
-            y: as it was measured (k,).
+            predicted: as returned by `output` (k,).
+            y: the measurement (k,).
         """
         return predicted - y

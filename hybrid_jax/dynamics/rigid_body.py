@@ -29,7 +29,7 @@ INERTIAS = {"mass": VELOCITY, "Ix": BODY_RATES.start, "Iy": BODY_RATES.start + 1
 
 @dataclass(frozen=True)
 class RigidBodySpace(StateSpace):
-    """That of state.py: position, attitude, velocity and body rates; see `RIGID_BODY_SPACE`."""
+    """The state space of state.py: position, attitude, velocity and body rates; see `RIGID_BODY_SPACE`."""
 
     def features(self, x, u):
         lengths = {"speed [m/s]": x[:, VELOCITY], "body rates [rad/s]": x[:, BODY_RATES]}
@@ -49,39 +49,38 @@ RIGID_BODY_SPACE = RigidBodySpace(
 
 
 class RigidBody(AbstractVectorField):
-    """A rigid body carried by its rotors, and what `Terms` add: x is that of state.py (13), u the rotor speeds [rad/s].
+    """A rigid body carried by its rotors, with further `Terms`: x as in state.py (13), u the rotor speeds [rad/s].
 
         ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
         m f = C (τ_y, −τ_x, 0) − D Rᵀv − m c Rᵀv,   E = diag(1, 1, 0)
 
     T and τ are thrust and torque of the rotors about the centre of mass; a rotor's thrust is k_i u_i², with one k or
-    one for each, and G scales the torque where the speeds do not tell it. Rotor drag D, the moment A and the damping B:
-    Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag for accurate
-    tracking of high-speed trajectories", 2018 (A there has the other sign). C is a cable that pulls at 1/C below the
-    centre of mass: the state does not hold the load's position, but the torque that balances its moment reveals it.
+    one for each, and G scales the torque where the speeds do not determine it. Rotor drag D, the moment A and the
+    damping B: Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag for
+    accurate tracking of high-speed trajectories", 2018 (A there has the other sign). C is a cable that pulls at 1/C
+    below the centre of mass: the state lacks the load's position, but the torque that balances its moment reveals it.
 
     S and λ describe a state estimator that takes all force but gravity to be along the body's z axis, and corrects its
-    velocity v̂ for other forces by the position alone: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the thrust.
-    Then v − v̂ is λ times the force in the log: f and what a residual adds to it. S models the same for drag alone.
+    velocity v̂ for other forces only by the position: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the thrust.
+    Then v − v̂ is λ times the force in the log: f plus the residual. S models the same for drag only.
 
-    Two corrections say how a body has changed (`corrected`): `efficiency` e, with which a rotor gives e times the
-    thrust and the reaction torque of a sound one at the same speed, and `added_drag` c [1/s] along the body's axes.
+    Two corrections describe a change of the body (`corrected`): `efficiency` e, a rotor's thrust and reaction torque
+    relative to a sound one at the same speed, and `added_drag` c [1/s] along the body's axes.
 
-    Parameters are deviations from nominal, so that all start at zero and one learning rate fits them all: positive ones
-    as log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The lag of the
-    rotors is applied to the log (`hybrid_jax.flights.checks.cleaning`): as four more states it would be unknown at the
-    start of each window.
+    Parameters are deviations from nominal that start at zero, so that one learning rate fits all: positive ones as
+    log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The rotors' lag
+    is applied to the log (`hybrid_jax.flights.checks.cleaning`): four more states would be unknown in each window.
 
     Attributes:
-        deviations: of each learned parameter, by name; shapes as of `shape_of`.
+        deviations: of each learned parameter, by name; for shapes see `shape_of`.
         vehicle: its constants, which are the nominal values.
         terms: nominal values of further terms; those that are zero and not learned cost nothing.
-        wrench: whether a residual is a force and a torque and not an acceleration. Its v̇ and ω̇ then hold at nominal
-            mass and inertia and are scaled by nominal / m and nominal / I at others, so that a learned aerodynamic
-            torque remains valid when the inertia changes.
+        wrench: whether a residual is a force and a torque rather than an acceleration. Its v̇ and ω̇ are then given at
+            nominal mass and inertia and scaled by nominal / m and nominal / I, so that a learned aerodynamic torque
+            remains valid when the inertia changes.
 
     Raises:
-        ValueError: an unknown parameter name, two that only their ratio or product tells, or no vehicle or terms.
+        ValueError: an unknown parameter name, two of which only the ratio or product is identifiable, or a wrong type.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -137,7 +136,7 @@ class RigidBody(AbstractVectorField):
         return equations.derivative(self.vehicle, self.terms, self.entries(), x, u)
 
     def apply_residual(self, x, residual):
-        """A residual force, too, changes the position before it shows in the estimated velocity."""
+        """The residual with its effect on ṗ: a force changes the position before the estimated velocity."""
         if self.wrench:
             factors = jnp.ones(STATE_SIZE, residual.dtype)
             for name, at in INERTIAS.items():
@@ -159,12 +158,12 @@ def rigid_body(
 
     Args:
         vehicle: its constants.
-        learn: names of the parameters that it learns, of `terms.SHAPES`.
-        terms: nominal values of what it has beyond thrust, torque and weight; by default nothing.
-        wrench: whether a residual beside it is a force and a torque, see `RigidBody`.
+        learn: names of the learned parameters, from `terms.SHAPES`.
+        terms: nominal values of terms beyond thrust, torque and weight; by default none.
+        wrench: whether its residual is a force and a torque, see `RigidBody`.
 
     Raises:
-        ValueError: as of `check_names`.
+        ValueError: see `check_names`.
     """
     check_names(tuple(learn))
     deviations = {name: jnp.zeros(shape_of(vehicle, name)) for name in learn}
@@ -172,7 +171,7 @@ def rigid_body(
 
 
 def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
-    """The rigid body with each of θ_p at nominal times a random factor, uniform in its logarithm.
+    """The rigid body with each of θ_p at nominal times a random factor, log-uniform from low to high.
 
     Args:
         vehicle: its constants, which are the nominal values.
@@ -180,7 +179,7 @@ def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: fl
         high: largest factor.
 
     Raises:
-        ValueError: factors that are not 0 < low <= high.
+        ValueError: unless 0 < low <= high.
     """
     if not 0 < low <= high < np.inf:
         raise ValueError(f"low and high must be two factors, 0 < low <= high, got {low} and {high}")
@@ -189,19 +188,19 @@ def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: fl
 
 
 def perturbed_by(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
-    """The rigid body with each of θ_p at nominal times or over 1 + off, at random."""
+    """The rigid body with each of θ_p at nominal × (1 + off) or nominal / (1 + off), at random."""
     signs = jax.random.rademacher(key, (len(LEARNED),), float)
     return RigidBody(dict(zip(LEARNED, np.log(1 + off) * signs, strict=True)), vehicle)
 
 
 def with_vehicle(field: RigidBody, vehicle: Vehicle) -> RigidBody:
-    """The field on another vehicle, such as the same one with a payload, with the same θ_p in SI units.
+    """The field on another vehicle, for example the same one with a payload, with the same θ_p in SI units.
 
-    Its deviations differ, as they are relative to the vehicle's nominal values, weight and arm.
+    The deviations change, since they are relative to the vehicle's nominal values, weight and arm.
 
     Args:
         field: the rigid body on the vehicle that it was learned on.
-        vehicle: constants of the other.
+        vehicle: constants of the other vehicle.
     """
     units, known = units_of(vehicle), nominal_values(vehicle, field.terms)
 
@@ -214,7 +213,7 @@ def with_vehicle(field: RigidBody, vehicle: Vehicle) -> RigidBody:
 
 
 def corrected(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with corrections of its rigid bodies that change nothing yet; itself if it has none, or has them."""
+    """The field with corrections of its rigid bodies, initially without effect, unless it has them already."""
 
     def larger(body: RigidBody) -> RigidBody:
         if body.deviations.keys() & CORRECTIONS:
@@ -227,7 +226,7 @@ def corrected(field: AbstractVectorField) -> AbstractVectorField:
 
 
 def uncorrected(field: AbstractVectorField) -> AbstractVectorField:
-    """The field without corrections of rigid bodies that are zero; outside of compiled code."""
+    """The field without the corrections that are zero; outside of compiled code."""
 
     def smaller(body: RigidBody) -> RigidBody:
         if any(np.any(body.deviations.get(name, 0)) for name in CORRECTIONS):

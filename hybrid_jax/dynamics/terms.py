@@ -27,12 +27,12 @@ class Terms:
         torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
         centre_of_mass: (x, y) in the frame of the rotors' positions [m].
         drag: D along x, y and z [N s/m].
-        cable_pull: C, one over how far below the centre of mass a cable pulls, along x and y [1/m].
+        cable_pull: C along x and y, the inverse of the distance below the centre of mass where a cable pulls [1/m].
         aerodynamic_moment: A, one row for each of the moments [N s].
         rate_damping: B about x, y and z [N m s].
-        velocity_gain: S, of the position's derivative over the velocity in a log.
+        velocity_gain: S, the position's derivative over the logged velocity.
         velocity_lag: λ, time constant of the estimated velocity for forces across the thrust [s].
-        motor_time_constant: of the rotors behind a log's motor values [s]; applied to logs, not by the field.
+        motor_time_constant: lag of the rotors behind logged motor values [s]; applied to logs, not by the field.
 
     Raises:
         ValueError: a term of another shape, or a number that is not finite.
@@ -87,7 +87,7 @@ def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...
 
 
 def units_of(vehicle: Vehicle) -> dict[str, float]:
-    """What a deviation of 1 is in SI units: forces and moments in the vehicle's weight and weight × arm."""
+    """The SI value of a deviation of 1: forces and moments in the vehicle's weight and weight × arm."""
     weight = vehicle.mass * vehicle.gravity
     arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / vehicle.rotors
     forces = {"drag": weight / SPEED, "aerodynamic_moment": weight * arm / SPEED, "rate_damping": weight * arm / RATE}

@@ -1,9 +1,9 @@
-"""A whole vehicle file: constants of the vehicle, nominal values of further terms, and what is to be learned.
+"""A vehicle file: constants of the vehicle, nominal values of further terms, and the learned parameters.
 
-Above all tables `learn = ["Ix", "drag", …]`, names of `terms.SHAPES`; then `[vehicle]` with the constants of `Vehicle`,
-`[vehicle.NAME]` with those that differ in a variant, `[terms]` with nominal values of `Terms`, and, for logs of
-commands instead of rotor speeds, `[actuator]` with those of `Actuator`, whose names `learn` may hold, too. Above the
-tables may also stand what a term is for, as in `purpose = { cable_pull = "the load hangs on a cable" }`.
+Above all tables `learn = ["Ix", "drag", …]`, names from `terms.SHAPES`; then `[vehicle]` with constants of `Vehicle`,
+`[vehicle.NAME]` with the overrides of a variant, `[terms]` with nominal values of `Terms`, and, for logs of commands
+instead of rotor speeds, `[actuator]` with those of `Actuator`, whose names `learn` may also contain. You can explain
+terms above the tables, for example `purpose = { cable_pull = "the load hangs on a cable" }`.
 """
 
 from collections.abc import Mapping
@@ -23,14 +23,14 @@ NEED_PURPOSE = ("cable_pull",)  # what a change alone explains; without one, the
 
 @dataclass(frozen=True)
 class VehicleModel:
-    """A vehicle, and what is to be learned of it; ValueError as of `check_learned`.
+    """A vehicle and its learned parameters; ValueError as in `check_learned`.
 
     Attributes:
         vehicle: its constants.
         terms: nominal values of further terms.
-        actuator: what stands between command and rotor; None for logs of rotor speeds.
-        learn: names of `terms.SHAPES`, and "motor_time_constant" for the rotors' lag in logs.
-        purpose: names of terms of which the file says what they are for.
+        actuator: the map from command to rotor speed; None for logs of rotor speeds.
+        learn: names from `terms.SHAPES`, and "motor_time_constant" for the rotors' lag in logs.
+        purpose: names of the terms that the file explains.
     """
 
     vehicle: Vehicle
@@ -43,11 +43,11 @@ class VehicleModel:
         check_learned(self.learn, self.actuator)
 
     def physics(self) -> RigidBody:
-        """The field at its nominal values that is told rotor speeds."""
+        """The field at its nominal values, driven by rotor speeds."""
         return rigid_body(self.vehicle, learned_by_field(self.learn), self.terms)
 
     def commanded(self) -> Actuated:
-        """The field at its nominal values that is told commands; ValueError without `[actuator]`."""
+        """The field at its nominal values, driven by commands; ValueError without `[actuator]`."""
         if self.actuator is None:
             raise ValueError("the vehicle file has no table [actuator], which a log of commands needs")
         return actuated(self.physics(), self.actuator, tuple(name for name in self.learn if name in NAMES))
@@ -61,7 +61,7 @@ def check_learned(learn: tuple[str, ...], actuator: Actuator | None = None) -> N
 
 
 def learned_by_field(learn: tuple[str, ...]) -> tuple[str, ...]:
-    """The names that a field learns: all but those of the actuators."""
+    """The learned names without those of the actuators."""
     return tuple(name for name in learn if name != LAG and name not in NAMES)
 
 
@@ -70,16 +70,16 @@ def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleM
 
     Args:
         path: the TOML file.
-        variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, such as the mass with a payload.
+        variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, e.g. the mass with a payload.
 
     Raises:
-        ValueError: the file, the key and what was expected, in one line.
+        ValueError: one line with the file, the key and what was expected.
     """
     return vehicle_model_of(read_tables(path), path, variant)
 
 
 def vehicle_model_of(tables: Mapping[str, Any], path: str | Path, variant: str | None = None) -> VehicleModel:
-    """As `load_vehicle_model`, of the tables of a file that was read already."""
+    """`load_vehicle_model` on the tables of a file that has already been read."""
     require_known(str(path), tables, TABLES)
     vehicle, terms = tables.get("vehicle"), tables.get("terms", {})
     if isinstance(vehicle, dict) and "learn" in vehicle:
