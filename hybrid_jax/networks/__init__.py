@@ -1,4 +1,4 @@
-"""Residual networks f_d: that of the paper (`mlp`), parts of a multirotor's state (`views`), and grids (`grids`)."""
+"""Residual networks f_d: the paper's (`mlp`), on parts of a multirotor's state (`views`) and on grids (`grids`)."""
 
 from hybrid_jax.networks.grids import GridNetwork, grid_network
 from hybrid_jax.networks.mlp import (

@@ -1,4 +1,4 @@
-"""Networks on periodic grids: the same small network at every point, which reads the point alone or its neighbours."""
+"""Networks on periodic grids: the same small network at every point, pointwise or on a neighbourhood."""
 
 from functools import reduce
 from typing import ClassVar
@@ -18,12 +18,12 @@ from hybrid_jax.networks.normalisation import AbstractScaling
 class GridNetwork(AbstractVectorField):
     """ẋ at each point = network(values at the kernel × … × kernel points around it, u).
 
-    A kernel of 1 is a reaction: what happens at a point depends on that point alone. A kernel of 3 is a convolution of
-    3 × 3, then one of 1 × 1; it can express derivatives in space, the Laplacian among them, where a kernel of 1 cannot.
+    A kernel of 1 is a pointwise reaction. A kernel of 3 is a convolution of 3 × 3, then one of 1 × 1; unlike a kernel
+    of 1, it can express derivatives in space, for example the Laplacian.
 
     The neighbours are gathered, and one product serves all points: on a CPU the derivative of a convolution of XLA
-    takes ten times as long. In training mode the hidden units are computed again for the gradient rather than kept
-    (`jax.checkpoint`): measured, that takes half the time and a twentieth of the memory.
+    takes ten times as long. In training mode the hidden units are recomputed for the gradient (`jax.checkpoint`), which
+    takes half the time and a twentieth of the memory.
 
     Attributes:
         network: what is evaluated at each point.
@@ -57,14 +57,14 @@ class GridNetwork(AbstractVectorField):
         return found.reshape(-1, found.shape[-1])
 
     def points(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> tuple[Array, Array]:
-        """What the network reads, a column for each point of each sample: neighbours (k, n), input (m, n)."""
+        """The network's input, a column for each point of each sample: neighbours (k, n), input (m, n)."""
         near = jnp.concatenate(self.grid.moved(self.grid.fields(x), self.kernel))
         u = u[: self.network.weight_in.shape[1] - len(near)]
         held = jnp.broadcast_to(jnp.expand_dims(u, (*self.grid.axes,)), (len(u), *near.shape[1:]))
         return near.reshape(len(near), -1), held.reshape(len(u), near[0].size)
 
     def neighbour_weights(self) -> Float[Array, "h k"]:
-        """The first layer's weights for the values at all points but the one itself."""
+        """The first layer's weights for the values at all points except the centre."""
         read = self.grid.components * self.kernel ** len(self.grid.shape)
         blocks = self.network.weight_in[:, :read].reshape(len(self.network.weight_in), -1, self.grid.components)
         middle = blocks.shape[1] // 2
@@ -97,15 +97,15 @@ def grid_network(
 
     Args:
         grid: the points, and the components at each.
-        input_size: m, the numbers in u; every point reads all of them. With 0 the network does not depend on u.
+        input_size: m, the size of u, which every point reads; 0 if the network does not depend on u.
         kernel: points along each axis that it reads, odd: 1 is pointwise, 3 a convolution.
         hidden: units at each point.
-        activation: of the hidden units, by default smooth; as in `residual_network`, like those that follow.
-        norm: batch normalisation, by default none.
-        scaling: of what the network reads and returns.
+        activation: of the hidden units, by default smooth; see `residual_network`.
+        norm: batch normalisation, by default none; see `residual_network`.
+        scaling: of its inputs and outputs; see `residual_network`.
 
     Raises:
-        ValueError: a kernel that is even or wider than the grid, or what `residual_network` refuses.
+        ValueError: a kernel that is even or wider than the grid, or an invalid argument of `residual_network`.
     """
     checks.count("kernel", kernel)
     if kernel % 2 == 0 or kernel > min(grid.shape):

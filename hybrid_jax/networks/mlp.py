@@ -50,15 +50,15 @@ class SmoothRelu:
 
 
 def function_of(activation: str | SmoothRelu) -> Activation:
-    """The activation of a network, which holds its name: a function could not be sent to another process."""
+    """The activation function of a network, which stores only its name so that it can be sent to another process."""
     return ACTIVATIONS[activation] if isinstance(activation, str) else activation
 
 
 class FusedNetwork(AbstractVectorField):
     """ẋ = W₂ σ(W₁ z + c) + A z + b, z = [x, scaled u]: a network with its normalisation folded in, and a linear map.
 
-    The same map as `ResidualNetwork`, or `LinearSkip` around one, laid out for few samples at a time, as a controller
-    evaluates it: one product serves W₁ and A, and the weights of an input are contiguous.
+    The same map as `ResidualNetwork`, or `LinearSkip` around one, in a layout for few samples at a time, for example in
+    a controller: one product serves W₁ and A, and the weights of an input are contiguous.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -79,7 +79,7 @@ class FusedNetwork(AbstractVectorField):
         return jnp.split(both + expand_trailing(self.bias, both), [len(self.weight_out)])  # pyright: ignore[reportReturnType]
 
     def linearize(self, x, u, dx, du):
-        """The Jacobian with respect to z is one product over the hidden units, whatever the number of directions."""
+        """The Jacobian by z is one product over the hidden units, whatever the number of directions."""
         z, dz = jvp_columns(self.scaling.concatenate, (x, u), (dx, du))
         hidden, linear = self.layer(z)
         weight, skip = self.weight_in[:, : len(hidden)], self.weight_in[:, len(hidden) :]
@@ -94,11 +94,11 @@ class ResidualNetwork(AbstractVectorField):
     W₁ has no bias: batch normalisation would remove it, and the others have a shift.
 
     Attributes:
-        weight_in: W₁ (h, m), of h hidden units and the m numbers of z.
+        weight_in: W₁ (h, m), with h hidden units and the m numbers of z.
         norm: normalisation of W₁ z before the activation.
         weight_out: W₂ (d, h).
         bias_out: b₂ (d,).
-        scaling: of what the network reads and of what it returns; z is [x, u] after it.
+        scaling: of its inputs and outputs; z is [x, u] after scaling.
         activation: σ, by its name in `residual_network`, or a `SmoothRelu`.
     """
 
@@ -118,7 +118,7 @@ class ResidualNetwork(AbstractVectorField):
         return self.scaling.outputs(affine(self.weight_out, self.bias_out, self.activations(x, u)))
 
     def activations(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
-        """The hidden units in inference mode, in which the output layer is linear."""
+        """The hidden units in inference mode, on which the output layer is linear."""
         return function_of(self.activation)(self.norm.infer(self.weight_in, self.inputs(x, u)))
 
     def inputs(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
@@ -144,7 +144,7 @@ class ResidualNetwork(AbstractVectorField):
         return self.fused_with(jnp.zeros((len(self.weight_out), self.weight_in.shape[1]), self.weight_in.dtype)) or self
 
     def fused_with(self, linear: Float[Array, "d m"]) -> FusedNetwork | None:
-        """This and a linear map of z in one, or None if the normalisation is no affine map.
+        """The sum of this network and a linear map of z as one module, or None if the normalisation is not affine.
 
         Args:
             linear: the map A of z (d, m).
@@ -161,7 +161,7 @@ class LinearResidual(AbstractVectorField):
     """ẋ = W [x, u] + b: the simplest correction of another field.
 
     Attributes:
-        weight: W (d, n), of the n numbers of [x, u], in units of ẋ over theirs.
+        weight: W (d, n), with the n numbers of [x, u], in units of ẋ over theirs.
         bias: b (d,), in units of ẋ.
     """
 
@@ -177,10 +177,10 @@ class LinearResidual(AbstractVectorField):
 class LinearSkip(AbstractVectorField):
     """ẋ = A z + f_d(x, u), z = [x, scaled u]: a linear skip connection around a network.
 
-    Linear drag is such a map, which hidden units only approximate, and which extrapolates beyond the data.
+    It represents, for example, linear drag exactly and extrapolates it beyond the data; hidden units do not.
 
     Attributes:
-        weight: A (d, m), of the m numbers of z.
+        weight: A (d, m), with the m numbers of z.
         field: the network f_d, which also scales z.
     """
 
@@ -213,19 +213,19 @@ def residual_network(
     outputs: int | None = None,
     activation: str = "relu",
 ) -> ResidualNetwork:
-    """A network with weights uniform in ±1/√fan_in, as the paper's stack initialises a linear layer.
+    """A network with weights uniform in ±1/√fan_in, the paper's initialisation.
 
     Args:
-        state_size: d, the numbers in x.
-        input_size: m, the numbers in u; may be 0.
+        state_size: d, the size of x.
+        input_size: m, the size of u; may be 0.
         hidden: number of hidden units.
-        scaling: by default read off the training windows by `hybrid_jax.fit`; see `standardise.with_scaling`.
+        scaling: by default set from the training windows by `hybrid_jax.fit`; see `standardise.with_scaling`.
         norm: normalisation of the hidden units: "batch", "layer" or "none".
-        outputs: size of what it returns, by default `state_size`.
+        outputs: size of the output, by default `state_size`.
         activation: of the hidden units: "relu" (paper), "softplus", "tanh" or "silu"; see `smoothed`.
 
     Raises:
-        ValueError: another norm or activation, sizes that are no positive integers, or no random key.
+        ValueError: an unknown norm or activation, sizes that are not positive integers, or no random key.
     """
     for name, chosen, known in (("norm", norm, NORMS), ("activation", activation, tuple(ACTIVATIONS))):
         if chosen not in known:  # it may not be hashable
@@ -279,14 +279,14 @@ def zero_output(field: AbstractVectorField) -> AbstractVectorField:
 
 
 def smoothed(field: AbstractVectorField, beta: float) -> AbstractVectorField:
-    """The field with `SmoothRelu` in the place of ReLU; other activations stay. ValueError unless β > 0.
+    """The field with `SmoothRelu` instead of ReLU; other activations stay. ValueError unless β > 0.
 
-    Solvers that use second derivatives need this: those of ReLU are zero but for its kink. It is found in networks of
-    this library, and where a module holds `jax.nn.relu` as a field, as Equinox' MLP does.
+    You should use this for solvers with second derivatives, which are zero for ReLU except at its kink. It changes the
+    networks of this library, and modules with `jax.nn.relu` as a field, for example Equinox' MLP.
 
     Args:
         field: the field whose networks are changed.
-        beta: β, sharpness of `SmoothRelu`: the larger, the nearer to ReLU.
+        beta: β, sharpness of `SmoothRelu`; larger values are closer to ReLU.
     """
     smooth = SmoothRelu(beta)
 

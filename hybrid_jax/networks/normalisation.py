@@ -1,4 +1,4 @@
-"""Scaling of what a network reads and returns, and normalisation of its hidden units before the activation."""
+"""Scaling of a network's inputs and outputs, and normalisation of its hidden units before the activation."""
 
 from abc import abstractmethod
 from functools import reduce
@@ -19,7 +19,7 @@ Channels = tuple[float, ...]
 
 
 class AbstractScaling(eqx.Module):
-    """What a network does to its input [x, u] and to its output. Training leaves it alone.
+    """Scaling of a network's input [x, u] and output, which training does not change.
 
     Attributes:
         learned_from: some of the windows that the network was trained on, see `standardise.with_motion`.
@@ -37,11 +37,11 @@ class AbstractScaling(eqx.Module):
 
 
 class InputScaling(AbstractScaling):
-    """u ↦ (u − offset) / scale, the same for all inputs; x and the output as they are. ValueError unless scale > 0.
+    """u ↦ (u − offset) / scale, the same for all inputs; x and the output are not scaled. ValueError unless scale > 0.
 
     Attributes:
-        offset: what is taken from each input, in its unit.
-        scale: what each input is then divided by, in its unit.
+        offset: subtracted from each input, in its unit.
+        scale: divisor of each input, in its unit.
     """
 
     offset: float = eqx.field(static=True, default=0.0)
@@ -56,9 +56,9 @@ class InputScaling(AbstractScaling):
 
 
 class ChannelScaling(AbstractScaling):
-    """z = ([x, u] − offset) / scale and ẋ = output ⊙ y, channel by channel; what is None is left as it is.
+    """z = ([x, u] − offset) / scale and ẋ = output ⊙ y, channel by channel; None means no scaling.
 
-    `hybrid_jax.fit` reads it off the training windows; see `standardise.with_scaling`.
+    `hybrid_jax.fit` sets it from the training windows; see `standardise.with_scaling`.
     """
 
     offset: Channels | None = eqx.field(static=True, default=None)
@@ -103,7 +103,7 @@ class AbstractNorm(eqx.Module):
         return affine(weight_out, bias_out, activation(self.infer(weight_in, z)))
 
     def observed(self, hidden: Float[Array, "h b"]) -> Self:
-        """This after the pre-activations of a training batch.
+        """The normalisation with running statistics updated by a training batch.
 
         Args:
             hidden: W₁ z, a column for each sample (h, b).
@@ -112,7 +112,7 @@ class AbstractNorm(eqx.Module):
 
 
 class AbstractAffineNorm(AbstractNorm):
-    """A normalisation that is an affine map of z in inference mode, so that weights can hold it."""
+    """A normalisation that is an affine map of z in inference mode, so that it can be folded into the weights."""
 
     @abstractmethod
     def fold(self, weight: Float[Array, "h m"]) -> tuple[Float[Array, "h m"], Float[Array, " h"]]:
@@ -131,14 +131,14 @@ class AbstractAffineNorm(AbstractNorm):
 class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
     """Batch normalisation of the hidden pre-activations h = W z, with gain γ and shift β (Ioffe and Szegedy 2015).
 
-    In training by the minibatch's mean and variance, in inference by running ones, which fold into a map of z.
+    Training uses the minibatch's mean and variance, inference running ones, which can be folded into the weights.
 
     Attributes:
         gain: γ of each hidden unit (h,).
         shift: β of each hidden unit (h,).
-        running: mean and variance of each hidden unit, which inference uses.
-        momentum: share by which a training batch moves `running`.
-        epsilon: added to the variance before its root is taken.
+        running: mean and variance of each hidden unit, for inference.
+        momentum: fraction by which a training batch moves `running`.
+        epsilon: added to the variance before the square root.
     """
 
     gain: Float[Array, " h"]
@@ -159,7 +159,7 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
         return self.moved(RunningStats(mean, row_means(jnp.square(hidden - mean[:, None]))))
 
     def training_mode(self, seen: Moments):
-        """This for one sample of a minibatch.
+        """The layer for one sample of a minibatch.
 
         Args:
             seen: the moments of the minibatch.
@@ -187,7 +187,7 @@ class LayerNorm(AbstractNorm):
     Attributes:
         gain: factor on each hidden unit (h,).
         shift: added to each hidden unit (h,).
-        epsilon: added to the variance before its root is taken.
+        epsilon: added to the variance before the square root.
     """
 
     gain: Float[Array, " h"]

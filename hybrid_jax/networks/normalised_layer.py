@@ -1,4 +1,4 @@
-"""Batch normalisation in training mode with the layers around it, and its derivative written out."""
+"""Batch normalisation in training mode with the adjacent layers, and its explicit derivative."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,8 +15,8 @@ def normalised_layer(
 ) -> Float[Array, "d b"]:
     """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
 
-    The derivative is written out because XLA turns the sums over a minibatch that autodiff asks for into scalar loops
-    on a CPU; as products with a vector of ones they halve the time of a training step. A test compares the two.
+    The derivative is explicit because XLA compiles the minibatch sums of autodiff to scalar loops on a CPU; as products
+    with a vector of ones they halve the time of a training step. A test compares the two.
     """
     arrays = weight_in, gain, shift, weight_out, bias_out, z
     precision = jnp.result_type(*arrays)  # each derivative is returned in the precision of its array
@@ -66,6 +66,5 @@ def _transposed(matrix: Float[Array, "r c"]) -> Float[Array, "c r"]:
 
 
 def row_means(rows: Float[Array, "r b"]) -> Float[Array, " r"]:
-    """The mean of each row."""
     # A row times the transposed: on a CPU less than half of what the matrix times a column takes.
     return (jnp.full((1, rows.shape[1]), 1 / rows.shape[1], rows.dtype) @ rows.T)[0]

@@ -1,4 +1,4 @@
-"""Set the scaling of networks from the training windows: inputs of mean 0 and deviation 1, outputs of the size of ẋ."""
+"""Set the scaling of networks from the training windows: inputs to mean 0 and deviation 1, outputs to the RMS of ẋ."""
 
 from dataclasses import replace
 from functools import partial
@@ -25,7 +25,7 @@ FLOOR = 0.01  # least scale of an input over the size of its mean, and of an out
 
 
 class _Probe(AbstractBatchNorm, AbstractScaling):
-    """Silences a network in inference mode. In training mode, records the moments of what the network reads."""
+    """A scaling that records the moments of the input in training mode and sets the output to zero in inference mode."""
 
     running: RunningStats
     momentum: float = eqx.field(static=True, default=0.0)
@@ -46,11 +46,11 @@ class _Probe(AbstractBatchNorm, AbstractScaling):
 
 
 def with_motion(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
-    """The field with some of the windows that it is trained on in the scaling of each network, for `hj.adapt`.
+    """The field with some of its training windows stored in the scaling of each network, for `hj.adapt`.
 
     Args:
-        field: a field that contains networks; one without is returned as it is.
-        windows: those that the field is trained on.
+        field: a field that contains networks; one without is returned unchanged.
+        windows: the training windows.
     """
     places = np.linspace(0, len(windows) - 1, min(len(windows), max(1, KEPT // windows[0].x.size), MOST)).astype(int)
     if not (networks := _networks(field)):
@@ -61,20 +61,20 @@ def with_motion(field: AbstractVectorField, windows: Trajectories) -> AbstractVe
 
 
 def motion_of(field: AbstractVectorField) -> Trajectories | None:
-    """Some of the windows that a field was trained on, see `with_motion`; None if it does not hold any."""
+    """The training windows stored by `with_motion`, or None."""
     return next((one.learned_from for one in _scalings(field) if one.learned_from is not None), None)
 
 
 def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
-    """The field with every `ChannelScaling` that is not set yet, as `residual_network` makes it, set from windows.
+    """The field with every `ChannelScaling` that is not set yet (see `residual_network`) set from windows.
 
-    Inputs are brought to mean 0 and standard deviation 1. If there is one output for each state, or of a `GridNetwork`
-    for each component, outputs are brought to the RMS of the derivative that the rest of the field lacks. A scaling
-    that was given or set stays as it is.
+    Inputs are scaled to mean 0 and standard deviation 1. Outputs are scaled to the RMS of the derivative that the rest
+    of the field lacks, if there is one for each state or, in a `GridNetwork`, for each component. Scalings that are
+    already set do not change.
 
     Args:
-        field: a field that contains networks; one without is returned as it is.
-        windows: those that the field is to be trained on.
+        field: a field that contains networks; one without is returned unchanged.
+        windows: the training windows.
     """
     networks = _networks(field)
     unset = [eqx.tree_equal(network.scaling, ChannelScaling()) for network in networks]
@@ -110,13 +110,13 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
 def _seen(
     probed: AbstractVectorField, x: Float[Array | np.ndarray, "d b"], u: Float[Array | np.ndarray, "m b"]
 ) -> list[batching.Moments]:
-    """The moments of what each probe reads, in the order of the networks."""
+    """The moments of each probe's input, in the order of the networks."""
     seen = zip(batching.batch_norms(probed), batching.moments_of(probed, x, u), strict=True)
     return [moments for norm, moments in seen if isinstance(norm, _Probe)]
 
 
 def _output(network: ResidualNetwork, grids: list[GridNetwork], lacking, rate) -> Channels | None:
-    """The scale of the outputs: of each state, or of each component of a grid, if the network returns one for each."""
+    """The scale of the outputs of a network with one for each state, or for each component of a grid; else None."""
     if len(network.bias_out) == len(rate):
         return _positive(lacking, FLOOR * rate)
     if not any(grid.network is network and grid.grid.size == len(rate) for grid in grids):
@@ -127,7 +127,7 @@ def _output(network: ResidualNetwork, grids: list[GridNetwork], lacking, rate) -
 
 
 def _positive(scale: Float[np.ndarray, " d"], floor: Float[np.ndarray, " d"]) -> Channels:
-    """The scale of each channel, no less than its floor; 1 where both are zero or the scale is not finite."""
+    """The scale of each channel, at least its floor; 1 where both are zero or the scale is not finite."""
     scale = np.maximum(scale, floor)
     return tuple(np.where(np.isfinite(scale) & (scale > 0), scale, 1.0).tolist())
 

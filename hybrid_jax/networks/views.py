@@ -1,4 +1,4 @@
-"""`make_residual`: a residual network that reads and returns part of a multirotor's state, chosen by name."""
+"""Residual networks on part of a multirotor's state, chosen by name: `make_residual`."""
 
 from typing import ClassVar
 
@@ -38,9 +38,9 @@ def _check(inputs: str, outputs: str, vehicle: Vehicle | None) -> None:
 class View(AbstractWrapper):
     """The field inside reads some features of a multirotor's state and returns some derivatives; see `make_residual`.
 
-    Derivatives that it does not return are zero, and so those of the physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact for
-    a true state, but not for estimates. Seen from the body it returns ṗ and v̇ in the body frame and q̇ as the
-    quaternion r of q̇ = q ⊗ r, so that the whole is equivariant to translation in x and y and to yaw.
+    Other derivatives are zero: the physics ṗ = v and q̇ = ½ q ⊗ [0, ω] is exact for a true state, but not for estimates.
+    In the body frame it returns ṗ, v̇ and the quaternion r of q̇ = q ⊗ r, which makes it equivariant to yaw and to
+    translation in x and y.
     """
 
     inputs: str = eqx.field(static=True, default="all")
@@ -93,22 +93,21 @@ def make_residual(
     Args:
         inputs: what it reads besides u. "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw": p_z, the world's up in
             the body frame Rᵀe_z, v and ω, in world axes, in which a wind keeps its direction when the vehicle yaws;
-            "near_ground", that and R / h of each rotor after p_z, in which ground effect is nearly linear (Cheeseman
+            "near_ground", these and R / h of each rotor after p_z, in which ground effect is nearly linear (Cheeseman
             and Bennett 1955); "body": p_z, the direction of gravity and Rᵀv [m/s] in the body frame, and ω;
             "body_motion", Rᵀv, ω and Rᵀe_z, without the height, for flight away from the ground.
         outputs: "all" 13 derivatives; "accelerations", v̇ and ω̇; "rotors", these and the thrust of each rotor by a
-            second network (`RotorThrust`), which starts at zero; "angular_acceleration", ω̇ alone; "motion",
-            corrections of ṗ, of the body rates in q̇, of v̇ and of ω̇, in the body frame.
+            second network (`RotorThrust`), initially zero; "angular_acceleration", only ω̇; "motion", corrections of
+            ṗ, of the body rates in q̇, of v̇ and of ω̇, in the body frame.
         hidden: units of each network.
-        norm: as in `residual_network`.
-        activation: as in `residual_network`.
-        scaling: as in `residual_network`.
-        linear: add a linear skip connection (`LinearSkip`); the output then starts at zero.
-        vehicle: gives the number of rotors, by default four; needed by "near_ground" and "rotors".
+        norm: see `residual_network`.
+        activation: see `residual_network`.
+        scaling: see `residual_network`.
+        linear: add a linear skip connection (`LinearSkip`); the output is then initially zero.
+        vehicle: gives the number of rotors, by default four; required for "near_ground" and "rotors".
 
     Raises:
-        ValueError: an unknown name, outputs that do not go with the inputs (see `GO_WITH`), or no vehicle, or none of
-            known rotor radius, where one is needed.
+        ValueError: an unknown name, incompatible outputs and inputs (see `GO_WITH`), or no vehicle or rotor radius.
     """
     _check(inputs, outputs, vehicle)
     rotors = INPUT_SIZE if vehicle is None else vehicle.rotors
@@ -125,11 +124,11 @@ def make_residual(
 
 
 class RotorThrust(AbstractVectorField):
-    """v̇ and ω̇ of a thrust k uᵢ² f(R / hᵢ, uᵢ) of each rotor along the body's z axis, k and inertia the nominal ones.
+    """v̇ and ω̇ of a thrust k uᵢ² f(R / hᵢ, uᵢ) of each rotor along the body's z axis, with nominal k and inertia.
 
     By dimensional analysis, the ground effect on a rotor in hover is a function of its radius R over its altitude h
-    (Cheeseman and Bennett 1955). One network learns it from the data of every rotor: the vehicle's geometry says where
-    each thrust acts, so that force and torque follow. The other derivatives are exactly zero.
+    (Cheeseman and Bennett 1955). One network learns it from the data of all rotors; force and torque follow from the
+    vehicle's geometry. The other derivatives are exactly zero.
 
     Attributes:
         field: f, from one state and one input to one number, without batch normalisation.
@@ -175,10 +174,10 @@ class RotorThrust(AbstractVectorField):
         return jax.vmap(self.field)(near[:, None], u[:, None])[:, 0]
 
     def write(self, x, u, share: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
-        """ẋ from the additional thrust of each rotor, as a share of k u².
+        """ẋ from the additional thrust of each rotor.
 
         Args:
-            share: of each rotor, as a share of k u² (rotors,).
+            share: additional thrust of each rotor as a fraction of k u² (rotors,).
         """
         vehicle = self.vehicle
         thrust = vehicle.thrust_coefficient * u * u * share

@@ -1,4 +1,4 @@
-"""The true system: a quadrotor in MuJoCo MJX with drag, ground effect and wind, and a pilot for random flights.
+"""A simulated quadrotor in MuJoCo MJX with drag, ground effect and wind, and a pilot for random flights.
 
 Raises ImportError if mujoco or mujoco-mjx is missing or of an unsupported version: the two integrate a free body
 differently across versions, and mujoco-mjx sets no upper bound on mujoco.
@@ -8,7 +8,7 @@ from hybrid_jax.io.datasets import versions
 
 
 def check_versions(found: dict[str, str]) -> None:
-    """Raise ImportError, with the command that installs others, unless both versions are 3.17.*."""
+    """Raise ImportError, with the install command, unless both versions are 3.17.*."""
     if not all(found[package].startswith("3.17.") for package in ("mujoco", "mujoco-mjx")):
         raise ImportError(
             f"hybrid_jax.sim needs mujoco and mujoco-mjx 3.17.*, found mujoco {found['mujoco']} and mujoco-mjx "

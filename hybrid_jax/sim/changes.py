@@ -1,4 +1,4 @@
-"""Changes of the Iris that adaptation is compared on: the paper's two, and five more."""
+"""Changes of the Iris for comparisons of adaptation methods: the paper's two, and five more."""
 
 from dataclasses import replace
 
@@ -10,9 +10,9 @@ from hybrid_jax.vehicle import IRIS, Vehicle
 
 
 def loaded(vehicle: Vehicle, mass: float, place: tuple[float, float, float]) -> Vehicle:
-    """The vehicle with a point mass [kg] at a place in the body frame [m]; its centre of mass becomes the origin.
+    """The vehicle with a point mass [kg] at a place in the body frame [m]; the new centre of mass becomes the origin.
 
-    Moments of inertia by the parallel axis theorem; products of inertia, small for a small load, are left out.
+    Moments of inertia follow from the parallel axis theorem; products of inertia, small for a small load, are left out.
     """
     total, at = vehicle.mass + mass, np.asarray(place)
     centre = mass / total * at

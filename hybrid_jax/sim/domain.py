@@ -1,8 +1,7 @@
-"""True systems: the source domain of the paper and its two targets, and the dynamics of their vehicle.
+"""Simulated systems: the paper's source domain and its two targets, and the dynamics of their vehicle.
 
-Accelerations are those of MuJoCo MJX for iris.xml with the constants of the vehicle, integrated by classical RK4. MJX
-freezes xfrc_applied within a step, which makes any of its integrators first order in drag. Here every RK4 stage
-recomputes the forces.
+Accelerations are those of MuJoCo MJX for iris.xml with the vehicle's constants, integrated by classical RK4. Every RK4
+stage recomputes the forces: MJX freezes xfrc_applied within a step, which makes its integrators first order in drag.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -42,7 +41,7 @@ class Quadrotor(eqx.Module):
         Args:
             x: state (13,).
             u: rotor speeds [rad/s].
-            t: time [s], of which wind is a function.
+            t: time [s], for time-dependent forces such as wind.
         """
         # Not above: MJX takes as long to import as JAX, and a program that was kept needs no MJX.
         from hybrid_jax.sim import scene
@@ -53,7 +52,7 @@ class Quadrotor(eqx.Module):
         return jnp.concatenate([x[VELOCITY], turning, scene.accelerations(self.parameters, x, u, applied)])
 
     def step(self, x: State, u: Input, t: Scalar, dt: Scalar | float) -> State:
-        """The state after dt [s] with u held from time t on: one step of classical RK4.
+        """The state after dt [s] with constant u from time t on: one step of classical RK4.
 
         Args:
             x: state (13,).
@@ -80,10 +79,10 @@ class Quadrotor(eqx.Module):
         dt: float,
         chunk: int = CHUNK,
     ) -> Float[Array, "n t 13"]:
-        """The states of n flights at the end of each interval, from x0 at t0 [s] with u[:, i] held over interval i.
+        """The states of n flights at the end of each interval, with u[:, i] constant over interval i.
 
         Args:
-            x0: states at the start (n, 13).
+            x0: initial states (n, 13).
             u: rotor speeds (n, t, rotors) [rad/s].
             t0: time at the start of each flight (n,) [s].
             dt: length of an interval [s].
@@ -91,7 +90,7 @@ class Quadrotor(eqx.Module):
 
         Raises:
             ValueError: shapes do not agree; or, outside of compiled code, a number is not finite, dt is not positive,
-                or x0 has no unit quaternion.
+                or a quaternion in x0 is not of norm 1.
         """
         x0, u, n = checks.floating("x0", x0), checks.floating("u", u), jnp.shape(t0)
         m = len(self.parameters.spin)
@@ -116,12 +115,12 @@ _derivative = eqx.filter_jit(Quadrotor.derivative)
 
 @dataclass(frozen=True)
 class Domain:
-    """A true system: a vehicle and the forces on it beyond thrust and gravity.
+    """A simulated system: a vehicle and the forces on it beyond thrust and gravity.
 
     Attributes:
-        name: what the system is called; flights depend on it.
+        name: name of the system; flights depend on it.
         vehicle: the true vehicle.
-        drag_coefficient: C_D [kg/s]; by default that of the Iris times the square of the size.
+        drag_coefficient: C_D [kg/s]; by default the Iris's, times the square of the size.
         forces: functions of `hybrid_jax.sim.forces`, or of your own, that add to thrust and gravity.
         nominal: the vehicle that the pilot of random flights is tuned for; by default the true one.
 
@@ -147,7 +146,7 @@ class Domain:
             raise ValueError(f"forces must be a tuple of functions, got {checks.short_repr(self.forces)}")
 
     def quadrotor(self) -> Quadrotor:
-        """The dynamics of the true system, in the current precision."""
+        """The dynamics of the system, in the current precision."""
         return Quadrotor(parameters_of(self.vehicle, self.drag_coefficient), self.forces)
 
     def describe(self) -> dict[str, Any]:

@@ -1,7 +1,4 @@
-"""Random flights of a domain, the pilot and the true vehicle in closed loop, and datasets of them.
-
-A dataset holds windows in splits of disjoint flights, with statistics and configuration.
-"""
+"""Random closed-loop flights of a domain, and datasets of windows in splits of disjoint flights."""
 
 import math
 import zlib
@@ -60,10 +57,10 @@ class Flights(NamedTuple):
 def random_flights(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flights:
     """Simulate random closed-loop flights of `seconds` each, at 100 Hz, always in float64 and on the CPU.
 
-    Flight i depends on the key and i alone.
+    Flight i depends only on the key and i.
 
     Args:
-        domain: the true system.
+        domain: the simulated system.
         flights: how many flights.
         seconds: length of each [s].
         key: random key.
@@ -96,7 +93,7 @@ def _fly_chunk(
     vehicle: Vehicle,
     mesh: Mesh,
 ) -> Flights:
-    """The flights of these numbers, an even share of them on each device of the mesh."""
+    """Simulate the flights with these numbers, an even share of them on each device of the mesh."""
     truth, nominal, key = shared
     scale = pilot.scale_of(vehicle)
 
@@ -142,7 +139,7 @@ class SplitSpec:
     Attributes:
         windows: windows of the split.
         steps: intervals of each window.
-        flights: the windows are the first ones of so many flights, in order; by default at random of many.
+        flights: take the first windows of this many flights, in order; by default random windows of many flights.
     """
 
     windows: int
@@ -167,10 +164,10 @@ def make_dataset(
     A split depends on the domain's name, its own name and size and the seed, not on the other splits.
 
     Args:
-        domain: the true system.
+        domain: the simulated system.
         splits: name → size of each split.
         seed: of all random numbers, at least 0.
-        progress: called with the finished share of the work, 0 … 1.
+        progress: called with the finished fraction of the work, 0 … 1.
 
     Raises:
         ValueError: seed is negative, or no flight of this domain stays in bounds.
@@ -211,7 +208,7 @@ def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[T
 
 
 def permutation(key: PRNGKeyArray, n: int) -> Int[np.ndarray, " n"]:
-    """`jax.random.permutation(key, n)`, for every n of which JAX compiles two programs, in half a second."""
+    """`jax.random.permutation(key, n)` without compiling two programs for every n, which takes half a second."""
     order = np.arange(n)
     for _ in range(math.ceil(3 * math.log(max(n, 1)) / math.log(2**32 - 1))):
         # The first numbers are the same however many are drawn (jax_threefry_partitionable).
@@ -227,7 +224,7 @@ def _drawn(key: PRNGKeyArray, n: int) -> tuple[PRNGKeyArray, UInt[Array, " n"]]:
 
 
 def cut(flights: Flights, steps: int, tally: Counter[str], vehicle: Vehicle = IRIS) -> list[Trajectories]:
-    """The valid windows of the valid flights (float32); the tally counts flights, windows and those of them dropped."""
+    """The valid windows of the valid flights (float32); the tally counts flights, windows and dropped ones."""
     parts, wrong = [], gone_wrong(flights.states, vehicle)
     tally.update(flights=len(wrong), dropped_flights=int(wrong.sum()))
     for states, inputs, lowest in zip(*(leaf[~wrong] for leaf in flights[:3]), strict=True):
@@ -241,7 +238,7 @@ def cut(flights: Flights, steps: int, tally: Counter[str], vehicle: Vehicle = IR
 
 
 def survey(windows: Trajectories) -> dict[str, float]:
-    """Speeds, tilts, altitudes …: percentiles over all states and shares in [0, 1], by name and unit."""
+    """Percentiles over all states and fractions of speeds, tilts, altitudes …, by name and unit."""
     x = np.asarray(windows.x)
     altitude, q, rates = x[..., POSITION][..., 2], x[..., QUATERNION], np.abs(x[..., BODY_RATES])
     height = altitude.mean(axis=1)

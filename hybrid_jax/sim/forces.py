@@ -1,6 +1,6 @@
-"""Forces on the true vehicle besides rotor thrust, reaction torque and gravity.
+"""Forces on the simulated vehicle besides rotor thrust, reaction torque and gravity.
 
-A force is a function (x, u, t, parameters) → Wrench. To add one, add the function to the `forces` of a `Domain`.
+A force is a function (x, u, t, parameters) → Wrench. You can add your own to the `forces` of a `Domain`.
 """
 
 import math
@@ -36,7 +36,7 @@ class Wrench(NamedTuple):
 
 
 class Parameters(eqx.Module):
-    """The parameters of a true vehicle (see `Vehicle`) as array leaves, so that they can be traced and vmapped."""
+    """The parameters of a simulated vehicle (see `Vehicle`) as array leaves, so that they can be traced and vmapped."""
 
     mass: Scalar
     inertia: Float[Array, "3"]
@@ -86,7 +86,7 @@ def gusty_wind(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
 
 
 def weak_rotor(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
-    """The first rotor gives 15 % less thrust and reaction torque than its speed stands for."""
+    """The first rotor gives 15 % less thrust and reaction torque than nominal at its speed."""
     lost, up, q = LOST_THRUST * u[0] ** 2, jnp.array([0.0, 0.0, 1.0], x.dtype), normalise(x[QUATERNION])
     thrust, reaction = lost * parameters.thrust_coefficient * up, lost * parameters.torque_coefficient * up
     torque = jnp.cross(parameters.rotor_positions[0], thrust) + parameters.spin[0] * reaction
@@ -112,6 +112,5 @@ def thrust_gain(altitude: Float[Array, "*rotors"], rotor_radius: Scalar) -> Floa
 
 
 def rotor_altitudes(x: State, rotor_positions: Float[Array, "rotors 3"]) -> Float[Array, " rotors"]:
-    """The altitude [m, world z] of each rotor."""
     q = normalise(x[QUATERNION])
     return x[POSITION][2] + jax.vmap(rotate, in_axes=(None, 0))(q, rotor_positions)[:, 2]

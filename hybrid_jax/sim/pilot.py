@@ -1,7 +1,7 @@
 """A pilot for random flight between waypoints, sometimes close to the ground, with dither on all axes.
 
-A `Plan` holds all that is random. `act` is the closed loop: a cascade of position, velocity, attitude and rate control
-at 100 Hz for the nominal vehicle. The constants are those for the Iris; `Scale` adapts them to other sizes.
+A `Plan` contains all random numbers. `act` is the closed loop: a cascade of position, velocity, attitude and rate
+control at 100 Hz for the nominal vehicle. Constants are for the Iris; `Scale` adapts them to other sizes.
 """
 
 import math
@@ -49,7 +49,7 @@ DIP, ARM = 0.12, 0.26  # near the ground a rotor this far out [m] dips by no mor
 
 
 class Scale(NamedTuple):
-    """Quantities of a vehicle over those of the Iris, by Froude scaling.
+    """Ratios of a vehicle's quantities to the Iris's, by Froude scaling.
 
     Flights are geometrically similar at the same tilt and thrust over weight, with times proportional to the root of
     lengths. A small vehicle is slowed down to what 100 Hz can control.
@@ -97,7 +97,7 @@ def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
 
 
 def _shorten(velocity: Float[Array, "4"], fastest: Vector) -> Float[Array, "4"]:
-    """Keep the direction in the plane and limit the speed in it, the climb and the turn."""
+    """Limit the horizontal speed, keeping its direction, the climb and the turn."""
     speed = jnp.linalg.norm(velocity[:2]) + 1e-9
     plane = velocity[:2] * jnp.minimum(1.0, fastest[0] / speed)
     return jnp.concatenate([plane, jnp.clip(velocity[2:], -fastest[1:], fastest[1:])])
@@ -134,10 +134,10 @@ def _draw_dither(key: PRNGKeyArray, steps: int, scale: Scale) -> Float[Array, "t
 def act(
     integral: Vector, x: State, plan: Plan, nominal: Parameters, vehicle: Vehicle, scale: Scale
 ) -> tuple[Vector, Input]:
-    """One decision: rotor speeds [rad/s] that the vehicle can reach, for the current entry of the plan.
+    """One decision: feasible rotor speeds [rad/s] for the current entry of the plan.
 
-    `nominal` are the parameters of `vehicle`, which the pilot is tuned for. `integral` is that of the position error
-    [m/s², world], passed in and returned.
+    `nominal` are the parameters of `vehicle`, which the pilot is tuned for. `integral` is the integrated position error
+    [m/s², world frame], passed in and returned.
     """
     # Raise the reference to a safe altitude if wind has blown the vehicle far away.
     far, place = jnp.linalg.norm(x[POSITION][:2]) > ASTRAY * scale.length, plan.position
@@ -164,7 +164,7 @@ def _flare(wanted: Scalar, altitude: Scalar, climb: Scalar, scale: Scale):
 
 
 def _limit_tilt(lift: Vector, altitude: Scalar, gravity: Scalar, scale: Scale) -> Vector:
-    """Limit the commanded acceleration [m/s², world] to upward thrust and to tilts that keep rotors off the ground."""
+    """Limit the commanded acceleration [m/s², world frame] to upward thrust and tilts that keep rotors off the ground."""
     up = jnp.clip(lift[2], 0.5 * gravity, 1.7 * gravity)
     lowest = jnp.arcsin(jnp.clip(DIP * altitude / (ARM * scale.length), 0.05, 1.0))
     sideways = jnp.linalg.norm(lift[:2]) + 1e-9
@@ -173,7 +173,7 @@ def _limit_tilt(lift: Vector, altitude: Scalar, gravity: Scalar, scale: Scale) -
 
 
 def _angular_acceleration(x: State, lift: Vector, heading: Scalar, scale: Scale) -> Vector:
-    """The angular acceleration [rad/s², body] that turns thrust towards lift and the nose towards heading [rad]."""
+    """The angular acceleration [rad/s², body frame] that turns thrust towards lift and the nose to heading [rad]."""
     yaw = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), heading)
     dx, dy, dz = lift / jnp.linalg.norm(lift)
     tilt = normalise(jnp.stack([1 + dz, -dy, dx, jnp.zeros_like(dz)]))  # the shortest turn of world z to lift
@@ -184,7 +184,7 @@ def _angular_acceleration(x: State, lift: Vector, heading: Scalar, scale: Scale)
 
 
 def _allocate(thrust: Scalar, torque: Vector, vehicle: Vehicle) -> Input:
-    """Rotor speeds [rad/s] that give a thrust [N] and a torque [N m, body], clipped to what a rotor can do."""
+    """Rotor speeds [rad/s] for a thrust [N] and a torque [N m, body frame], clipped to their limits."""
     wrench = jnp.concatenate([thrust[None], torque])
     mixer, rotors = jnp.asarray(vehicle.mixer, wrench.dtype), vehicle.rotors
     if rotors <= 4:  # three rotors leave yaw alone
@@ -197,7 +197,7 @@ def _allocate(thrust: Scalar, torque: Vector, vehicle: Vehicle) -> Input:
 
 
 def starting_state(key: PRNGKeyArray, plan: Plan, scale: Scale) -> State:
-    """Near the start of a plan, slightly tilted, drifting and turning."""
+    """A random state near the start of a plan, slightly tilted, drifting and turning."""
     draw = jax.random.normal(key, (3, 3))
     level = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), plan.heading[0])
     tilted = multiply(level, from_axis_angle(draw[0] / jnp.linalg.norm(draw[0]), jnp.asarray(0.05)))

@@ -63,13 +63,13 @@ def traced_model(p: Parameters) -> mjx.Model:
 
 
 def _placeholder(rotors: int) -> Vehicle:
-    """The Iris with another number of rotors, wherever they are."""
+    """The Iris with another number of rotors, at arbitrary positions."""
     places, spin = ((each * rotors)[:rotors] for each in (IRIS.rotor_positions, IRIS.spin))
     return replace(IRIS, rotor_positions=places, spin=spin)
 
 
 def accelerations(p: Parameters, x: State, u: Input, applied: Float[Array, "6"]) -> Float[Array, "6"]:
-    """v̇ and ω̇ for rotor speeds u [rad/s] and a force [N] and torque [N m] that are applied besides."""
+    """v̇ and ω̇ for rotor speeds u [rad/s] and an additional force [N] and torque [N m]."""
     model = traced_model(p)
     forces = jnp.stack([jnp.zeros_like(applied), applied])
     data = mjx.make_data(model).replace(qpos=x[:7], qvel=x[7:], ctrl=u**2, xfrc_applied=forces)
