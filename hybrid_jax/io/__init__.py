@@ -1,4 +1,4 @@
-"""Models and datasets as files that hold data and no code, written atomically and verified by a checksum."""
+"""Models and datasets as files with data and no code, written atomically and verified by a checksum."""
 
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.models import Model, check_savable, describe, load, save

@@ -1,4 +1,4 @@
-"""Archives: named arrays and JSON metadata in one file, without pickle, with a checksum, byte for byte reproducible."""
+"""Archives: named arrays and JSON metadata in one reproducible file, with a checksum and without pickle."""
 
 import hashlib
 import io
@@ -60,7 +60,7 @@ def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarr
 
 
 def digest(metadata: Any, arrays: Arrays) -> str:
-    """SHA-256 (hex) of metadata, as strict JSON, and arrays. The order of keys and names does not matter."""
+    """SHA-256 (hex) of arrays and of metadata as strict JSON, independent of the order of keys and names."""
     found = hashlib.sha256(encode(metadata, sort_keys=True, separators=(",", ":")))
     for name in sorted(arrays):
         array = np.asarray(arrays[name], order="C")  # np.ascontiguousarray would make a vector of a scalar
@@ -70,7 +70,7 @@ def digest(metadata: Any, arrays: Arrays) -> str:
 
 
 def encode(value: Any, **layout: Any) -> bytes:
-    """Encode a value as strict JSON; ValueError if it has no such form."""
+    """Encode a value as strict JSON; ValueError if this is impossible."""
     try:
         return json.dumps(value, allow_nan=False, **layout).encode()
     except (TypeError, ValueError, RecursionError) as error:
@@ -89,7 +89,7 @@ def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
 
 
 def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) -> PyTree:
-    """`like` with each array replaced by that of its path; ValueError of `origin` and the first that does not fit."""
+    """`like` with each array replaced by the one at its path; ValueError, with `origin`, if one does not fit."""
     expected = named_leaves(like)
     found, wanted = ({name: f"{a.dtype}{list(a.shape)}" for name, a in side.items()} for side in (arrays, expected))
     for name in sorted(expected.keys() | arrays.keys()):
@@ -104,14 +104,14 @@ def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) 
 
 
 def array_type(array: Any) -> dict[str, str]:
-    """What a NumPy array of `to_numpy` does not say: the algorithm of a random key, or a type in `EXTENDED`."""
+    """What `to_numpy` loses: the algorithm of a random key, or a type in `EXTENDED`."""
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
         return {"key": str(jax.random.key_impl(array))}
     return {"dtype": array.dtype.name} if array.dtype.name in EXTENDED else {}
 
 
 def to_numpy(array: Any) -> np.ndarray:
-    """An array in a type that a .npy can describe."""
+    """An array in a type that the .npy format supports."""
     kind = array_type(array)
     stored = np.asarray(jax.random.key_data(array) if "key" in kind else array)
     return stored.view(f"u{stored.itemsize}") if "dtype" in kind else stored
@@ -125,7 +125,7 @@ def from_numpy(array: np.ndarray, kind: Mapping[str, str]) -> Any:
 
 
 def _read_entries(path: Path) -> dict[str, bytes]:
-    """The bytes of each entry by name. Refuses names that leave the folder, and compression, which may hide a size."""
+    """The bytes of each entry by name; ValueError for paths outside the folder and for compression."""
     if path.exists() and not path.is_file():
         raise ValueError("it is no regular file")  # a pipe would be waited for, a device read without end
     with zipfile.ZipFile(path) as archive:

@@ -24,8 +24,8 @@ class Dataset:
     """Windows by the name of their split.
 
     Attributes:
-        splits: the windows of each split, such as "train", by its name.
-        metadata: JSON values. Its entry `config` determines the windows; the rest, such as versions, describes them.
+        splits: the windows of each split by its name, for example "train".
+        metadata: JSON values. Its entry `config` determines the windows; other entries describe them, e.g. versions.
         origin: the file that it was read from, for messages.
     """
 
@@ -57,16 +57,16 @@ class Dataset:
 
 
 def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) -> None:
-    """Write a dataset atomically. If the file already has these windows and this configuration, it is left unchanged.
+    """Write a dataset atomically. A file with the same windows and configuration is left unchanged.
 
     Args:
         path: of the file to write.
-        dataset: the windows and what is known about them.
+        dataset: the windows and their metadata.
         overwrite: whether a file with other content may be replaced.
 
     Raises:
         ValueError: malformed windows, windows of a vehicle without unit quaternions, metadata that are not JSON, or a
-            file that exists with other content while `overwrite` is false.
+            file with other content while `overwrite` is false.
         OSError: the file cannot be written.
     """
     path = Path(path)
@@ -86,11 +86,11 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
 
     Args:
         path: of a file that `save_dataset` wrote.
-        expected_config: entries that the configuration must have; it may have others. None for no condition.
+        expected_config: entries that the configuration must contain; None for no condition.
 
     Raises:
-        ValueError: the file is missing, damaged or not a dataset, or of another configuration; one line that names the
-            file and every entry that differs.
+        ValueError: the file is missing, damaged or not a dataset, or has another configuration; one line with the file
+            and every entry that differs.
     """
     header, arrays = load_archive(path, FORMAT)
     try:
@@ -136,7 +136,7 @@ def _check_splits(path: Path | str, dataset: Dataset) -> None:
 
 
 def _content(dataset: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What is saved of each split besides its arrays, and these by name."""
+    """The saved metadata of each split, and its arrays by name."""
     splits = {name: dataset.splits[name] for name in sorted(dataset.splits)}
     arrays = {f"{name}/{part}": np.asarray(getattr(splits[name], part)) for name in splits for part in ARRAYS}
     return {name: {"dt": windows.dt} for name, windows in splits.items()}, arrays

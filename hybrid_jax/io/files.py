@@ -18,10 +18,10 @@ from hybrid_jax.checks import content_of, first_line
 
 
 def write_atomic(path: str | Path, content: str | bytes) -> None:
-    """Write a new file beside `path`, text as UTF-8, then rename it; OSError leaves an earlier file as it was.
+    """Write a new file beside `path`, text as UTF-8, then rename it; OSError leaves an earlier file unchanged.
 
-    Nobody can foresee the new file's name, and what should be there all the same, such as a link, is not written to.
-    Those that a killed process left an hour ago are deleted.
+    The new file has a random name and is never an existing one, for example a link. Those that a killed process left an
+    hour ago are deleted.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,7 +73,7 @@ def json_value(value: Any) -> Any:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file; ValueError of one line if it cannot be read or is not JSON (NaN and Infinity are not)."""
+    """Read a JSON file; one-line ValueError if it cannot be read or is not JSON (NaN and Infinity are not)."""
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not JSON")

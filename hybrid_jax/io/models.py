@@ -1,4 +1,4 @@
-"""Trained models as files: saved and loaded with one call. A file holds data; loading it runs no code of the file."""
+"""Save and load trained models. A file contains only data; loading it runs no code of the file."""
 
 import dataclasses
 import warnings
@@ -24,11 +24,11 @@ FORMAT = "hybrid_jax model 2"
 
 @dataclass(frozen=True)
 class Model:
-    """A vector field and what is known about it.
+    """A vector field and its metadata.
 
     Attributes:
         field: the vector field ẋ = f(x, u), or any other Equinox module that was saved.
-        about: JSON values about it, such as its origin and test error.
+        about: JSON values about it, for example its origin and test error.
     """
 
     field: AbstractVectorField
@@ -37,18 +37,18 @@ class Model:
     def predict(
         self, x0: Float[Array | np.ndarray, "*n d"], u: Float[Array | np.ndarray, "*n t m"], dt: float
     ) -> Float[Array, "*n t d"]:
-        """The state of one window, or of n, at the end of each interval, under inputs that are held.
+        """The state of one window, or of n, at the end of each interval, under piecewise constant inputs.
 
-        All are finite. To keep the other windows where some diverge, use `rollout_batch`.
+        To keep the other windows if some diverge, use `rollout_batch` instead.
 
         Args:
-            x0: the first state of each window.
+            x0: the initial state of each window.
             u: the input in each of the t intervals of each window.
             dt: length of an interval [s].
 
         Raises:
-            ValueError: shapes do not agree or do not fit the model, a number is not finite, dt is not positive, a rigid
-                body starts without a unit quaternion, or a prediction diverges.
+            ValueError: shapes do not agree or do not fit the model, a number is not finite, dt is not positive, an
+                initial quaternion is not of norm 1, or a prediction diverges.
         """
         if not callable(self.field):
             name = type(self.field).__name__
@@ -68,16 +68,16 @@ class Model:
 def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = None) -> None:
     """Write a model to one file: any Equinox module, and JSON values `about` it.
 
-    Warns if `load` will need `like`, as the file alone is not enough to rebuild the model; see `check_savable`.
+    Warns if you will need `like` in `load`, because the file is not enough to rebuild the model; see `check_savable`.
 
     Args:
-        path: of the file to write; one that exists is replaced.
+        path: of the file to write; an existing file is replaced.
         field: the model.
         about: JSON values, which `load` returns with the field.
 
     Raises:
-        ValueError: `about` is not JSON, or the field contains an object that is no array, number, text, function,
-            container or module; names its path.
+        ValueError: `about` is not JSON, or the field contains an object, named by its path, other than an array,
+            number, text, function, container or module.
         OSError: the file cannot be written.
     """
     about = {} if about is None else about
@@ -92,16 +92,16 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
 
 
 def load(path: str | Path, like: eqx.Module | None = None) -> Model:
-    """Read a model that `save` wrote. The modules that define its classes must have been imported.
+    """Read a model that `save` wrote. You should import the modules that define its classes first.
 
     Args:
         path: of the file.
-        like: a field of the same structure, whose arrays are replaced by those of the file. Needed for classes and
-            functions that the file cannot name, such as local classes and lambdas.
+        like: a field of the same structure, whose arrays are replaced by those in the file. Needed for classes and
+            functions that the file cannot name, for example local classes and lambdas.
 
     Raises:
-        ValueError: the file is missing, damaged or not a model; it refers to a class or function that is not known; an
-            array is not finite, or not of the type and shape that its class states; or it does not fit `like`.
+        ValueError: the file is missing, damaged or not a model; it refers to an unknown class or function; an array is
+            not finite, or not of the type and shape that its class declares; or the file does not fit `like`.
     """
     metadata, arrays = load_archive(path, FORMAT)
     try:
@@ -119,7 +119,7 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
 
 
 def _not_finite(field: eqx.Module) -> str:
-    """Which array of a field holds numbers that are not finite, as of a fit that diverged; empty if none does."""
+    """The path of an array that is not finite, for example after a fit that diverged; empty if there is none."""
     for keys, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(field, eqx.is_inexact_array)):
         if bad := int((~np.isfinite(leaf)).sum()):
             path = jax.tree_util.keystr(keys, simple=True, separator="/")
@@ -138,10 +138,10 @@ def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
 
 
 def check_savable(field: Any) -> str | None:
-    """Why `load` could not rebuild this field from a file alone, or None if it can. `load` with `like` mostly can.
+    """Why `load` cannot rebuild this field from its file without `like`, or None if it can.
 
     Args:
-        field: the model that is to be saved.
+        field: the model to save.
     """
     try:
         return Structure(field).problem

@@ -1,7 +1,7 @@
 """The structure of a field as JSON: classes and functions by name, static values, and the path of each array.
 
-Reading a structure runs no code that the file chooses. A class is looked up among the modules that the program has
-already imported and must be an Equinox module of exactly that name. Its `__init__` is not called.
+Reading a structure runs no code that the file chooses. A class must be an Equinox module of exactly that name in a
+module that the program has already imported. Its `__init__` is not called.
 """
 
 import builtins
@@ -56,14 +56,14 @@ def portable(item: Item, *, name: str | None = None) -> Item: ...
 @overload
 def portable(item: None = None, *, name: str | None = None) -> Callable[[Item], Item]: ...
 def portable(item: Any = None, *, name: str | None = None) -> Any:
-    """Decorator: saved models refer to this class or function by `name`, by default its own, and not by its module.
+    """Decorator: saved models refer to this class or function by `name`, and not by its module.
 
-    An Equinox module needs no decorator unless it may move to another module. A function that a field holds, or a
-    dataclass that is no Equinox module, needs it to be loaded without `like`.
+    An Equinox module needs no decorator unless you move it to another module. A function in a field, or a dataclass
+    other than an Equinox module, needs it to be loaded without `like`.
 
     Args:
         item: the class or function. Without it, as in `@portable(name="mine")`, the result is the decorator.
-        name: in files, by default its own; no other class or function may have it.
+        name: in files, by default its own; must be unique.
 
     Raises:
         ValueError: another class or function already has the name.
@@ -152,7 +152,7 @@ def decode(value: Any, arrays: Arrays) -> Any:
     """The object that a structure describes.
 
     Raises:
-        ValueError: a class or function that this program does not know, or fields that do not fit the class.
+        ValueError: an unknown class or function, or fields that do not fit the class.
         KeyError, TypeError, AttributeError, RecursionError, OverflowError: the structure is malformed.
     """
     match value:
@@ -186,7 +186,7 @@ def decode(value: Any, arrays: Arrays) -> Any:
 
 
 def static_values(tree: Any) -> dict[str, Any]:
-    """The numbers, text and None in a structure, by path."""
+    """The numbers, strings and None in a structure, by path."""
     found = {}
     for keys, leaf in jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: node is None):
         path = jax.tree_util.keystr(keys, simple=True, separator="/").split("/")
@@ -196,7 +196,7 @@ def static_values(tree: Any) -> dict[str, Any]:
 
 
 def find_class(name: str) -> type:
-    """The class "module:qualname" of an imported module, or the portable one "@name"; ValueError if it is no module."""
+    """The class "module:qualname" of an imported module, or the portable one "@name"; ValueError for other types."""
     module, _, qualname = name.partition(":")
     found: Any = _PORTABLE.get(name, sys.modules.get(module))
     if found is None:
@@ -213,7 +213,7 @@ def find_class(name: str) -> type:
 
 
 def _rebuild(name: str, parts: dict[str, Any]) -> Any:
-    """An object with these fields, made without its `__init__`; but the checks of this library's own classes run."""
+    """An object with these fields, made without its `__init__` but with the checks of this library's own classes."""
     cls: Any = find_class(name)
     made, known = object.__new__(cls), dataclasses.fields(cls)
     values = {f.name: f.default for f in known if f.default is not dataclasses.MISSING} | parts
@@ -232,7 +232,7 @@ def _rebuild(name: str, parts: dict[str, Any]) -> Any:
 
 
 def _require_shapes(name: str, known: Iterable[dataclasses.Field], values: Mapping[str, Any]) -> None:
-    """Refuse what is no array as its class states it; all may have further axes in front, as of models side by side."""
+    """Require arrays as the class declares them; all may have extra leading axes, for example for stacked models."""
     stated = {f.name: f.type for f in known if isinstance(f.type, type) and issubclass(f.type, AbstractArray)}
     with jaxtyped("context"):
         for key, kind in stated.items():

@@ -25,7 +25,7 @@ FLOOR = 0.01  # least scale of an input over the size of its mean, and of an out
 
 
 class _Probe(AbstractBatchNorm, AbstractScaling):
-    """A scaling that records the moments of the input in training mode and sets the output to zero in inference mode."""
+    """A scaling that records the moments of the input in training mode and zeroes the output in inference mode."""
 
     running: RunningStats
     momentum: float = eqx.field(static=True, default=0.0)

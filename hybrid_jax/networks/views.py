@@ -38,7 +38,7 @@ def _check(inputs: str, outputs: str, vehicle: Vehicle | None) -> None:
 class View(AbstractWrapper):
     """The field inside reads some features of a multirotor's state and returns some derivatives; see `make_residual`.
 
-    Other derivatives are zero: the physics ṗ = v and q̇ = ½ q ⊗ [0, ω] is exact for a true state, but not for estimates.
+    Other derivatives are zero: the physics ṗ = v and q̇ = ½ q ⊗ [0, ω] is exact, unless the state is an estimate.
     In the body frame it returns ṗ, v̇ and the quaternion r of q̇ = q ⊗ r, which makes it equivariant to yaw and to
     translation in x and y.
     """

@@ -164,7 +164,7 @@ def _flare(wanted: Scalar, altitude: Scalar, climb: Scalar, scale: Scale):
 
 
 def _limit_tilt(lift: Vector, altitude: Scalar, gravity: Scalar, scale: Scale) -> Vector:
-    """Limit the commanded acceleration [m/s², world frame] to upward thrust and tilts that keep rotors off the ground."""
+    """Limit the commanded acceleration [m/s², world frame] to upward thrust and tilts with rotors off the ground."""
     up = jnp.clip(lift[2], 0.5 * gravity, 1.7 * gravity)
     lowest = jnp.arcsin(jnp.clip(DIP * altitude / (ARM * scale.length), 0.05, 1.0))
     sideways = jnp.linalg.norm(lift[:2]) + 1e-9

@@ -1,8 +1,8 @@
-"""Several processes: initialisation, and results on every process.
+"""Multi-process runs: initialisation, and results on every process.
 
-All processes run the same program on the same data and call these functions in the same order. Only results, and what
-process 0 decides or reads, travel between them. Every function that communicates raises PeerLost when another process
-is lost; the same command then goes on from what process 0 has saved, with any number of processes.
+All processes run the same program on the same data and call these functions in the same order. Only results, and the
+decisions and files of process 0, are exchanged. Every function that communicates raises PeerLost if another process is
+lost; you can then run the same command again, with any number of processes, to continue from what process 0 has saved.
 """
 
 import io
@@ -29,21 +29,21 @@ def initialize(
     alike: Mapping[str, Any] | None = None,
     timeout: float = 120.0,
 ) -> None:
-    """Join a multi-process run, whose process 0 is at `coordinator`, host:port. Call it before the first array is made.
+    """Join a multi-process run. Call this before you create the first array.
 
     Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open MPI, Kubernetes, Cloud TPU); there the
-    cluster, and not `timeout`, watches over the processes.
+    cluster monitors the processes instead of `timeout`.
 
     Args:
         coordinator: host:port of process 0.
-        processes: how many there are.
+        processes: the number of processes.
         process: the index of this one, from 0.
-        alike: JSON values by name in which all processes must agree, such as options and a digest of the source.
-        timeout: seconds after which a process that does not come, or does not answer, is taken for lost.
+        alike: JSON values by name that must agree between all processes, e.g. options and a digest of the source.
+        timeout: seconds after which a process that does not join or answer counts as lost.
 
     Raises:
-        ValueError: an argument is missing or inconsistent, or the processes differ in what must be alike.
-        PeerLost: another process did not come.
+        ValueError: an argument is missing or inconsistent, or the processes differ in `alike`.
+        PeerLost: another process did not join.
     """
     jax.config.update("jax_enable_preemption_service", False)  # the host loop handles signals
     try:
@@ -80,7 +80,7 @@ def is_main_process() -> bool:
 
 
 def put(tree: PyTree, sharding: Sharding) -> PyTree:
-    """Global arrays; each process passes the part that its own devices hold."""
+    """Global arrays; each process provides the part on its own devices."""
     if jax.process_count() == 1:
         return jax.device_put(tree, sharding)
     return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), tree)
@@ -117,7 +117,7 @@ def agreed(number: int) -> int:
 
 
 def from_first(make: Callable[[], tuple[Any, Arrays]]) -> tuple[Any, Arrays]:
-    """The result of `make` on process 0, JSON values and named arrays, on every process; only process 0 calls it."""
+    """The result of `make`, JSON values and named arrays, which only process 0 calls, on every process."""
     if jax.process_count() == 1:
         return make()
     message = np.frombuffer(_pack(*make()), np.uint8) if is_main_process() else np.zeros(0, np.uint8)
@@ -139,7 +139,7 @@ def _unpack(message: np.ndarray) -> tuple[Any, Arrays]:
 
 
 def _exchange(call: Callable[[], Any]) -> Any:
-    """The result of a call that waits for all processes."""
+    """The result of a call that waits for all processes, or PeerLost."""
     try:
         return _known[0].waited_for(call) if _known else call()
     except (RuntimeError, ValueError) as error:  # of the launch, or of a result that never arrived

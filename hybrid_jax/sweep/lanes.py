@@ -1,7 +1,7 @@
 """Map one function over many independent lanes: chunks of lanes under `vmap`, chunks in a loop, loops on all devices.
 
-A lane is a slice of a pytree along its first axis. Which lanes are active is data, not shape: one compilation serves a
-sweep to its end. In a multi-process run (see hosts.py) each process feeds its own devices, and all get all results.
+A lane is a slice of a pytree along its first axis. Which lanes are active is data, not shape, so that a sweep compiles
+once. In a multi-process run (see hosts.py) each process feeds its own devices, and all get all results.
 """
 
 import heapq
@@ -25,7 +25,7 @@ WIDTH = {"cpu": 1}  # one lane fills the cache (benchmarks/sweep.py); on a GPU a
 
 
 def stack(lanes: Sequence[PyTree]) -> PyTree:
-    """One tree whose arrays have a first axis over the lanes; ValueError if other leaves, such as numbers, differ.
+    """One tree whose arrays have a first axis over the lanes; ValueError if other leaves, e.g. Python numbers, differ.
 
     Args:
         lanes: trees of one structure, one for each lane.
@@ -46,14 +46,13 @@ def lane(lanes: PyTree, index: int | np.ndarray) -> PyTree:
 
     Args:
         lanes: a tree whose arrays have a first axis over the lanes.
-        index: number of a lane, from 0, or an array of numbers or truth values.
+        index: number of a lane, from 0, or an array of indices or booleans.
     """
     # asarray: an entry of a NumPy vector is a scalar
     return jax.tree.map(lambda leaf: np.asarray(leaf[index]) if eqx.is_array(leaf) else leaf, lanes)
 
 
 def count(lanes: PyTree) -> int:
-    """The number of lanes."""
     return next(leaf.shape[0] for leaf in jax.tree.leaves(lanes) if eqx.is_array(leaf))
 
 
@@ -71,7 +70,7 @@ def schedule(costs: Numbers, active: Numbers, devices: int, width: int, capacity
 
 
 def load_balance(shards: Sequence[np.ndarray], costs: Numbers, width: int) -> Float[np.ndarray, " n"]:
-    """For each scheduled lane, the work of the busiest device over that of the lane's own device; 0 for the others."""
+    """For each scheduled lane, the work of the busiest device over that of its own device; 0 for other lanes."""
     # A chunk takes as long as its most expensive lane, which is its first.
     loads, ratios = [sum(float(costs[i]) for i in shard[::width]) for shard in shards], np.zeros(len(costs))
     for shard, load in zip(shards, loads, strict=True):
@@ -85,7 +84,7 @@ class LaneMap:
     Args:
         width: lanes in a chunk. Default: 1 on a CPU; elsewhere 0, an even share of the lanes for each device.
         devices: where chunks run, ordered by process; by default all devices of all processes.
-        min_capacity: lanes to compile for at least, so that calls of fewer lanes share the program. Ignored for width
+        min_capacity: least number of lanes to compile for, so that smaller calls share the program. Ignored for width
             0, where padding would be computed.
         compiler: options of XLA.
     """
@@ -119,12 +118,12 @@ class LaneMap:
         return lane(results, np.array([where[i] for i in active], int))
 
     def schedule(self, total: int, costs: Numbers, active: Numbers) -> tuple[list[np.ndarray], int, int]:
-        """Each device's shard, the width of a chunk, and the chunks that a device can take.
+        """Each device's shard, the width of a chunk, and the capacity of a device in chunks.
 
         Args:
             total: the number of lanes.
             costs: expected work of each lane, in any unit.
-            active: numbers of the lanes that are run.
+            active: indices of the active lanes.
         """
         devices = len(self.devices)
         width = self.width or -(-total // devices)
@@ -135,7 +134,7 @@ class LaneMap:
 
 
 def _on_mesh(function: Callable, width: int, devices: tuple, rest: PyTree, lanes, chunks, shared) -> PyTree:
-    """Each device's lanes on this device; `rest` holds what is no array of the lanes and of what they share."""
+    """The results of each device's lanes on this device; `rest` contains the leaves that are not arrays."""
     mesh, split, whole = Mesh(np.array(devices), (AXIS,)), PartitionSpec(AXIS), PartitionSpec()
 
     def share(lanes, chunks, shared):

@@ -1,4 +1,4 @@
-"""Who of a multi-process run is there: all meet before JAX begins, and then hear from each other every second."""
+"""Monitor a multi-process run: processes connect before JAX starts, then exchange heartbeats every second."""
 
 import atexit
 import os
@@ -14,16 +14,16 @@ GRACE = 3.0  # s that what was sent before a loss may still take to arrive, or t
 
 
 class PeerLost(ConnectionError):
-    """Another process of this run has ended, does not answer, or never came."""
+    """Another process of this run has ended, does not answer, or never joined."""
 
 
 class Peers:
-    """Process 0 hears from all others, they from it, and it tells them who is lost.
+    """Heartbeats between process 0 and all others; process 0 announces who is lost.
 
-    JAX itself aborts a process whose peer does not come, and waits for ever for one that was stopped.
+    JAX itself aborts if a peer does not join, and waits forever for one that was stopped.
 
     Attributes:
-        lost: who is lost, and how, once someone is.
+        lost: which process is lost and how, once there is one.
     """
 
     def __init__(self, coordinator: str, processes: int, process: int, timeout: float):
@@ -36,7 +36,7 @@ class Peers:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _gather(self, port: int, processes: int, until: float) -> dict[int, socket.socket]:
-        """The links to all others, or PeerLost that names who did not come, here and in those that did."""
+        """The links to all others; PeerLost, on every process that joined, names those that did not."""
         links: dict[int, socket.socket] = {}
         with socket.create_server(("", port)) as door:
             while len(links) < processes - 1 and select.select([door], [], [], max(0.0, until - time.monotonic()))[0]:
@@ -98,7 +98,7 @@ class Peers:
                 continue
 
     def waited_for(self, exchange: Callable[[], Any]) -> Any:
-        """The result of a call that waits for all others, or PeerLost as soon as one of them is lost."""
+        """The result of a call that waits for all others; PeerLost as soon as one of them is lost."""
         found, done = dict[str, Any](), threading.Event()
 
         def run() -> None:

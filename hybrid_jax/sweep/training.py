@@ -1,7 +1,4 @@
-"""Many training runs as one compiled program: every seed, size and rate is a lane (see lanes.py).
-
-A host loop trains the lanes in blocks of epochs. Between blocks it drops those that have stopped and reports progress.
-"""
+"""Many training runs as one compiled program: every seed, size and rate is a lane (see lanes.py)."""
 
 import time
 from collections.abc import Callable
@@ -36,7 +33,7 @@ class Progress:
     Attributes:
         active: lanes that are still training.
         lanes: all lanes.
-        epochs: the most that a lane has completed.
+        epochs: the most epochs that a lane has completed.
         best: the smallest validation L_MSE of any lane.
         at_least: epochs that some active lane still needs.
         at_most: epochs that some active lane may still need.
@@ -68,15 +65,15 @@ def sweep(
     """Train every lane until it stops. If all have stopped already, the program is compiled and nothing is trained.
 
     Args:
-        validation: the windows that stop a lane early.
-        settings: as of `fit`, the same for all lanes.
+        validation: the windows for early stopping.
+        settings: see `fit`; the same for all lanes.
         states: stacked initial states, one for each lane (`fitting.start`, `lanes.stack`).
         plans: stacked run configurations, one for each lane.
         train: the windows that `plans` index into; shared by all lanes, as `validation` is.
-        min_capacity: lanes and training windows to compile for at least. Smaller sweeps are padded and share the
-            program; padding of lanes needs a fixed width (see `LaneMap`).
-        width: lanes in a chunk; see `LaneMap`. On a GPU, lower it if a sweep does not fit into memory.
-        block_seconds: approximate duration of a block of epochs.
+        min_capacity: least numbers of lanes and training windows to compile for. Smaller sweeps are padded and share
+            the program; padding of lanes needs a fixed width (see `LaneMap`).
+        width: lanes in a chunk; see `LaneMap`. On a GPU, you should lower it if a sweep does not fit into memory.
+        block_seconds: approximate duration of a block of epochs, after which finished lanes are dropped.
         on_block: called after each block with all states and the progress.
 
     Returns:
@@ -120,8 +117,8 @@ def evaluate(
         fields: stacked fields, one for each lane.
         windows: shared by all lanes.
         every: count the state after each so many intervals.
-        settings: give the integrator.
-        min_lanes: lanes to compile for at least.
+        settings: for the solver.
+        min_lanes: least number of lanes to compile for.
     """
     return evaluate_windows(fields, windows, every, settings, min_lanes)[0]
 
@@ -129,14 +126,14 @@ def evaluate(
 def evaluate_windows(
     fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
 ) -> tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes windows"]]:
-    """`evaluate`, and what it is the mean of: the error of each window."""
+    """`evaluate`, and the error of each window, of which it is the mean."""
     lanes = count(fields := jax.device_get(fields))
     errors = _evaluation(settings, every, max(lanes, min_lanes), _shapes(lane(fields, 0), windows))
     return errors(fields, (windows,), np.ones(lanes), range(lanes))
 
 
 def _padded(plans: RunConfig, shared: tuple[PyTree, PyTree], windows: int) -> tuple[RunConfig, tuple[PyTree, PyTree]]:
-    """Pad plans and training data to a number of windows. No plan uses the padding."""
+    """Plans and training data, padded to a number of windows; no plan uses the padding."""
     train, validation = shared
     subset = np.pad(plans.subset, ((0, 0), (0, max(0, windows - plans.subset.shape[-1]))))
     if len(train) < windows:
@@ -145,7 +142,7 @@ def _padded(plans: RunConfig, shared: tuple[PyTree, PyTree], windows: int) -> tu
 
 
 def _shapes(*trees: PyTree) -> tuple:
-    """The shapes, types and structure that a program is compiled for."""
+    """Shapes, types and structure, for which a program is compiled."""
     leaves = [leaf for leaf in jax.tree.leaves(trees) if eqx.is_array(leaf)]
     return (*((leaf.shape, leaf.dtype) for leaf in leaves), jax.tree.structure(trees))
 

@@ -1,7 +1,4 @@
-"""Training: `fit` on one machine, one run, and `fit_gauss_newton`; losses, objectives, learning-rate groups and stages.
-
-A sweep of many runs in one program is in `hybrid_jax.sweep`.
-"""
+"""Training: `fit` for one run, and `fit_gauss_newton`; losses, objectives, learning-rate groups and stages."""
 
 from hybrid_jax.training.channels import Channel, ChannelLoss, channels_from
 from hybrid_jax.training.driver import FitInterrupted, FitResult, History, fit

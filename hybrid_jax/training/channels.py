@@ -1,7 +1,7 @@
 """A loss that weights the channels of the state and is robust against outliers.
 
 Without weights, an error of 1 rad/s in the body rates counts ten thousand times as much as one of 1 cm in position.
-Here each channel is divided by its error under a simple baseline: 1 is no better than the baseline.
+Here the error of each channel is relative to a simple baseline: 1 is no better than the baseline.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ class Channel:
     Attributes:
         start: the first entry, counted from 0.
         stop: one past the last entry.
-        scale: norm of their error that counts as 1, in their unit.
+        scale: the error norm that counts as 1, in their unit.
 
     Raises:
         ValueError: no entries, or a scale that is not positive.
@@ -47,14 +47,13 @@ class Channel:
 
 @dataclass(frozen=True)
 class ChannelLoss(TrajectoryLoss):
-    """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, in place of the square in `TrajectoryLoss`.
+    """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, instead of the square in `TrajectoryLoss`.
 
-    ρ(r) = r²; with `huber` only up to it, and 2 huber r − huber² beyond (Huber 1964, doubled). As r is a norm, no
-    direction is preferred.
+    ρ(r) = r²; beyond `huber` it is 2 huber r − huber² (Huber 1964, doubled). As r is a norm, no direction is preferred.
 
     Attributes:
-        channels: one or more; entries of the state that are in none do not count.
-        huber: threshold on ‖error‖ / scale, from which on ρ grows linearly; by default none.
+        channels: one or more; state entries in no channel do not count.
+        huber: threshold on ‖error‖ / scale beyond which ρ is linear; by default none.
 
     Raises:
         ValueError: no channels, or a threshold that is not positive.
@@ -100,7 +99,7 @@ class ChannelLoss(TrajectoryLoss):
 
 
 def _huber(square: Float[Array, "*n"], threshold: float) -> Float[Array, "*n"]:
-    """ρ(r) from r². The root is taken of 1 where it is not used, as its slope at zero is infinite."""
+    """ρ(r) from r², with a finite slope at zero, where the root is not used."""
     far = square > threshold**2
     length = jnp.sqrt(jnp.where(far, square, 1.0))
     return jnp.where(far, 2 * threshold * length - threshold**2, square)
@@ -109,15 +108,15 @@ def _huber(square: Float[Array, "*n"], threshold: float) -> Float[Array, "*n"]:
 def channels_from(
     baseline: AbstractVectorField, windows: Trajectories, parts: Mapping[str, slice] | None = None
 ) -> tuple[Channel, ...]:
-    """Channels scaled by the RMS error of a baseline, such as one of baselines.py, at the end of the windows.
+    """Channels scaled by the RMS error of a baseline, for example one of baselines.py, at the end of the windows.
 
     Args:
         baseline: the field whose errors are the scales.
-        windows: of the data that the field will be trained on.
+        windows: the training windows.
         parts: entries of each channel; by default the quantities of the baseline's state space.
 
     Raises:
-        ValueError: malformed windows, or a channel in which the baseline makes no error.
+        ValueError: malformed windows, or a channel in which the baseline has no error.
     """
     size = check(windows, "windows").x.shape[-1]
     parts = {one.name: part for part, one in state_space(baseline, size).parts} if parts is None else parts

@@ -1,4 +1,4 @@
-"""`fit`: train one field on windows. The host runs the compiled loop of `fitting` in blocks of epochs."""
+"""`fit`: train one field on windows, by the compiled loop of `fitting` in blocks of epochs."""
 
 import time
 import warnings
@@ -39,7 +39,7 @@ class History(eqx.Module):
     """The losses of every epoch.
 
     Attributes:
-        train: mean of the loss over the minibatches of each epoch, the regulariser with it.
+        train: training loss with the regulariser, mean over the minibatches of each epoch.
         validation: the validation loss after each epoch.
     """
 
@@ -53,7 +53,7 @@ class FitResult(eqx.Module):
     Attributes:
         best: the field of the best validation epoch.
         best_mse: its validation loss.
-        best_epoch: which epoch it is, counted from 1; 0 if it is the initial field.
+        best_epoch: its number, counted from 1; 0 for the initial field.
         field: the field after the last epoch.
         epochs: how many were trained.
         status: how it ended; OK if it stopped early, RUNNING if it was interrupted.
@@ -72,7 +72,7 @@ class FitResult(eqx.Module):
 
 
 class FitInterrupted(KeyboardInterrupt):
-    """Ctrl-C during `fit`. `result` holds the run up to the last complete block of epochs."""
+    """Ctrl-C during `fit`; `result` is the run up to the last complete block of epochs."""
 
     def __init__(self, result: FitResult):
         super().__init__(f"training was interrupted after epoch {result.epochs}; `result` of this exception holds it")
@@ -97,31 +97,31 @@ def fit(
 ) -> FitResult:
     """Train a field on all windows of `train`; `result.best` is the field of the best validation epoch.
 
-    A network made without a scaling is scaled by the training windows first; see `with_scaling`.
+    A network without a scaling is scaled by the training windows first; see `with_scaling`.
 
     Args:
-        field: the field to begin with, or another module that the objective of `settings` can evaluate.
-        train: windows to learn from.
-        validation: windows that tell the best epoch and when to stop.
-        key: of the order of the minibatches.
+        field: the initial field, or another module that the objective of `settings` can evaluate.
+        train: training windows.
+        validation: windows that determine the best epoch and early stopping.
+        key: random key for shuffling minibatches.
         rates: learning rates of Adam, a tree prefix of the field: a number, by default 1e-2, or e.g.
             `Hybrid(1e-2, 1e-3)` for physics and residual.
-        optimiser: any Optax optimiser in place of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
+        optimiser: any Optax optimiser instead of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
             and are 1 by default.
         min_epochs: no early stop before.
         patience: stop after this many epochs without a better validation loss.
         max_epochs: stop after this many epochs.
         regulariser_weight: λ, by default 1e-3.
-        settings: by default minibatches of 100 windows, or of all if there are fewer, and no regulariser. The paper's
-            is `Settings(regulariser=hybrid_jax.training.loss.trajectory_correlation)`.
+        settings: by default minibatches of 100 windows, or of all if there are fewer, and no regulariser. For the
+            paper's, use `Settings(regulariser=hybrid_jax.training.loss.trajectory_correlation)`.
         progress: True for a bar on stderr, or a function of (epoch, state) that is called about twice a second.
 
     Raises:
-        ValueError: windows that the objective refuses, that do not match the field, or are of a rigid body and have no
-            unit quaternions; fewer training windows than a minibatch; a batch norm that cannot be trained, as with
+        ValueError: windows that the objective rejects, that do not match the field, or without unit quaternions for a
+            rigid body; fewer training windows than a minibatch; a batch norm that cannot be trained, e.g. with
             minibatches of one window; a field with nothing to learn; rates that do not match the field; a weight
             without a regulariser; another argument out of range.
-        FitInterrupted: Ctrl-C; a KeyboardInterrupt that holds the result so far.
+        FitInterrupted: Ctrl-C; a KeyboardInterrupt with the result so far.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
     if rates is None:
@@ -140,7 +140,7 @@ def fit(
 def checked_arguments(
     field: Learner, train: Trajectories, validation: Trajectories, key, settings: Settings | None, optimiser, weight
 ) -> tuple[PyTree, Shared, float]:
-    """The training data, what is shared by all stages, and λ: the arguments of `fit`, checked, with their defaults."""
+    """The training data, the settings of all stages, and λ: the checked arguments of `fit` with defaults."""
     checks.not_traced("fit", field, train, validation, key)
     if settings is None:
         settings = Settings(batch_size=min(Settings.batch_size, len(check(train, "train"))))
@@ -164,7 +164,7 @@ def checked_arguments(
 
 
 def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settings) -> None:
-    """Refuse a field that learns nothing, and windows that do not match it. Other learners check their own windows."""
+    """Reject a field that learns nothing, and windows that do not match it; other learners check their own windows."""
     if isinstance(settings.objective, TrajectoryLoss):
         check_callable(field)
     if not any(jax.tree.leaves(trainable(field))):
@@ -185,14 +185,14 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
 
 
 def ready(field: Learner, train: Trajectories) -> Learner:
-    """The field with its scaling and its motion set. Warns if a file of it could not be loaded without more."""
+    """The field with its scaling and motion set; warns if you will need `like` to load it from a file."""
     if (reason := check_savable(field)) is not None:
         warnings.warn(reason, stacklevel=4)
     return with_motion(with_scaling(field, train), train) if isinstance(field, AbstractVectorField) else field
 
 
 def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progress: Report | bool | None) -> FitResult:
-    """Take a run to its end in blocks of epochs, and report the progress between them."""
+    """Run to the end in blocks of epochs, with progress reports between them."""
     validated_on, settings, optimiser = shared
     # Weakly typed numbers would come back typed, and the second block be compiled anew.
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype) if eqx.is_array(leaf) else leaf, state)
@@ -224,7 +224,7 @@ _train, _train_by_kernels = eqx.filter_jit(fitting.run), jit_with(FAST_COMPILE)(
 
 @cache  # the same object for the same optimiser, so that its program is compiled once
 def _negated(optimiser: Optimiser) -> Optimiser:
-    """The optimiser with updates that are subtracted, as those of `fitting`, rather than added."""
+    """The optimiser with updates to be subtracted, as in `fitting`, rather than added."""
     return optax.chain(optimiser, optax.scale(-1.0))
 
 

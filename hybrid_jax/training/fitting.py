@@ -1,7 +1,4 @@
-"""One training run as a pure function: minibatches, the optimiser, validation, the best epoch, early stopping.
-
-`RunConfig` holds what may differ between runs of one compiled program; `Settings` holds what it is compiled for.
-"""
+"""One training run as a pure function: minibatches, the optimiser, validation, the best epoch, early stopping."""
 
 import equinox as eqx
 import jax
@@ -20,7 +17,7 @@ SHORTCUT = 8  # a run that uses at most 1 / SHORTCUT of its listed windows sorts
 
 
 class RunConfig(eqx.Module):
-    """Hyper-parameters that may differ between the runs of a sweep; see `fit`."""
+    """Hyper-parameters that may differ between the runs of a sweep, unlike `Settings`; see `fit`."""
 
     rates: PyTree  # a tree prefix of the field: one number, or e.g. `Hybrid(1e-2, 1e-4)`
     subset: Int[Array, " n"]  # indices of the training windows that the run may use
@@ -33,7 +30,7 @@ class RunConfig(eqx.Module):
 
 
 class FitState(eqx.Module):
-    """A run between two epochs: all that is needed to continue it."""
+    """The complete state of a run between two epochs."""
 
     field: Learner
     adam: PyTree
@@ -64,7 +61,7 @@ def run(
     optimiser: Optimiser = ADAM,
     losses: Float[Array, "e 2"] | None = None,
 ) -> tuple[FitState, Float[Array, "e 2"] | None]:
-    """Continue until the run has stopped or has completed `until` epochs; `losses` takes those of the first epochs."""
+    """Continue until the run has stopped or has completed `until` epochs; `losses` stores those of the first epochs."""
     first = state.epoch
     # A user's field may hold leaves that are not arrays (an activation function). A loop carries arrays only.
     arrays, rest = eqx.partition(state, eqx.is_array)
@@ -88,7 +85,7 @@ def run(
 def _epoch(
     state: FitState, plan: RunConfig, train: PyTree, validation: PyTree, settings: Settings, optimiser: Optimiser
 ) -> tuple[FitState, Float[Array, ""]]:
-    """One pass over the training windows in a new order, then a validation; returns the validation loss too."""
+    """One pass over the shuffled training windows, then a validation; returns the validation loss too."""
     key, order_key = jax.random.split(state.key)
     order, size = _shuffled(plan, order_key), settings.batch_size
     batches = plan.n_train // size
@@ -110,7 +107,7 @@ def _epoch(
 def gradient_step(
     field: Learner, adam: PyTree, plan: RunConfig, picked: PyTree, settings: Settings, optimiser: Optimiser = ADAM
 ) -> tuple[Learner, PyTree, Float[Array, ""]]:
-    """One optimiser step on one minibatch; running statistics are updated with the same minibatch."""
+    """One optimiser step on one minibatch, which also updates the running statistics."""
     parameters, rest = eqx.partition(field, trainable(field))
     # Gathered once: without the barrier the gather is fused into, and repeated by, everything that reads the minibatch.
     batch = jax.lax.optimization_barrier(settings.objective.batch(picked, settings))
@@ -130,7 +127,7 @@ def gradient_step(
 
 
 def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> RunConfig:
-    """A configuration with every number as an array, as `vmap` needs it; ValueError if one is out of range."""
+    """A configuration with every number as an array, as `vmap` needs; ValueError if one is out of range."""
     for rate in jax.tree.leaves(rates):
         checks.not_negative("rates", rate)
     counts = {"n_train": n_train, "min_epochs": min_epochs, "patience": patience, "max_epochs": max_epochs}
@@ -156,7 +153,7 @@ def _shuffled(plan: RunConfig, key: PRNGKeyArray) -> Int[Array, " n"]:
 
 
 def _updated(state, plan, field, adam, key, train_loss, error) -> FitState:
-    """The state after an epoch: whether it is the best one, and whether the run continues."""
+    """The state after an epoch, with the best epoch and early stopping."""
     finished = state.epoch + 1
     finite = jnp.isfinite(train_loss) & jnp.isfinite(error)
     better = finite & (error < state.best_mse)

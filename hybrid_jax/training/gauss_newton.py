@@ -1,8 +1,8 @@
 """Damped Gauss–Newton for all parameters of a field, network and physics, to a precision that Adam does not reach.
 
-A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the lengths of the columns of J. J is computed
-in the field's precision one window at a time, with the trajectory (`sensitivities`); JᵀJ is summed, and the step
-solved, in double precision, since squaring J would leave nothing of float32 for the directions that matter least.
+A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the column norms of J. J is computed in the
+field's precision one window at a time, with the trajectory (`sensitivities`). JᵀJ and the step are in double precision,
+since squaring J in float32 would lose the least sensitive directions.
 """
 
 from collections.abc import Callable
@@ -38,9 +38,9 @@ class GaussNewtonFit(eqx.Module):
     """The result of `fit_gauss_newton`.
 
     Attributes:
-        field: the best one that was found.
+        field: the best field found.
         loss: L_MSE on the windows plus λ times the penalty.
-        steps: points that were tried.
+        steps: number of points tried.
         status: how it ended; OK if it stopped before `max_steps`, at a finite loss.
     """
 
@@ -51,23 +51,22 @@ class GaussNewtonFit(eqx.Module):
 
 
 def residual_norm(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """f_d along the predicted trajectory: its mean square is that of loss.py (Yin et al. 2021)."""
+    """f_d along the predicted trajectory, whose mean square is `loss.residual_norm` (Yin et al. 2021)."""
     x, u = jnp.concatenate([window.x0[None], predicted[:-1]]), window.u
     parts = jax.vmap(field.residual)(x, jnp.asarray(u))
     return parts.ravel() / len(u) ** 0.5
 
 
 def trajectory_correlation(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """Its square is that of loss.py (Osaka et al. 2025, Eq. 7)."""
+    """Its square is `loss.trajectory_correlation` (Osaka et al. 2025, Eq. 7)."""
     physics = integrate(field.physics, jnp.asarray(window.x0), jnp.asarray(window.u), window.dt, solver)
     return correlation_rows(*(y.ravel()[:, None] for y in (physics, predicted))).ravel()
 
 
 def neighbour_weights(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """The weights of a `GridNetwork` for all points but the one itself: small if f_d is a reaction.
+    """The weights of a `GridNetwork` for all points except the centre, which vanish if f_d is a reaction.
 
-    A small f_d need not be the true one, since a reaction and diffusion may cancel; what tells them apart is that a
-    reaction does not depend on neighbours.
+    Unlike the norm of f_d, this distinguishes a reaction from diffusion, which may cancel each other.
     """
     networks = [n for n in jax.tree.leaves(field, is_leaf=_is_grid) if _is_grid(n)]
     return jnp.concatenate([jnp.zeros(0), *(network.neighbour_weights().ravel() for network in networks)])
@@ -93,23 +92,23 @@ def fit_gauss_newton(
     solver: Solver | None = None,
     scale: Float[Array, " d"] | None = None,
 ) -> GaussNewtonFit:
-    """Minimise L_MSE + λ L_reg over all parameters of a field by Gauss–Newton; a batch norm stays as it is.
+    """Minimise L_MSE + λ L_reg over all parameters of a field by Gauss–Newton; running statistics do not change.
 
-    For networks of up to a thousand parameters and little data with little noise; there is no early stopping.
+    You should use it with up to a thousand parameters and little data with little noise: there is no early stopping.
 
     Args:
-        field: the field to begin with.
+        field: the initial field.
         windows: all are used in each step. A network without a scaling is scaled by them first, as in `fit`.
-        penalty: L_reg, of a `Hybrid`: "residual_norm" or "trajectory_correlation" of `training.loss`, or
-            "neighbour_weights", the squared weights of a `GridNetwork` for all points but the one itself.
+        penalty: L_reg, for a `Hybrid`: "residual_norm" or "trajectory_correlation" of `training.loss`, or
+            "neighbour_weights", the squared weights of a `GridNetwork` for all points except the centre.
         weight: λ.
-        max_steps: points that are tried at most.
+        max_steps: largest number of points tried.
         solver: by default `RK4`.
         scale: divides the error of each state, as in `fit_least_squares`.
 
     Raises:
-        ValueError: malformed windows or others than the field's; no parameters, or too many; an unknown penalty, or
-            one of a field that is no `Hybrid`; a weight that is negative.
+        ValueError: malformed windows, or windows that do not match the field; no parameters, or too many; an unknown
+            penalty, or one for a field that is not a `Hybrid`; a weight that is negative.
     """
     checks.not_traced("fit_gauss_newton", field, windows)
     windows = check_windows(field, windows)

@@ -30,7 +30,7 @@ Regulariser = Callable[[Hybrid, Minibatch, Float[Array, "t d b"]], Float[Array, 
 
 
 def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
-    """1 − ⟨ŷ_p, ŷ⟩ / (‖ŷ_p‖ ‖ŷ‖), with ŷ_p the trajectory of f_p alone (paper, Eq. 7); the mean over trajectories."""
+    """1 − ⟨ŷ_p, ŷ⟩ / (‖ŷ_p‖ ‖ŷ‖), with ŷ_p the trajectory without f_d (paper, Eq. 7); mean over trajectories."""
     physics = rollout_minibatch(field.physics, batch.x0, batch.u, batch.dt, batch.solver)
     rows = correlation_rows(*(y.reshape(-1, y.shape[-1]) for y in (physics, predicted)))
     return jnp.mean(jnp.sum(jnp.square(rows), axis=0))
@@ -42,7 +42,7 @@ def correlation_rows(physics: Float[Array, "r b"], predicted: Float[Array, "r b"
 
 
 def inner_product(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
-    """⟨f_p, f_d⟩² along the predicted trajectories, mean over samples: zero where the two are orthogonal."""
+    """⟨f_p, f_d⟩² along the predicted trajectories, mean over samples: zero where they are orthogonal."""
     physics, residual = _parts(field, batch, predicted)
     return jnp.mean(jnp.square(jnp.sum(physics * residual, axis=0)))
 

@@ -1,4 +1,4 @@
-"""What a training run minimises and validates on, and what its program is compiled for."""
+"""What a training run minimises and validates on, and the settings that its program is compiled for."""
 
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -29,7 +29,7 @@ class Objective(Protocol):
         """The data of a run, with a length and indexed by arrays of integers.
 
         Args:
-            windows: the training or the validation data, as `fit` was given them.
+            windows: the training or validation data of `fit`.
             name: what messages call them, "train" or "validation".
 
         Raises:
@@ -40,41 +40,41 @@ class Objective(Protocol):
         """A minibatch in the layout that `loss` needs.
 
         Args:
-            picked: the windows of the minibatch, as indexing the data of `prepare` gives them.
-            settings: what the program is compiled for.
+            picked: the windows of the minibatch, indexed from the data of `prepare`.
+            settings: of the compiled program.
         """
         return picked
 
     def loss(
         self, field: Learner, batch: PyTree, settings: "Settings", weight: Float[Array, ""]
     ) -> tuple[Float[Array, ""], PyTree]:
-        """The loss on a minibatch, and what `observe` needs of the evaluation.
+        """The loss on a minibatch, and the values that `observe` needs.
 
         Args:
             field: what is trained.
-            batch: a minibatch, as `batch` returns it.
-            settings: what the program is compiled for.
+            batch: a minibatch, as returned by `batch`.
+            settings: of the compiled program.
             weight: λ, the weight of the regulariser.
         """
         ...
 
     def observe(self, field: Learner, batch: PyTree, seen: PyTree) -> Learner:
-        """The field with its running statistics updated by the minibatch; learned parameters stay as they are.
+        """The field with running statistics updated by the minibatch; learned parameters do not change.
 
         Args:
             field: what is trained.
-            batch: a minibatch, as `batch` returns it.
-            seen: what `loss` returned beside the loss.
+            batch: a minibatch, as returned by `batch`.
+            seen: the second value returned by `loss`.
         """
         return field
 
     def validate(self, field: Learner, data: PyTree, settings: "Settings") -> Float[Array, ""]:
-        """The validation loss, which early stopping and the choice of the best epoch use.
+        """The validation loss, for early stopping and the choice of the best epoch.
 
         Args:
             field: what is trained.
-            data: the validation data, as `prepare` returns them.
-            settings: what the program is compiled for.
+            data: the validation data, as returned by `prepare`.
+            settings: of the compiled program.
         """
         ...
 
@@ -114,16 +114,16 @@ class TrajectoryLoss(Objective):
 
 @dataclass(frozen=True)
 class Settings:
-    """What a training program is compiled for, the same for all runs of a sweep.
+    """Settings of a compiled training program, the same for all runs of a sweep.
 
     Attributes:
         batch_size: windows of a minibatch.
         regulariser: L_reg of a `Hybrid`, given the field, the minibatch and its predicted states; by default none.
-        solver: takes the field from sample to sample, by default one step of RK4 each.
-        objective: what is minimised and validated on, by default the squared error of trajectories.
+        solver: integrates from sample to sample, by default one step of RK4 each.
+        objective: training and validation loss, by default the squared error of trajectories.
 
     Raises:
-        ValueError: a batch size that is no count, or a regulariser, solver or objective that is none.
+        ValueError: an invalid batch size, regulariser, solver or objective.
     """
 
     batch_size: int = 100
@@ -143,14 +143,14 @@ class Settings:
 
 
 def check_minibatch(field: Learner, settings: Settings) -> None:
-    """Refuse minibatches of one window where a BatchNorm is trained: minus its own mean, a window is a constant."""
+    """Reject minibatches of one window if a BatchNorm is trained: minus its own mean, a window is a constant."""
     if settings.batch_size < 2 and batch_norms(field):
         size = settings.batch_size
         raise ValueError(f"settings.batch_size must be at least 2 where the field holds a BatchNorm, got {size}")
 
 
 def compiler_options(field: Learner, data: PyTree, settings: Settings) -> dict[str, bool | int]:
-    """XLA's options for a training program: the fast ones where kernels do most of the work."""
+    """XLA options of a training program: the fast ones if kernels do most of the work."""
     if not isinstance(data, Trajectories):
         return {}
     x0, u = (jax.ShapeDtypeStruct((settings.batch_size, *a.shape[1:]), a.dtype) for a in (data.x0, data.u))

@@ -1,8 +1,8 @@
-"""A trajectory and its derivatives along all parameters of a field.
+"""A trajectory and its derivatives with respect to all parameters of a field.
 
 The derivative of an explicit Runge–Kutta method is the same method on ẋ = f(x, θ), Ṡ = ∂f/∂x S + ∂f/∂θ: internal
-numerical differentiation (Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", 1981). So what
-is the same for all parameters, such as the slopes of a network at each point of a grid, is computed once for all.
+numerical differentiation (Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", 1981). Values
+shared by all parameters, for example the slopes of a network at each point of a grid, are computed once.
 """
 
 import diffrax
@@ -19,7 +19,7 @@ Columns = Float[Array, "t d p"]  # of the states at the end of each interval, in
 def with_sensitivities(
     field: AbstractVectorField, x0: Float[Array, " d"], u: Float[Array, "t m"], dt: float, solver: Solver
 ) -> tuple[Float[Array, "t d"], Columns]:
-    """The states of `integrate`, and their derivatives along each learned number."""
+    """The states of `integrate`, and their derivatives with respect to each learned number."""
     theta, at = ravel_learned(field)
     if not isinstance(solver, RK4 | diffrax.AbstractERK):
         states, push = jax.linearize(lambda theta: integrate(at(theta), x0, u, dt, solver), theta)

@@ -1,7 +1,4 @@
-"""Training in stages: e.g. physics first and then the residual, or short windows first and then longer ones.
-
-Each stage is one training run with its own learning rates and horizon, from the best field of the stage before.
-"""
+"""Training in stages, for example physics first and then the residual, or short windows first and then longer ones."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +27,7 @@ class Stage:
 
     Attributes:
         rates: learning rate by the name of a group.
-        steps: intervals of each window that are trained on, from its start; by default all.
+        steps: initial intervals of each window to train on; by default all.
         epochs: stop after this many.
         patience: or after this many without a better validation loss.
 
@@ -55,7 +52,7 @@ def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
     """The learning rate of each learned array of a field, as a tree like the field; see `Stage`.
 
     Args:
-        field: whose learned arrays get a rate; 0 if they are in no group.
+        field: its learned arrays get a rate each; 0 if they are in no group.
         groups: learning rate by the name of a group.
 
     Raises:
@@ -82,7 +79,7 @@ def cut(windows: Trajectories, steps: int | None) -> Trajectories:
 
 
 def judged(state: FitState, validation: PyTree, settings: Settings) -> FitState:
-    """A run at its start with the validation loss of its field, which is `best` until an epoch is better."""
+    """The initial run with the validation loss of its field, which is `best` until an epoch is better."""
     error = settings.objective.validate(state.field, validation, settings)
     return replace(state, best_mse=jnp.asarray(error, state.best_mse.dtype))
 
@@ -103,23 +100,23 @@ def fit_in_stages(
     settings: Settings | None = None,
     progress: Report | bool | None = None,
 ) -> list[FitResult]:
-    """Train a field in stages; `results[-1].best` is the trained field.
+    """Train a field in stages, each from the best field of the one before; `results[-1].best` is the trained field.
 
-    Every stage is validated on whole windows. Only what is better there than the field that it began with is kept.
+    Every stage is validated on whole windows and kept only if its field is better there than its initial one.
 
     Args:
-        field: the field to begin with.
-        train: windows to learn from, of which each stage may use a shorter beginning.
-        validation: windows that tell the best epoch of each stage and when to stop it.
-        key: of the order of the minibatches.
+        field: the initial field.
+        train: training windows, of which each stage may use a shorter beginning.
+        validation: windows that determine the best epoch and early stopping of each stage.
+        key: random key for shuffling minibatches.
         stages: one training run each, in this order.
-        optimiser: any Optax optimiser in place of Adam, whose updates the rates of a stage then multiply.
+        optimiser: any Optax optimiser instead of Adam, whose updates the rates of a stage then multiply.
         regulariser_weight: λ, by default 1e-3.
         settings: of all stages; by default those of `fit`.
         progress: True for a bar on stderr, or a function of (epoch, state) that is called about twice a second.
 
     Raises:
-        ValueError: as `fit`; no stages; windows shorter than a stage needs; or rates of a group that the field has not.
+        ValueError: see `fit`; no stages; windows shorter than a stage needs; or rates of an unknown group.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
     if not (stages := checks.list_of("stages", stages, Stage)):
