@@ -1,4 +1,4 @@
-"""The console script `hybrid-jax`: from folders of logs to a model that can be trusted, and into a controller."""
+"""The console script `hybrid-jax`: learn, check, adapt and export models from folders of logs."""
 
 import sys
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command line.
 
     Args:
-        arguments: a verb and its options; by default those of the process.
+        arguments: a verb and its options, by default `sys.argv`.
     """
     try:
         from hybrid_jax.cli.command import run

@@ -1,4 +1,4 @@
-"""`hybrid-jax adapt`: what changed, and a model of it."""
+"""`hybrid-jax adapt`: find what changed, and adapt a model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ LACKED = (
 
 @dataclass(frozen=True)
 class Options(FlightOptions):
-    """Adapt a model to logs after a change: ten seconds of flight or more.
+    """Adapt a model to logs after a change; you need ten seconds of flight or more.
 
-    Ends with exit code 4, and writes no model, if nothing changed that these flights can tell, and the network stays.
+    Exits with code 4, without writing a model, if these flights show no change.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -69,7 +69,7 @@ def run(options: Options) -> int:
 
 
 def _changed(known: Known, found: Adaptation) -> list[Change]:
-    """The parameters whose intervals leave the value before out, the surest first."""
+    """Return the parameters whose intervals exclude the previous value, most significant first."""
     before = {name: float(value) for name, value in named_parameters(known.field).items()}
     # A term that was not there was 0, an efficiency 1.
     every = [

@@ -1,4 +1,4 @@
-"""`hybrid-jax check`: a model's predictions against flights and the simplest others, where and when they are wrong."""
+"""`hybrid-jax check`: compare predictions with flights and baselines, and find where they are wrong."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ WORST = 5  # moments that are listed
 
 @dataclass(frozen=True)
 class Options(FlightOptions):
-    """Compare the predictions of a model with flights that it has not learned from, and with the simplest others."""
+    """Compare the predictions of a model with held-out flights and with simple baselines."""
 
     model: Annotated[Path, tyro.conf.Positional]
     """Model that `hybrid-jax fit` or `adapt` wrote."""
@@ -84,7 +84,7 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
 
 
 def _worst(known: Known, flights: Flights, names: list[str], each: list[Float[np.ndarray, "n t 4"]]) -> list[tuple]:
-    """The moments of the largest errors, in units of the typical one."""
+    """Return the moments of the largest errors relative to the typical error."""
     typical = np.sqrt(np.mean(np.concatenate([np.square(one[:, -1]) for one in each]), axis=0))
     size = [(one[:, -1] / typical).max(axis=1) for one in each]
     found = sorted(((float(size[i][j]), i, j) for i in range(len(size)) for j in range(len(size[i]))), reverse=True)

@@ -1,16 +1,13 @@
-"""Choose among candidates by flights, or manoeuvres, left out of their training, and say what error to expect.
+"""Choose among candidates by cross-validation over flights or manoeuvres, and estimate the error on a new flight.
 
-Why this rule: what is chosen will be flown on what nobody has recorded. So each candidate is judged on flights that
-were left out of its training, and each flight counts once: its windows share wind, battery and manoeuvre, and seeds
-share the flight.
+A model should be reliable on flights that nobody has recorded, so each candidate is scored on held-out flights. Each
+flight counts once, because its windows share wind, battery and manoeuvre, and seeds share the flight.
 
-1. The worst flight counts as well as the mean. A candidate that, on any flight, is worse than the safest baseline is
-   not considered. The safest is that with the best worst flight: one that is the best on average, but fails on a
-   flight, would excuse others that fail on it too. Only a standard error over seeds is allowed for: allowing for the
-   spread between flights would excuse most what is least reliable.
-2. Of the others, the best is that with the smallest mean. A mean over few flights is uncertain, so the simplest
-   candidate within one standard error of it, of the paired differences, is chosen (Breiman et al., "Classification and
-   regression trees", 1984).
+1. A candidate that is worse on any flight than the safest baseline (the one with the best worst flight) is rejected.
+Only a standard error over seeds is allowed for; the spread between flights would excuse the least reliable.
+
+2. Of the others, the simplest candidate within one standard error of the smallest mean is chosen, by paired differences
+(Breiman et al., "Classification and regression trees", 1984).
 """
 
 from collections.abc import Collection, Mapping
@@ -27,14 +24,14 @@ Scores = Mapping[Named, Float[np.ndarray, "flights seeds"]]
 
 
 def choose(scores: Scores[Named], baselines: Collection[Named]) -> Named:
-    """The simplest candidate within one standard error of the best, of those that are considered."""
+    """Choose the simplest accepted candidate within one standard error of the best."""
     considered = _considered(scores, baselines)
     best = min(considered, key=lambda name: scores[name].mean())
     return next(name for name in considered if _within_error(scores[name], scores[best]))
 
 
 def _considered(scores: Scores[Named], baselines: Collection[Named]) -> list[Named]:
-    """The candidates that are nowhere worse than the safest baseline, beyond a standard error over seeds."""
+    """Return the candidates that are nowhere worse than the safest baseline, beyond a standard error over seeds."""
     finite = [name for name, each in scores.items() if np.isfinite(each).all()]
     worst = {name: scores[name].mean(axis=1).max() for name in finite if name in baselines}
     baseline = scores[min(worst, key=worst.__getitem__)]
@@ -55,9 +52,9 @@ def _within_error(scores: np.ndarray, best: np.ndarray) -> bool:
 
 
 def expected(logs: Float[np.ndarray, "flights ..."], level: float = LEVEL) -> Float[np.ndarray, "3 ..."]:
-    """The error to expect on another flight, and both ends of its interval, from the logs of errors on flights.
+    """Return the expected error on another flight and its interval, from the log-errors of flights.
 
-    Student's t: logs of errors of flights are taken as draws from one normal distribution. One flight bounds nothing.
+    It uses Student's t, with log-errors of flights as samples of one normal distribution. One flight gives no bound.
     """
     n, middle = len(logs), logs.mean(axis=0)
     if n < 2:

@@ -1,4 +1,4 @@
-"""From the command line to a verb: its options, its errors in one line, and its exit code."""
+"""Run a verb of the command line: parse its options, print its errors in one line, set its exit code."""
 
 import contextlib
 import difflib
@@ -46,15 +46,15 @@ Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."
 
 
 class Explained(ValueError):
-    """Bad input whose message has several lines."""
+    """Invalid input whose message has several lines."""
 
 
 class ChecksFailed(Exception):
-    """Logs failed checks; `args` are lines for the user."""
+    """Some logs failed checks; `args` are lines for the user."""
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Run a verb; end the process with a line on stderr and an exit code if it cannot be."""
+    """Run a verb; on errors, end the process with a line on stderr and an exit code."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE.format(verbs="\n".join(f"  {name:<8} {about}" for name, about in VERBS.items())))
         return
@@ -71,10 +71,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _answer_at_once(program: str) -> None:
-    """End the process on Ctrl-C, also while XLA compiles or runs, when Python's own handler would wait.
-
-    A file is renamed when it is whole, so none is left half.
-    """
+    """End the process on Ctrl-C even while XLA is busy; files are renamed when complete, so none is left partial."""
     if threading.current_thread() is not threading.main_thread():
         return
     ear, mouth = os.pipe()
@@ -92,7 +89,7 @@ def _answer_at_once(program: str) -> None:
 
 
 def parsed(kind: type[Options], program: str, arguments: Sequence[str] | None, **more: Any) -> Options:
-    """The options that a command line gives, an instance of a dataclass; ValueError if it gives none."""
+    """Parse a command line into a dataclass; raise ValueError if it is invalid."""
     output, given = io.StringIO(), list(sys.argv[1:] if arguments is None else arguments)
     more = {"description": inspect.cleandoc(kind.__doc__ or "")} | more
     asked = kind
@@ -118,14 +115,14 @@ def parsed(kind: type[Options], program: str, arguments: Sequence[str] | None, *
 
 
 def _rare(kind: type) -> list[tuple[str, Any, Any]]:
-    """The options that --help leaves out, as fields that it does not see."""
+    """Return the options that --help hides."""
     hints = get_type_hints(kind, include_extras=True)
     rare = [each for each in fields(kind) if RARE in getattr(hints[each.name], "__metadata__", ())]
     return [(each.name, tyro.conf.Suppress[hints[each.name]], field(default=each.default)) for each in rare]
 
 
 def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
-    """Split comma-separated values, such as 10,50, of the options that take several values."""
+    """Split comma-separated values, for example 10,50, of options with several values."""
     words, option = [], ""
     for word in arguments:
         option, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
@@ -136,12 +133,12 @@ def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
 
 @contextlib.contextmanager
 def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
-    """End the process with one line on stderr and an exit code on bad input and on a signal.
+    """On invalid input or a signal, end the process with one line on stderr and an exit code.
 
     Args:
-        program: as it is called, which begins the line.
-        command: whose options messages name; see `in_flags`.
-        interrupted: what is said on Ctrl-C.
+        program: the program's name, which begins the line.
+        command: the command whose options appear in messages; see `in_flags`.
+        interrupted: the message on Ctrl-C.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -162,7 +159,7 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
 
 
 class _Output(io.FileIO):
-    """Standard output that may be full or closed, as by `| head -1`: the files are written all the same."""
+    """Standard output that ignores being full or closed, for example by `| head -1`; files are still written."""
 
     def __init__(self, program: str):
         super().__init__(sys.stdout.fileno(), "w", closefd=False)
@@ -189,7 +186,7 @@ def _meant(word: str, known: Any) -> str:
 
 
 def _message(box: str) -> str:
-    """The text in the first part of the box that tyro draws around an error, without the name of our class."""
+    """Extract the message from the box that tyro draws around an error, without the class name."""
     lines = [line.strip("│| ") for line in box.splitlines()]
     rules = [i for i, line in enumerate(lines) if line.startswith(("─", "╭", "╰", "---", "+"))]
     text = " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
@@ -198,7 +195,7 @@ def _message(box: str) -> str:
 
 @contextlib.contextmanager
 def step(doing: str) -> Iterator[Callable[[str], None]]:
-    """Say on stderr what is being done, then, by the function that is given, what came of it and how long it took."""
+    """Print on stderr what is being done, then the result (set by the yielded function) and the duration."""
     began, found = time.perf_counter(), [""]
     print(f"{doing} …", file=sys.stderr, flush=True)
     yield lambda text: found.__setitem__(0, text)

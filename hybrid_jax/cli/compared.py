@@ -1,4 +1,4 @@
-"""Checks of logs before a vehicle is identified from them, as far as their signals allow, and of what drags it."""
+"""Check logs before a vehicle is identified from them, as far as their signals allow."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -39,16 +39,12 @@ COMPARED = (
 
 
 def check_whole(recordings: Sequence[Recording], vehicle: Vehicle, anyway: bool) -> list[str]:
-    """Check logs as they were recorded; a line for each check that failed.
-
-    Raises:
-        ChecksFailed: a check failed, and it is not to go on anyway.
-    """
+    """Check raw logs; return a line for each failed check, or raise ChecksFailed without `anyway`."""
     return _require([(each, check_recording(each, vehicle)) for each in recordings], anyway)
 
 
 def check_consistent(recordings: Sequence[Recording], field: Any, learn: Sequence[str], anyway: bool) -> list[str]:
-    """Compare the signals of each log, and those with the vehicle; lines and errors as of `check_whole`."""
+    """Compare the signals of each log with each other and the vehicle; returns and raises like `check_whole`."""
     return _require([(each, compared(each, field, learn)) for each in recordings], anyway)
 
 
@@ -61,7 +57,7 @@ def _require(found: Sequence[tuple[Recording, list[Check]]], anyway: bool) -> li
 
 
 def compared(recording: Recording, field: Any, learn: Sequence[str]) -> list[Check]:
-    """The checks of a flight that the signals of a recording allow, each at the rate of the signals that it needs."""
+    """Run all checks of a flight that the signals allow, each at the rate of its signals."""
     body: Any = field.body if isinstance(field, Actuated) else field
     signals = _signals(recording, field)
     runs: dict[float, list[Check]] = {}
@@ -80,7 +76,7 @@ def compared(recording: Recording, field: Any, learn: Sequence[str]) -> list[Che
 
 
 def _flight(recording: Recording, signals: dict[str, Signal], dt: float) -> FlightLog:
-    """The flight in the air, or all of it if it is never there; what it lacks rests at the origin."""
+    """Return the airborne flight, or all of it if it is never airborne; missing states are at rest at the origin."""
     filled = _filled(recording, signals, dt)
     log, first = to_flight(filled, dt), max(signal.t[0] for signal in filled.signals.values())
     spans = airborne(replace(recording, signals={**recording.signals, MOTORS: signals[MOTORS]}), MOTORS)
@@ -89,7 +85,7 @@ def _flight(recording: Recording, signals: dict[str, Signal], dt: float) -> Flig
 
 
 def _signals(recording: Recording, field: Any) -> dict[str, Signal]:
-    """What a flight is made of, with rotor speeds that follow from commands at once."""
+    """Return the signals of a flight, with rotor speeds that follow commands without lag."""
     found = {name: signal for name, signal in recording.signals.items() if len(signal.axes) >= 3 and len(signal) > 1}
     attitude, body = found.get("attitude"), found.pop("body_velocity", None)
     if body and attitude and "velocity" not in found and attitude.interval < 1.5 * body.interval:
@@ -102,7 +98,7 @@ def _signals(recording: Recording, field: Any) -> dict[str, Signal]:
 
 
 def inputs_of(recording: Recording, field: Actuated) -> Float[np.ndarray, "n m"]:
-    """The commands and, if the field reads it, the voltage; where none was measured, the nominal one."""
+    """Return the commands and, if the field reads it, the voltage, by default the nominal one."""
     inputs, voltage = recording.signals["command"], recording.signals.get("voltage")
     if not field.reads_voltage:
         return np.asarray(inputs.values)
@@ -112,7 +108,7 @@ def inputs_of(recording: Recording, field: Actuated) -> Float[np.ndarray, "n m"]
 
 
 def _filled(recording: Recording, signals: dict[str, Signal], dt: float) -> Recording:
-    """A recording of all that a flight needs; states that are missing or slower than dt rest at the origin."""
+    """Complete a recording: states that are missing or slower than dt are at rest at the origin."""
     motors, kept = signals[MOTORS], {MOTORS: signals[MOTORS]}
     for name in STATES:
         if name in signals and signals[name].interval <= 1.5 * dt:
@@ -125,7 +121,7 @@ def _filled(recording: Recording, signals: dict[str, Signal], dt: float) -> Reco
 
 
 def unlearned_drag(logs: Sequence[Recording]) -> str:
-    """What is to be said where forces across the thrust follow the velocity; empty where they do not."""
+    """Return a warning if forces across the thrust depend on the velocity, else an empty string."""
     both = [pair for log in logs if (pair := _across(log)) is not None]
     if not both:
         return ""
@@ -139,7 +135,7 @@ def unlearned_drag(logs: Sequence[Recording]) -> str:
 
 
 def _across(log: Recording) -> tuple[np.ndarray, np.ndarray] | None:
-    """Specific force and velocity along x and y of the body, if both were measured."""
+    """Return specific force and velocity along body x and y, if both were measured."""
     signals = log.signals
     force, q = signals.get("specific_force"), signals.get("attitude")
     if force is None or force.axes != ("x", "y", "z") or not {"velocity", "body_velocity"} & signals.keys():

@@ -1,4 +1,4 @@
-"""Errors of predictions on flights, and what verbs show of them."""
+"""Prediction errors on flights, and their tables and figures for the verbs."""
 
 from collections.abc import Mapping, Sequence
 
@@ -21,12 +21,12 @@ MOST = 500  # windows of a flight
 def rmse_by_flight(
     field: AbstractVectorField, logs: Sequence[FlightLog], steps: int
 ) -> Float[np.ndarray, "flights t 4"]:
-    """RMSE of each of UNITS on each flight at the end of each interval."""
+    """Compute the RMSE in UNITS on each flight at the end of each interval."""
     return np.stack([rmse(errors_of(field, log, steps)) for log in logs])
 
 
 def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[np.ndarray, "n t 4"]:
-    """The errors of each of UNITS for windows of a flight at the end of each interval."""
+    """Compute the errors in UNITS for windows of a flight at the end of each interval."""
     windows = windows_of([log], steps, steps).windows
     places = np.arange(-(-len(windows) // MOST) * MOST) % len(windows)  # so that flights share a program
     return np.stack(flight_errors(field, windows[places], chunk=MOST), axis=-1)[: len(windows)]
@@ -37,18 +37,17 @@ def rmse(errors: Float[np.ndarray, "n t 4"]) -> Float[np.ndarray, "t 4"]:
 
 
 def ratio(errors: Float[np.ndarray, "*n 4"], others: Float[np.ndarray, "*n 4"]) -> float:
-    """The geometric mean of errors over others."""
     return float(np.exp(np.log(errors / others).mean()))
 
 
 def texts(values: Float[np.ndarray, " 4"]) -> list[str]:
-    """A number with its unit for each of UNITS."""
+    """Format numbers with their UNITS."""
     return [f"{value:.3g} {unit}" for value, unit in zip(values, UNITS.values(), strict=True)]
 
 
 @mpl.rc_context(STYLE)
 def figure(errors: Mapping[str, Float[np.ndarray, "flights t 4"]], dt: float) -> Figure:
-    """RMSE over the time since the prediction began, a panel for each of UNITS and a line for each model."""
+    """Plot the RMSE against prediction time, with a panel per unit and a line per model."""
     drawn = Figure(figsize=(7.5, 4.5), layout="constrained")
     panels = drawn.subplots(2, 2, sharex=True)
     for i, (panel, (name, unit)) in enumerate(zip(panels.flat, UNITS.items(), strict=True)):
@@ -63,12 +62,12 @@ def figure(errors: Mapping[str, Float[np.ndarray, "flights t 4"]], dt: float) ->
 
 
 def parameter_table(found: Adaptation) -> Table:
-    """All parameters with their intervals."""
+    """List all parameters with their intervals."""
     lines = [(name, str(one)) for name, one in found.parameters.items()]
     return Table(f"Parameters ({found.level:.0%} intervals)", ("parameter", "value"), lines)
 
 
 def unknown(found: Adaptation) -> list[str]:
-    """A sentence on parameters that the flights do not tell, if there are any."""
+    """Say which parameters the flights do not identify; empty if there are none."""
     names = [name for name, one in found.parameters.items() if one.high == np.inf]
     return [f"The flights do not tell {', '.join(names)}: other values fit them as well."] if names else []

@@ -1,7 +1,7 @@
-"""What the logs of a vehicle tell of it: hover, thrust, where the rotors are and how they spin, lag and trim.
+"""Estimate hover, thrust, rotor positions, spin, lag and trim of a vehicle from its logs.
 
-Angular acceleration is regressed on the squares of the motors, both band-passed: ω̇ = B s, s = w², τ ẇ = u − w. The
-signs of B's columns place each rotor and give its spin; the lag is the τ that explains roll and pitch best.
+Angular acceleration is regressed on the squared motors, both band-passed: ω̇ = B s, s = w², τ ẇ = u − w. The signs of
+B's columns give each rotor's position and spin; the lag is the τ that explains roll and pitch best.
 """
 
 from collections.abc import Sequence
@@ -29,19 +29,19 @@ LEAST_SPREAD = 0.3  # m/s², of the specific force, for a curve of thrust
 
 
 class Estimate(NamedTuple):
-    """Numbers of one vehicle with n rotors.
+    """Estimates for a vehicle with n rotors.
 
     Attributes:
         commands: whether motors are commands from 0 to 1, else speeds [rad/s].
         largest: motor value in the logs.
-        hover: root mean square of each motor in hover.
-        voltage: in hover [V]; not a number if unknown.
-        effect: B, the angular acceleration that each squared motor adds [rad/s² of a squared motor].
-        correlations: of roll, pitch and yaw with the regression.
-        lag: τ [s].
+        hover: RMS value of each motor in hover.
+        voltage: voltage in hover [V]; NaN if unknown.
+        effect: B, the angular acceleration per squared motor [rad/s² / motor²].
+        correlations: correlations of roll, pitch and yaw with the regression.
+        lag: time constant τ [s].
         curve: c0, c1, c2: specific force of one rotor's thrust [m/s²] over its command.
-        seconds: in flight.
-        moves: whether a log tells of the velocity, without which none tells of drag.
+        seconds: time in flight.
+        moves: whether a log has the velocity, which drag requires.
     """
 
     commands: bool
@@ -57,11 +57,11 @@ class Estimate(NamedTuple):
 
     @property
     def placed(self) -> bool:
-        """Whether roll and pitch follow the motors well enough to place the rotors."""
+        """Whether roll and pitch follow the motors well enough to locate the rotors."""
         return bool(self.correlations[:2].min() > EXPLAINED)
 
     def positions(self, arm: float) -> Float[np.ndarray, "n 2"]:
-        """(x, y) of each rotor at a distance `arm` [m], evenly around the centre, one of them or a gap in front."""
+        """Return (x, y) of each rotor at a distance `arm` [m], evenly spaced, with a rotor or a gap in front."""
         count, found = len(self.hover), np.arctan2(self.effect[0], -self.effect[1])
         rank = np.argsort(np.argsort(found))
         grids = [2 * np.pi * (rank + shift / 2) / count - np.pi for shift in range(2 * count)]
@@ -69,7 +69,7 @@ class Estimate(NamedTuple):
         return arm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
     def spin(self) -> list[int]:
-        """The sign of each rotor's reaction torque; of an even number of rotors, neighbours differ."""
+        """Return the sign of each rotor's reaction torque; neighbours differ if the number of rotors is even."""
         turns = self.effect[2]
         if len(turns) % 2 == 0:
             places = self.positions(1.0)
@@ -78,22 +78,18 @@ class Estimate(NamedTuple):
         return [1 if each > 0 else -1 for each in turns]
 
     def inertia(self, thrust: float, places: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
-        """Ix and Iy [kg m²], of a thrust [N] per squared motor and the places of the rotors [m]."""
+        """Return Ix and Iy [kg m²] for a thrust [N] per squared motor and the rotors' positions [m]."""
         roll, pitch = self.effect[0], -self.effect[1]
         y, x = places[:, 1], places[:, 0]
         return float(thrust * (y @ roll) / (roll @ roll)), float(thrust * (x @ pitch) / (pitch @ pitch))
 
     def centre(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " 2"]:
-        """The centre of thrust in hover [m], above which there is no torque, if all rotors are equal."""
+        """Return the centre of thrust in hover [m], assuming equal rotors."""
         return self.hover**2 @ places / (self.hover**2).sum()
 
 
 def estimate(recordings: Sequence[Recording]) -> Estimate:
-    """Estimate from all logs that hold motors; without body rates, what turns the vehicle stays unknown.
-
-    Raises:
-        ValueError: no log holds them in flight.
-    """
+    """Estimate from all logs with motors; raise ValueError if none is in flight. Rotation needs body rates."""
     usable = [each for each in recordings if each.rotors]
     count = usable[0].rotors if usable else 0
     pieces = [piece for each in usable if each.rotors == count for piece in _pieces(each)]
@@ -127,7 +123,7 @@ def estimate(recordings: Sequence[Recording]) -> Estimate:
 
 
 class _Piece(NamedTuple):
-    """Samples at even times, in flight and without gaps."""
+    """Evenly spaced samples in flight without gaps."""
 
     dt: float
     u: Float[np.ndarray, "m n"]
@@ -138,7 +134,7 @@ class _Piece(NamedTuple):
 
 
 def _pieces(recording: Recording) -> list[_Piece]:
-    """The parts of a log between gaps, and without the ground."""
+    """Split a log at gaps, without the time on the ground."""
     motors = motors_of(recording)
     still = Signal(motors.t, np.zeros((len(motors), 3)), ("x", "y", "z"), "no body rates")
     rates = recording.signals.get("rates", still)
@@ -172,13 +168,13 @@ def _column(signal: Signal | None, axis: str, t: np.ndarray) -> np.ndarray:
 
 
 def _lagged(piece: _Piece, lag: float) -> Float[np.ndarray, "m n"]:
-    """The motors behind a first-order lag."""
+    """Apply a first-order lag to the motors."""
     kept = np.exp(-piece.dt / lag) if lag else 0.0
     return lfilter([1 - kept], [1.0, -kept], piece.u, axis=0, zi=kept * piece.u[:1])[0]
 
 
 def _regress(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, "3 n"], Float[np.ndarray, " 3"]]:
-    """B, and the correlations of ω̇ about each axis with B s."""
+    """Return B and the correlations of ω̇ about each axis with B s."""
     rows = []
     for piece in pieces:
         fast, slow = (max(1, round(span / piece.dt)) for span in (FAST, SLOW))
@@ -195,10 +191,7 @@ def _regress(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, "3
 
 
 def _curve(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, " 3"], float] | None:
-    """Specific force along z over the motors, for one rotor of n, and its correlation; None if it hardly varies.
-
-    Of speeds, which thrust follows by their squares, c2 alone.
-    """
+    """Fit one rotor's specific force along z to its motor (for speeds, c2 only); None if it hardly varies."""
     lagged = np.concatenate([_lagged(piece, lag) for piece in pieces])
     force = np.concatenate([piece.force for piece in pieces])
     known = np.isfinite(force)

@@ -1,4 +1,4 @@
-"""`hybrid-jax export`: a model as C, CasADi functions or StableHLO, for programs outside this library."""
+"""`hybrid-jax export`: write a model as C, CasADi functions or StableHLO."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,11 +35,11 @@ PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
 
 @dataclass(frozen=True)
 class Options:
-    """Write the field ẋ = f(x, u) of a model, and a step x⁺ = F(x, u) of it, for programs outside this library.
+    """Write a model's field ẋ = f(x, u), and a step x⁺ = F(x, u) of it, for other programs.
 
     c: NAME.h and NAME.c in C99, for a flight controller, and if the physics has parameters NAME_adaptation.h and
-    NAME_adaptation.c: a filter that adapts them in flight. casadi: field.casadi and step.casadi, which
-    casadi.Function.load reads. stablehlo: field.npz and step.npz, which hybrid_jax.export.load_program reads, or JAX.
+    NAME_adaptation.c, a filter that adapts them in flight. casadi: field.casadi and step.casadi for
+    casadi.Function.load. stablehlo: field.npz and step.npz for hybrid_jax.export.load_program or JAX.
     """
 
     model: Annotated[Path, tyro.conf.Positional]
@@ -47,41 +47,41 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the files."""
     to: tuple[Literal["c", "casadi", "stablehlo"], ...] = ("c",)
-    """What to write, such as c,casadi."""
+    """What to write, for example c,casadi."""
     name: str = "model"
     """Name of the C files, and prefix of their functions."""
     double: bool = False
     """C in double precision."""
     smooth: float | None = None
-    """Put ½ (z + √(z² + 1/β²)) with this β in the place of ReLU, as solvers of optimal control problems need it, and
-    say how much ẋ changes. With 5 they converge where with 30 they mostly do not: see docs/howto/solvers.md."""
+    """Replace ReLU by ½ (z + √(z² + 1/β²)) with this β for solvers of optimal control problems, and report how much ẋ
+    changes. They converge with 5 and mostly not with 30: see docs/howto/solvers.md."""
     dt: float | None = None
-    """Length of a step [s]; by default that of the flights that the model was trained on."""
+    """Length of a step [s]; by default the sample interval of the training flights."""
     out: Path = Path("runs/export")
     """Folder of the page."""
     period: Annotated[float | None, RARE] = None
-    """Of the filter in C: time between two samples [s]; by default the length of a step."""
+    """Filter: time between two samples [s]; by default the length of a step."""
     noise: Annotated[tuple[float, ...], RARE] = ()
-    """Of the filter: standard deviation of what is measured: position [m], quaternion, velocity [m/s] and body rates
+    """Filter: standard deviation of the measurements: position [m], quaternion, velocity [m/s] and body rates
     [rad/s], by default 0.001 0.002 0.02 0.02; or one number for all states, or one for each. A system other than a
     rigid body has no default, and no filter without it."""
     process: Annotated[tuple[float, ...], RARE] = ()
-    """Of the filter: what the model leaves out of the derivatives of these states, as white noise [1/sqrt(s)]; by
-    default 0 0 0.003 0.005 for a rigid body, else 0."""
+    """Filter: standard deviation of the white process noise of these states [1/sqrt(s)]; by default 0 0 0.003 0.005 for
+    a rigid body, else 0."""
     prior: Annotated[tuple[str, ...], RARE] = ()
-    """Of the filter: by how much each parameter may change, as a standard deviation (of a rigid body mostly of its
-    logarithm): one number for all, or words such as Ix=0.3 k=0.2; 0.3 where nothing is said."""
+    """Filter: standard deviation of the change of each parameter (for a rigid body mostly of its logarithm): one number
+    for all, or for example Ix=0.3 k=0.2; by default 0.3."""
     disturbance: Annotated[tuple[float, ...], RARE] = ()
-    """Of the filter: by how much a constant disturbance of a rigid body may change, likewise: three accelerations
-    [m/s^2] and three angular ones [rad/s^2], by default 3 3 3 5 5 5, or one number for all; 0: there is none."""
+    """Filter: standard deviation of a constant disturbance of a rigid body: three accelerations [m/s^2] and three
+    angular accelerations [rad/s^2], by default 3 3 3 5 5 5, or one number for all; 0 for none."""
     batched: Annotated[bool, RARE] = False
-    """The programs of StableHLO take x (b, d) and u (b, m), for any b, instead of x (d,) and u (m,)."""
+    """StableHLO: take x (b, d) and u (b, m), for any b, instead of x (d,) and u (m,)."""
     platforms: Annotated[tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...], RARE] = ("cpu",)
     """Platforms to compile StableHLO for."""
     state_size: Annotated[int | None, RARE] = None
-    """Size of x, for a model of another system."""
+    """Size of x, if the model is not of a rigid body."""
     input_size: Annotated[int | None, RARE] = None
-    """Size of u, likewise."""
+    """Size of u, if the model is not of a rigid body."""
 
 
 def run(options: Options) -> int:
@@ -140,7 +140,7 @@ def _page(options: Options, dt: float, written: Sequence[Path], said: Sequence[s
 
 
 def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> OnlineAdaptation | str:
-    """The filter, or why there is none; ValueError for options that do not fit the model."""
+    """Make the filter, or say why there is none; raise ValueError if the options do not match the model."""
     rigid = state_space(field) == RIGID_BODY_SPACE and d == STATE_SIZE
     try:
         ravel_parameters(field)
@@ -165,7 +165,7 @@ def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> 
 
 
 def _of_states(name: str, numbers: tuple[float, ...], d: int) -> tuple[float, ...]:
-    """A number for each of d states, or one for all."""
+    """Return a number for each of d states, or one for all."""
     (checks.positive if name == "noise" else checks.not_negative)(f"--{name}", min(numbers))
     if len(numbers) in (1, d):
         return numbers
@@ -176,7 +176,7 @@ def _of_states(name: str, numbers: tuple[float, ...], d: int) -> tuple[float, ..
 
 
 def _prior(words: tuple[str, ...], field: AbstractVectorField) -> float | dict[str, float]:
-    """The standard deviation of each parameter; ValueError for a word that is not NAME=NUMBER."""
+    """Parse the standard deviation of each parameter; raise ValueError for a word that is not NAME=NUMBER."""
     try:
         if len(words) == 1 and "=" not in words[0]:
             return float(words[0])
@@ -188,7 +188,7 @@ def _prior(words: tuple[str, ...], field: AbstractVectorField) -> float | dict[s
 
 
 def _change(field: AbstractVectorField, beta: float) -> str:
-    """The largest difference in ẋ between the smooth field and the field, as a sentence."""
+    """Describe the largest difference in ẋ between the smooth field and the field."""
     if (motion := motion_of(field)) is None:
         return "How much smoothing changes ẋ was not looked at: the model holds no windows that it learned from."
     columns = jnp.asarray(motion.x0.T), jnp.asarray(motion.u[:, 0].T)

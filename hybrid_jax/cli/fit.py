@@ -1,4 +1,4 @@
-"""`hybrid-jax fit`: learn a vehicle from its logs, by physics alone or with a network, whichever predicts better."""
+"""`hybrid-jax fit`: learn a vehicle from its logs, with a network if that predicts better than physics only."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,11 +29,11 @@ QUANTILES = np.linspace(0.01, 0.99, 99)
 class Options(FlightOptions):
     """Learn a vehicle from the logs of its flights.
 
-    Each flight is left out in turn: what is learned from the others chooses between physics alone and physics with a
-    network, and says which error to expect on a flight that nobody has recorded.
+    Each flight is held out in turn, to choose between physics only and physics with a network, and to estimate the
+    error on a new flight.
 
-    Logs with position, velocity, attitude, body rates, and rotor speeds or commands with --polynomial become flights.
-    Logs that lack some of it are identified from: see hybrid-jax identify.
+    Your logs should have position, velocity, attitude, body rates, and rotor speeds (or commands with --polynomial).
+    Logs without some of these are used for identification: see hybrid-jax identify.
     """
 
     before: Annotated[Path, tyro.conf.Positional]
@@ -41,14 +41,14 @@ class Options(FlightOptions):
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """File for the model."""
     vehicle: Path | None = None
-    """Vehicle file: what is known, and in `learn` what is not. See docs/howto/vehicle.md. By default one is written
-    from the logs into the folder of the page, with a mass of 1 kg and arms of 0.1 m: results are right up to these."""
+    """Vehicle file with the known constants and, in `learn`, the unknown ones: see docs/howto/vehicle.md. By default,
+    one is estimated from the logs, with a mass of 1 kg and arms of 0.1 m, which scale the results."""
     learn: tuple[str, ...] = ()
-    """Parameters to learn, in place of those of the vehicle file."""
+    """Parameters to learn, instead of the vehicle file's."""
     dt: float = 0.01
     """Interval of the model [s]."""
     seed: int = 0
-    """Of the network."""
+    """Random seed of the network."""
     out: Path = Path("runs/fit")
     """Folder of the page."""
 
@@ -79,7 +79,7 @@ def run(options: Options) -> int:
 
 
 def _written(options: Options) -> Path:
-    """The vehicle file that the logs tell, in the folder of the page."""
+    """Write a vehicle file estimated from the logs into the folder of the page."""
     path = options.out / "vehicle.toml"
     with step("a vehicle file from the logs, as none is given"):
         logs = [log for _, log in raw_logs(options.before, lambda log: inspected(log, None, options))[0]]
@@ -88,7 +88,7 @@ def _written(options: Options) -> Path:
 
 
 def _identified(options: Options, model: VehicleModel) -> bool:
-    """Whether the first log lacks what a flight needs, or has commands for the vehicle file's actuator."""
+    """Whether the first log is incomplete, or has commands for the vehicle file's actuator."""
     paths = find_logs(options.before)[0] if options.before.is_dir() else [options.before]
     found = next((read_recording(path, **options.reading) for path in paths if path.exists()), None)
     if found is None:
@@ -98,7 +98,7 @@ def _identified(options: Options, model: VehicleModel) -> bool:
 
 
 def _about(options: Options, model: VehicleModel, flights: Flights, found: Learned) -> dict[str, Any]:
-    """What other verbs must know of the model."""
+    """Collect what other verbs need to know about the model."""
     features = RIGID_BODY_SPACE.features(
         *(np.concatenate([getattr(log, part) for log in flights.logs]) for part in "xu")
     )

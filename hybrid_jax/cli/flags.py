@@ -1,4 +1,4 @@
-"""Messages of the library in the words of a command: what it calls an argument, the command calls an option."""
+"""Translate arguments in the library's messages to options of a command."""
 
 import re
 
@@ -11,7 +11,7 @@ _VALUE = r"\([^)]*\)|\{[^}]*\}|\"[^\"]*\"|[^\s,;:)]+"
 
 
 def in_flags(command: str, message: str) -> str:
-    """A message in which `argument=value` and `argument must …` name the options of a command, if it has such."""
+    """Replace `argument=value` and `argument must …` by the options of a command, if it has them."""
     if command not in READ_LOGS:
         return message
     message = re.sub(rf"\b({_NAMED})=({_VALUE})", lambda found: _option(FLAGS[found[1]], found[2]), message)
@@ -19,7 +19,7 @@ def in_flags(command: str, message: str) -> str:
 
 
 def _option(flag: str, value: str) -> str:
-    """An option with its value, as it is typed."""
+    """Format an option with its value."""
     if value in ("True", '"warn"'):
         return flag
     pairs = re.sub(r"\"([^\"]*)\": *", r"\1=", value)

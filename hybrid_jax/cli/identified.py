@@ -1,4 +1,4 @@
-"""What `hybrid-jax adapt` and `check` do with a model that was identified, which knows no states."""
+"""`hybrid-jax adapt` and `check` for identified models, which have no states."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -38,7 +38,7 @@ HEADER = ("parameter", "before", "after", "from", "to", "unit")
 
 
 def adapt(options: Any, model: Model) -> int:
-    """Identify it again, from where it is, by logs after a change."""
+    """Identify the model again from logs after a change, beginning with its present parameters."""
     read, layout = _like(options, options.after, model), layout_of(model.about["identified"])
     found, logs = identified(read, layout), [*read.logs.values()]
     before, after = model.about["parameters"], values_of(found)
@@ -78,7 +78,7 @@ def adapt(options: Any, model: Model) -> int:
 
 
 def check(options: Any, model: Model) -> int:
-    """What it predicts of each quantity that was measured, in all logs and in each."""
+    """Compare predictions with each measured quantity, over all logs and in each."""
     read, layout = _like(options, options.flights, model), layout_of(model.about["identified"])
     logs = [*read.logs.values()]
     whole = predicted(model.field, logs, layout, "all logs")
@@ -99,7 +99,7 @@ def check(options: Any, model: Model) -> int:
 
 
 def _like(options: Any, folder: Path, model: Model) -> Read:
-    """Logs for a model that was identified, of which none may be one that it learned from."""
+    """Read logs for an identified model; none of them may be one of its training logs."""
     field = cast(Any, model.field)
     body = field.body if isinstance(field, Actuated) else field
     learned = tuple(name.partition("[")[0] for name in model.about["parameters"])
@@ -113,11 +113,10 @@ def _like(options: Any, folder: Path, model: Model) -> Read:
 
 
 def _changed(model: Model, found: Identified) -> dict[str, tuple[float, float, float, float]]:
-    """Of each parameter that alone would explain the change: the share that it explains, its value, and both ends.
+    """Return, for each parameter, the share of the change it explains by itself, its value and its interval.
 
-    Several are often told together alone, such as what two rotors give, of which a turn about z tells the difference.
-    A change of one, at these covariances, is what fits the difference of all estimates best, by generalised least
-    squares. The first explains most.
+    Often only combinations of parameters are identifiable. The change of one is fitted to the differences of all
+    estimates by generalised least squares with their covariances; the best explanation is first.
     """
     before, restored = ravel_parameters(model.field)
     difference = np.asarray(ravel_parameters(found.field)[0]) - np.asarray(before)

@@ -1,4 +1,4 @@
-"""`hybrid-jax identify`: learn a vehicle from logs of its commands and of whatever was measured beside them."""
+"""`hybrid-jax identify`: learn a vehicle from logs of its commands and of any other measurements."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -40,10 +40,10 @@ ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below co
 
 @dataclass(frozen=True)
 class Options(LogOptions):
-    """Learn what a vehicle is from logs of its commands and of whatever was measured beside them.
+    """Learn a vehicle from logs of its commands and of any other measurements.
 
-    The vehicle file names what is known and, in `learn`, what is not. With commands instead of rotor speeds it needs a
-    table [actuator], such as
+    The vehicle file has the known constants and, in `learn`, the unknown ones. With commands instead of rotor speeds,
+    it needs a table [actuator], for example
 
         learn = ["curve", "time_constant", "Ix", "Iy", "delay"]
         [actuator]
@@ -51,38 +51,38 @@ class Options(LogOptions):
         gives = "thrust"             # or "speed" [rad/s]
         time_constants = 0.05        # s; or [up, down]
 
-    Position, velocity, attitude, body rates and accelerometer may each be missing. Each parameter comes with a 95 %
-    interval; one that the logs do not tell has an infinite one.
+    Position, velocity, attitude, body rates and accelerometer are all optional. Each parameter gets a 95 % interval,
+    which is infinite if it is not identifiable.
 
-    Logs are checked first, as far as their signals allow. A check that fails stops with exit code 3; --anyway goes on.
+    Logs are checked first, as far as their signals allow. A failed check ends with exit code 3, except with --anyway.
     """
 
     folder: Annotated[Path, tyro.conf.Positional]
-    """Folder of logs of any format that is read, or one log."""
+    """Folder of logs of any supported format, or one log."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """File for the model."""
     vehicle: Path
     """Vehicle file (TOML)."""
     learn: tuple[str, ...] = ()
-    """Names of parameters, in the place of those of the vehicle file."""
+    """Parameters to learn, instead of the vehicle file's."""
     anyway: bool = False
-    """Go on although checks of the logs failed: the page then says so first."""
+    """Continue although logs failed checks; the page begins with a warning."""
     out: Path = Path("runs/identify")
     """Folder of the page."""
     dt: Annotated[float, RARE] = 0.005
-    """Steps of the solver, and of the grid on which measurements are compared [s]."""
+    """Step of the solver and of the grid on which measurements are compared [s]."""
     steps: Annotated[int, RARE] = 20
-    """Steps of a window. Short ones resist slow disturbances, long ones tell slow effects."""
+    """Steps of a window. Short windows are robust to slow disturbances, long ones identify slow effects."""
     windows: Annotated[int, RARE] = 300
-    """Windows at most: half are those that tell most of what is learned, the others are spread evenly."""
+    """Maximum number of windows: half are the most informative, the others are evenly spaced."""
 
     disturbance: Annotated[tuple[float, ...], RARE] = Layout.disturbance
-    """First guess of the standard deviation of a constant force [m/s²] and torque [rad/s²] of a window, along x, y and
-    z; 0 for none: of a damaged rotor the trim tells, which a free torque would take up."""
+    """Initial standard deviation of a window's constant force [m/s²] and torque [rad/s²] along x, y and z. You should
+    use 0 for a damaged rotor, because a free torque would absorb its trim."""
 
 
 class Read(NamedTuple):
-    """Recordings by the names of their files, the field to start from, lines for the page, and failed checks."""
+    """Recordings by file name, the initial field, lines for the page, and failed checks."""
 
     logs: dict[str, Recording]
     field: Any
@@ -110,12 +110,12 @@ def run(options: Options) -> int:
 
 
 def layout_of(fits: Mapping[str, Any]) -> Layout:
-    """How recordings are cut into windows, of FITS."""
+    """Return how recordings are cut into windows (one of FITS)."""
     return Layout(fits["dt"], fits["steps"], fits["windows"], disturbance=tuple(fits["disturbance"]))
 
 
 def checked(options: Options) -> Read:
-    """The logs of a folder, checked against the vehicle file and against each other; ChecksFailed without --anyway."""
+    """Read the logs of a folder and check them against the vehicle file; raise ChecksFailed without --anyway."""
     model = _model_of(options)
     return read_checked(
         options.folder, options, model.vehicle, model.learn, lambda logs: _field_of(options, model, logs)
@@ -125,7 +125,7 @@ def checked(options: Options) -> Read:
 def read_checked(
     folder: Path, options: Any, vehicle: Vehicle, learn: Sequence[str], start: Callable[[Sequence[Recording]], Any]
 ) -> Read:
-    """The logs of a folder, as `checked`, for the field that `start` makes for them."""
+    """Read and check the logs of a folder like `checked`, for the field that `start` makes for them."""
     raws, said = raw_logs(folder, partial(read_recording, **options.reading))
     logs = {path.name: log for path, log in raws}
     require_distinct([(log.name, content_of(log)) for log in logs.values()])
@@ -140,7 +140,7 @@ def read_checked(
 
 
 def identified(read: Read, layout: Layout) -> Identified:
-    """What the logs tell, from where the field is: of commands first the thrust, then what turns the vehicle."""
+    """Identify the parameters, beginning with the field's; with commands, thrust comes before rotation."""
     with step(f"identifying by {len(read.logs)} logs") as told:
         fit = identify_in_turn if isinstance(read.field, Actuated) else identify
         found = fit(read.field, [*read.logs.values()], layout)
@@ -149,7 +149,7 @@ def identified(read: Read, layout: Layout) -> Identified:
 
 
 def values_of(found: Identified) -> dict[str, Any]:
-    """Each parameter, with its interval and unit, as JSON values."""
+    """Return each parameter with its interval and unit as JSON values."""
     units = cast(Any, found.field).parameter_units
     return {
         name: {
@@ -174,7 +174,7 @@ def _model_of(options: Options) -> VehicleModel:
 
 
 def _field_of(options: Options, model: VehicleModel, logs: Sequence[Recording]) -> Any:
-    """The field to start from: told commands if the logs have any and the vehicle file has a table [actuator]."""
+    """Make the initial field, with commands as inputs if the logs have any and the vehicle file has [actuator]."""
     for log in logs:
         if log.rotors != model.vehicle.rotors:
             raise ValueError(f"{log.name}: has {log.rotors} motors, {options.vehicle} has {model.vehicle.rotors}")
@@ -192,7 +192,7 @@ def _field_of(options: Options, model: VehicleModel, logs: Sequence[Recording]) 
 
 
 def _learn(names: Sequence[str], without: Sequence[str]) -> str:
-    """What to type to learn all but some parameters."""
+    """Return the option that learns all but some parameters."""
     return f"give --learn {' '.join(name for name in names if name not in without) or 'Ix Iy'}"
 
 
@@ -253,13 +253,13 @@ def predicted(field: Any, recordings: Sequence[Recording], layout: Layout, what:
 
 
 def _by_step(part: Float[np.ndarray, "n t k"]) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
-    """The steps, from 1, at which something was measured in any window, and the RMS of the errors there."""
+    """Return the steps, from 1, with a measurement in any window, and the RMS errors there."""
     steps = np.flatnonzero(~np.isnan(part).all(axis=(0, 2)))
     return steps + 1, np.sqrt(np.nanmean(part[:, steps] ** 2, axis=0))
 
 
 def _nearest(part: Float[np.ndarray, "n t k"], asked: int, dt: float) -> str:
-    """The errors at the measured step that is nearest to the one asked for, with its time if it is another."""
+    """Return the errors at the measured step nearest to the requested one, with its time if it differs."""
     steps, errors = _by_step(part)
     if not len(steps):
         return "not measured"
@@ -270,7 +270,7 @@ def _nearest(part: Float[np.ndarray, "n t k"], asked: int, dt: float) -> str:
 
 @mpl.rc_context(page.STYLE)
 def figure(field: Any, logs: Sequence[Recording], layout: Layout) -> Figure:
-    """Errors of predictions against time."""
+    """Plot prediction errors against time."""
     errors = prediction_errors(field, logs, layout)
     picture = Figure(figsize=(3.2 * len(errors), 2.8), layout="constrained")
     for panel, (name, part) in zip(np.atleast_1d(picture.subplots(1, len(errors))), errors.items(), strict=True):

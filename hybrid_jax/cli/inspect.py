@@ -1,4 +1,4 @@
-"""`hybrid-jax inspect`: what logs hold and lack, what mends them, and a vehicle file of what they tell."""
+"""`hybrid-jax inspect`: check which signals logs have, advise what to log, and write a vehicle file."""
 
 import math
 from collections.abc import Sequence
@@ -37,12 +37,12 @@ EMPTY = "–"
 
 @dataclass(frozen=True)
 class Options(SpeedOptions):
-    """Say what is in the logs of a folder, whether it suffices for a model, and what to log instead.
+    """Check the logs of a folder: their signals, whether they suffice for a model, and what you should log instead.
 
-    Reads PX4's .ulg, logs of a Crazyflie's SD card, ROS bags, Betaflight's blackbox and CSV, each file by itself, so
-    that one that is damaged hides no other. Nothing is trained and no log is changed.
+    Reads PX4's .ulg, logs of a Crazyflie's SD card, ROS bags, Betaflight's blackbox and CSV. Files are read separately,
+    so one damaged file does not hide the others. Nothing is trained and no log is changed.
 
-    First look at the logs, then write a vehicle file from them, correct it by hand, and look again with it:
+    First inspect the logs, then write a vehicle file from them, correct it by hand, and inspect the logs with it:
 
       hybrid-jax inspect flights/
       hybrid-jax inspect flights/ --write-vehicle v.toml --mass 0.68 --arm 0.12
@@ -52,22 +52,22 @@ class Options(SpeedOptions):
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of logs, or one log."""
     vehicle: Path | None = None
-    """Vehicle file that the logs are compared with: number and order of motors, spin, thrust, largest speed."""
+    """Vehicle file to check the logs against: number and order of motors, spin, thrust, largest speed."""
     write_vehicle: Path | None = None
-    """Write a vehicle file to start from: hover and thrust, where the rotors are, spin, lag and centre of thrust as the
-    logs tell that fail no check, with a comment on each number that they do not. No file is overwritten."""
+    """Write an initial vehicle file. Hover, thrust, rotor positions, spin, lag and centre of thrust are estimated from
+    logs that pass all checks; the rest is marked with a comment. Existing files are not overwritten."""
     mass: float | None = None
-    """With --write-vehicle: what the vehicle weighs [kg]. No log tells it; thrust and inertia grow with it."""
+    """With --write-vehicle: mass [kg]. Logs cannot show it; thrust and inertia are proportional to it."""
     arm: float | None = None
-    """With --write-vehicle: distance of a rotor from the centre [m]. No log tells it; inertia grows with it."""
+    """With --write-vehicle: distance of rotors from the centre [m]. Logs cannot show it; inertia scales with it."""
     dt: float = 0.01
-    """Interval [s] that a model is to have. A signal that is slower fails a check, as half of it would be invented."""
+    """Intended interval of the model [s]. A slower signal fails: half of its samples would be interpolated."""
     out: Path = Path("runs/inspect")
     """Folder of the page."""
 
 
 class Inspected(NamedTuple):
-    """One log: what was read, its checks, why it is no flight for a model, or nothing, and what was said on it."""
+    """One log: recording, checks, why it cannot be a flight (or empty), and lines about it."""
 
     name: str
     recording: Recording | None
@@ -81,7 +81,7 @@ class Inspected(NamedTuple):
 
     @property
     def result(self) -> str:
-        """In a few words: refused, fails, or ready."""
+        """The result in one word: refused, fails, or ready."""
         if self.recording is None:
             return f"not read: {self.refusal}"
         if more := self.failed:
@@ -116,7 +116,7 @@ def run(options: Options) -> int:
 
 
 def inspected(path: Path, vehicle: Vehicle | None, options: Any) -> Inspected:
-    """Read and check one log, by the options of this verb or of `fit`; what refuses it is part of the result."""
+    """Read and check one log by the options of this verb or of `fit`; an error becomes part of the result."""
     name = printable(path.name)
     try:
         raw = read_recording(path, **options.reading)
@@ -131,13 +131,13 @@ def inspected(path: Path, vehicle: Vehicle | None, options: Any) -> Inspected:
 def write_vehicle(
     path: Path, logs: Sequence[Inspected], folder: Path, mass: float | None = None, arm: float | None = None
 ) -> None:
-    """Write a vehicle file of what logs of a folder tell."""
+    """Write a vehicle file estimated from the logs of a folder."""
     write_atomic(path, vehicle_text(estimate(trusted(logs)), folder.resolve().stem, mass, arm))
     print(f"{path}: written; read its comments before it is used")
 
 
 def trusted(logs: Sequence[Inspected]) -> list[Recording]:
-    """The recordings that a vehicle file may rest on; which are not is printed."""
+    """Return the recordings that a vehicle file may use; print the others."""
     left = [log.name for log in logs if any(check.name not in BORNE for check in log.failed)]
     kept = [log.recording for log in logs if log.recording is not None and log.name not in left]
     if not kept:
@@ -148,7 +148,7 @@ def trusted(logs: Sequence[Inspected]) -> list[Recording]:
 
 
 def printable(text: str) -> str:
-    """A text that may hold a file's name, which may hold anything: with escapes for what is no character."""
+    """Escape characters of a text that may not be printable, for example in a file name."""
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
@@ -186,7 +186,7 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
 
 
 def _facts(log: Inspected) -> list[tuple[str, ...]]:
-    """Format, vehicle, airframe, program, length [s] and motors of a log that was read."""
+    """Return format, vehicle, airframe, program, length [s] and motors of a log."""
     if (found := log.recording) is None:
         return []
     known = {"vehicle": "unknown vehicle", **found.facts}
@@ -212,7 +212,7 @@ def _unit(name: str) -> str:
 
 
 def _checks(logs: Sequence[Inspected]) -> page.Table:
-    """What came of each check."""
+    """List the results of all checks."""
     every = dict.fromkeys(check.name for log in logs for check in log.checks)
     lines = []
     for log in logs:
@@ -228,7 +228,7 @@ def _verdict(check: Check) -> str:
 
 @mpl.rc_context(page.STYLE)
 def _drawn(recording: Recording) -> Figure:
-    """A panel for each signal over time, gaps in grey."""
+    """Plot each signal against time in its own panel, with gaps in grey."""
     figure = Figure((8, 1.2 + 1.3 * len(recording.signals)), layout="constrained")
     panels = figure.subplots(len(recording.signals), 1, sharex=True, squeeze=False)[:, 0]
     for panel, (name, signal) in zip(panels, recording.signals.items(), strict=True):
@@ -242,7 +242,7 @@ def _drawn(recording: Recording) -> Figure:
 
 
 def _broken(signal: Signal) -> tuple[np.ndarray, np.ndarray]:
-    """Times and values with a break at each gap, so that no line is drawn across it."""
+    """Return times and values with a break at each gap."""
     step, starts = max(1, len(signal) // POINTS), [start for start, _ in signal.gaps()]
     t = signal.t[::step]
     cuts = np.searchsorted(t, starts, side="right")

@@ -1,4 +1,4 @@
-"""Learn a vehicle from flights, by physics alone or with a network: what `fit` decides, and what experiments score."""
+"""Learn a vehicle from flights, with physics only or with a network, for `fit` and experiments."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -31,15 +31,15 @@ FROZEN, CANDIDATES = "thrust, rates frozen", ("physics", "hybrid")  # the simple
 
 
 class Learned(NamedTuple):
-    """A model of a vehicle.
+    """A learned model of a vehicle.
 
     Attributes:
         field: the model.
-        physics: its physics alone, with intervals.
+        physics: the identified physics without the network, with intervals.
         chosen: one of CANDIDATES.
-        lag: of the rotors behind the motors of the logs [s].
-        left_out: RMSE of FROZEN and each candidate on flights left out, after each interval.
-        expected: error on a flight that nobody has recorded, of each of `errors.UNITS`: value, low, high.
+        lag: rotor lag relative to the logged motors [s].
+        left_out: RMSE of FROZEN and each candidate on held-out flights, after each interval.
+        expected: expected error on a new flight, in `errors.UNITS`: value, low, high.
     """
 
     field: AbstractVectorField
@@ -51,12 +51,12 @@ class Learned(NamedTuple):
 
 
 def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Learned:
-    """Learn from all flights what flights that are left out in turn choose: physics alone, or with a network.
+    """Learn from all flights, and choose by held-out flights whether to add a network to the physics.
 
     Args:
-        model: what is known, and in `learn` what is not.
-        logs: two flights or more; rotors lag as `model` says, or as is chosen where it is to be learned.
-        seed: of the network.
+        model: the vehicle's constants and, in `learn`, the unknown ones.
+        logs: two flights or more; the rotor lag is the model's, or is selected if it should be learned.
+        seed: random seed of the network.
     """
     lag = _lag(model, logs) if LAG in model.learn else model.terms.motor_time_constant
     logs = lagged(logs, lag)
@@ -83,20 +83,17 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
 
 
 def adapted(field: AbstractVectorField, logs: Sequence[FlightLog], most: int = ADAPTED) -> Adaptation:
-    """Adapt a model to at most so many windows of flights after a change, whose rotors lag as the model has it.
-
-    Its network stays as it is: ten seconds of flight do not tell hundreds of weights.
-    """
+    """Adapt the physics of a model, not its network, to at most `most` windows of flights after a change."""
     return adapt(field, windows_of(logs, STEPS, STEPS, most).windows, method=Auto(networks=False))
 
 
 def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:
-    """The flights with rotors that follow the motors of the logs with a lag [s]."""
+    """Apply a rotor lag [s] to the motors of flights."""
     return [lag_motors(log, lag)[0] for log in logs] if lag else list(logs)
 
 
 def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
-    """The lag with which physics that is fitted to all but the last flight predicts that flight best."""
+    """Find the lag with which physics fitted to all but the last flight predicts that flight best."""
 
     def error(lag: float) -> float:
         flights = lagged(logs, lag)
@@ -115,13 +112,13 @@ def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
 
 
 def _windows(logs: Sequence[FlightLog], count: int) -> Trajectories:
-    """So many windows, spread evenly, some twice where there are fewer, so that trainings share a program."""
+    """Select evenly spaced windows, repeated if there are fewer, so that trainings share a compiled program."""
     windows = windows_of(logs, STEPS, 1, count).windows
     return windows[np.arange(count) % len(windows)]
 
 
 def _hybrid(physics: Any, logs: Sequence[FlightLog], seed: int, settings: Settings) -> AbstractVectorField:
-    """Physics with a network that adds accelerations; of more than two flights the last one tells when to stop."""
+    """Add a network for accelerations to physics; with three flights or more, the last is used for early stopping."""
     learned, validating = (logs[:-1], logs[-1:]) if len(logs) > 2 else (logs, logs)
     vehicle, key = physics.vehicle, jax.random.key(seed)
     scaling = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)

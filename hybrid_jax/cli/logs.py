@@ -1,4 +1,4 @@
-"""Logs of a folder as flights: read, checked, cut to the time in the air and into windows, as every verb does."""
+"""Read logs of a folder, check them, and cut them into flights and windows, for every verb."""
 
 import itertools
 import sys
@@ -30,18 +30,18 @@ CHANGED = 2.0  # factor by which thrust may differ from the vehicle's where a ch
 
 @dataclass(frozen=True, kw_only=True)
 class LogOptions:
-    """How the logs of a folder are read."""
+    """Options for reading logs."""
 
     columns: Path | None = None
     """TOML file of the columns, units and frames of CSV logs: see docs/howto/logs.md."""
     topics: tuple[str, ...] = ()
-    """Topics of ROS bags, such as odometry=/odom motors=/rotors:data:rpm; also pose, imu, voltage."""
+    """Topics of ROS bags, for example odometry=/odom motors=/rotors:data:rpm; also pose, imu, voltage."""
     motor_order: tuple[int, ...] = ()
-    """Which motor of the log, from 0, each rotor of the vehicle file is, such as 2,0,3,1."""
+    """Index in the log of each rotor's motor, from 0, for example 2,0,3,1."""
 
     @property
     def reading(self) -> dict[str, Any]:
-        """The arguments of the functions of `hybrid_jax.flights.load`; ValueError for topics that are no pairs."""
+        """Arguments of the functions of `hybrid_jax.flights.load`; raises ValueError for malformed topics."""
         for word in self.topics:
             if "=" not in word:
                 raise ValueError(f"--topics must be words such as odometry=/odom, got {word!r}")
@@ -51,31 +51,31 @@ class LogOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedOptions(LogOptions):
-    """How the logs of a folder are read, for models whose inputs are rotor speeds."""
+    """Options for reading logs for models whose inputs are rotor speeds."""
 
     polynomial: tuple[float, ...] = ()
-    """For logs of commands without rotor speeds: rotor speed [rad/s] = c0 + c1 command + c2 command² …, the command
-    from 0 (stop) to 1 (full). It comes from a test stand, or from two points: 100,1000 if a motor turns with 100 rad/s
-    as it starts and with 1100 at the full command. PWM of 1000 … 2000 µs and DShot are turned into 0 … 1 beforehand."""
+    """For logs with commands but no rotor speeds: rotor speed [rad/s] = c0 + c1 command + c2 command² …, with commands
+    from 0 (stop) to 1 (full). You can measure it on a test stand, or at two points: 100,1000 if a motor starts at
+    100 rad/s and reaches 1100 at full command. PWM (1000 … 2000 µs) and DShot are scaled to 0 … 1 first."""
     delay: Annotated[float, RARE] = 0.0
-    """Delay of the motors [s], where a check found that they lead the gyro."""
+    """Delay to add to the motors [s], if a check found that they lead the gyro."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlightOptions(SpeedOptions):
-    """How logs become flights."""
+    """Options for converting logs to flights."""
 
     anyway: bool = False
-    """Use logs that fail checks as well, instead of leaving them out: the page then says so."""
+    """Also use logs that fail checks; the page then warns about them."""
 
 
 class Flights(NamedTuple):
     """The flights of a folder, at one interval.
 
     Attributes:
-        logs: in the air, of those logs that passed.
-        contents: of these what tells them apart, by name.
-        said: lines on what was read, left out and cut.
+        logs: airborne flights of the logs that passed.
+        contents: digests of the flights' contents by name.
+        said: lines on logs that were read, left out or cut.
     """
 
     logs: list[FlightLog]
@@ -84,17 +84,17 @@ class Flights(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """In the air."""
+        """Total time in the air [s]."""
         return sum(len(log) * log.dt for log in self.logs)
 
 
 class Looked(NamedTuple):
-    """What a log is worth to a model.
+    """A checked log and its flight.
 
     Attributes:
-        log: its flight, in the air; none if it cannot be one.
-        checks: of its signals, less those that every verb mends.
-        refusal: why it is no flight, or empty.
+        log: its airborne flight, or None.
+        checks: checks of its signals, except what every verb corrects.
+        refusal: why it is not a flight, or empty.
         notes: what was cut.
     """
 
@@ -105,9 +105,8 @@ class Looked(NamedTuple):
 
 
 def require_distinct(flights: Sequence[tuple[str, Any]]) -> None:
-    """Refuse a flight that occurs twice, whatever its files are called; `flights` are names and what tells them apart.
-
-    It could be both in training and in a test.
+    """Raise ValueError if a flight occurs twice, since it could be in training and test; `flights` are names and
+    contents.
     """
     first: dict[Any, str] = {}
     for name, content in flights:
@@ -117,7 +116,7 @@ def require_distinct(flights: Sequence[tuple[str, Any]]) -> None:
 
 
 def require_unseen(learned_from: Mapping[str, str], contents: Mapping[str, str]) -> None:
-    """Refuse a flight that a model learned from."""
+    """Raise ValueError for a flight that a model was trained on."""
     names = {content: name for name, content in learned_from.items()}
     for name, content in contents.items():
         if content in names:
@@ -125,13 +124,13 @@ def require_unseen(learned_from: Mapping[str, str], contents: Mapping[str, str])
 
 
 def content_of(recording: Recording) -> str:
-    """What tells a recording apart from others, whatever its file is called."""
+    """Identify a recording by its content, whatever its file's name."""
     parts = itertools.product(recording.signals.items(), ("t", "values"))
     return digest(None, {f"{name} {part}": getattr(signal, part) for (name, signal), part in parts})
 
 
 def raw_logs(folder: Path, read: Callable[[Path], Any]) -> tuple[list[tuple[Path, Any]], list[str]]:
-    """What `read` makes of each log of a folder, or of one log, and a line for each file that is none."""
+    """Apply `read` to each log of a folder, or to one log; also return a line for each skipped file."""
     if not folder.exists():
         raise ValueError(f"{folder}: no such file or folder")
     paths, others = find_logs(folder) if folder.is_dir() else ([folder], {})
@@ -142,18 +141,9 @@ def raw_logs(folder: Path, read: Callable[[Path], Any]) -> tuple[list[tuple[Path
 
 
 def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptions, changed: bool = False) -> Flights:
-    """Read, check and cut all logs; those that fail are left out, with a line.
+    """Read, check and cut all logs; failed ones are left out with a line, and `changed` tolerates another thrust.
 
-    Args:
-        folder: of logs, or one log.
-        vehicle: that they are compared with.
-        dt: interval of the flights [s].
-        options: how they are read.
-        changed: the thrust may differ, as that may be what changed.
-
-    Raises:
-        ChecksFailed: none is left.
-        ValueError: a log cannot be read, or is there twice.
+    Raises ChecksFailed if no log is left, and ValueError if a log is unreadable or a duplicate.
     """
     with step(f"reading {folder}") as told:
         raws, said = raw_logs(folder, lambda path: read_recording(path, **options.reading))
@@ -181,7 +171,7 @@ def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptio
 def look(
     path: Path, raw: Recording, vehicle: Vehicle | None, dt: float, options: SpeedOptions, changed: bool = False
 ) -> Looked:
-    """Check a log and cut it to its flight; what cannot be compared with the vehicle is compared with itself."""
+    """Check a log and cut it to its flight; without a vehicle, it is compared with itself."""
     checks, notes = check_recording(raw, vehicle, dt), []
     scaled = "rotor_speed" in raw.signals or bool(options.polynomial)
     try:
@@ -205,7 +195,7 @@ def _near(ratio: float) -> bool:
 
 
 def windows_of(logs: Sequence[FlightLog], steps: int, stride: int, most: int | None = None) -> LogWindows:
-    """Windows of flights, of which at most so many are kept, evenly spaced."""
+    """Cut flights into windows and keep at most `most`, evenly spaced."""
     found = cut_windows(list(logs), steps, stride)
     if most is None or len(found) <= most:
         return found

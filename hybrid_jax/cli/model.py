@@ -1,4 +1,4 @@
-"""Models that `hybrid-jax fit` and `adapt` wrote, as the other verbs need them."""
+"""Read models written by `hybrid-jax fit` and `adapt` for the other verbs."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,7 +23,7 @@ class Known(NamedTuple):
     Attributes:
         field: the model.
         vehicle: its constants.
-        about: what `fit` wrote beside it.
+        about: metadata written by `fit`.
     """
 
     field: AbstractVectorField
@@ -40,7 +40,7 @@ class Known(NamedTuple):
 
 
 def known_of(path: Path, model: Model) -> Known:
-    """A model that was read from a file; ValueError if `fit` or `adapt` did not write it."""
+    """Convert a model from a file; raise ValueError if `fit` or `adapt` did not write it."""
     vehicle = vehicle_in(model.field)
     if "identified" in model.about:
         raise ValueError(f"{path}: was identified without states, which replay draws; hybrid-jax check predicts logs")
@@ -50,21 +50,21 @@ def known_of(path: Path, model: Model) -> Known:
 
 
 def reading_of(known: Known, options: FlightOptions) -> Any:
-    """The options, with commands turned into speeds as they were for the model, if nothing else is said."""
+    """Complete the options with the model's conversion from commands to speeds."""
     if options.polynomial or not known.about.get("polynomial"):
         return options
     return replace(options, polynomial=tuple(known.about["polynomial"]))
 
 
 def flights_for(known: Known, folder: Path, options: FlightOptions, changed: bool) -> Flights:
-    """The flights of a folder, of which none may be one that the model learned from."""
+    """Read the flights of a folder; none of them may be one of the model's training flights."""
     found = read_flights(folder, known.vehicle, known.dt, reading_of(known, options), changed)
     require_unseen(known.about["learned_from"], found.contents)
     return found._replace(logs=lagged(found.logs, known.about.get("lag", 0.0)))
 
 
 def unlike(known: Known, flights: Flights) -> list[str]:
-    """A sentence for each quantity that is often outside of what the model learned from."""
+    """Warn about each quantity that is often outside the training range."""
     learned = {name: np.asarray(values) for name, values in known.about["motion"].items()}
     x, u = (np.concatenate([getattr(log, part) for log in flights.logs]) for part in ("x", "u"))
     asked = RIGID_BODY_SPACE.features(x, u)

@@ -1,4 +1,4 @@
-"""What a verb leaves in its folder: report.html, one file that needs no other, and report.json with stable keys."""
+"""The report of a verb: report.html, a single self-contained file, and report.json with stable keys."""
 
 import base64
 import html
@@ -31,9 +31,9 @@ class Table(NamedTuple):
     """A table of texts.
 
     Attributes:
-        title: above it.
-        header: of its columns.
-        lines: its cells.
+        title: title of the table.
+        header: names of the columns.
+        lines: rows of cells.
     """
 
     title: str
@@ -43,15 +43,15 @@ class Table(NamedTuple):
 
 @dataclass(frozen=True)
 class Page:
-    """What a verb found, in the order in which it is read.
+    """The contents of a report, in reading order.
 
     Attributes:
-        question: that the verb answers.
-        answer: in a sentence.
-        table: of a few rows.
-        figures: caption and picture, or the bytes of a PNG or GIF; the first is not folded.
-        meaning: sentences on what it means.
-        todo: sentences on what to do next.
+        question: the question that the verb answers.
+        answer: the answer in a sentence.
+        table: main table, with a few rows.
+        figures: captions and figures, or the bytes of a PNG or GIF; the first is not folded.
+        meaning: sentences that interpret the answer.
+        todo: sentences on what you should do next.
         details: folded tables.
         notes: folded lines.
     """
@@ -67,13 +67,13 @@ class Page:
 
 
 def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
-    """Write report.html and report.json into a folder, and say where they are.
+    """Write report.html and report.json into a folder, and print where they are.
 
     Args:
         out: the folder.
-        verb: that was run.
-        page: what people read.
-        found: what programs read, JSON values by name.
+        verb: name of the verb.
+        page: contents of the HTML page.
+        found: JSON values by name, for programs.
     """
     record = {"format": FORMAT, "verb": verb, "answer": page.answer, "notes": list(page.notes)} | found
     write_atomic(out / "report.json", json_text(json_value(record)).encode())
@@ -85,7 +85,7 @@ def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
 
 
 def document(page: Page) -> str:
-    """The page as HTML."""
+    """Render the page as HTML."""
     first, *others = [_figure(*each) for each in page.figures] or [""]
     parts = [f"<h1>{_text(page.question)}</h1><p class=answer>{_text(page.answer)}</p>", first]
     parts += [_table(page.table)] if page.table else []

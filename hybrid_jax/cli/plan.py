@@ -1,4 +1,4 @@
-"""`hybrid-jax plan`: the most informative ten seconds of flight for a model."""
+"""`hybrid-jax plan`: design the most informative ten seconds of flight for a model."""
 
 import warnings
 from dataclasses import dataclass
@@ -30,9 +30,9 @@ BOX = FlightBounds()
 
 @dataclass(frozen=True)
 class Options:
-    """Plan the flight whose data tell the parameters of a model best, inside a box.
+    """Plan the most informative flight for the parameters of a model, inside a box.
 
-    It begins and ends in hover at the centre of the box. A steady force and torque are taken as unknown, too.
+    It begins and ends in hover at the centre of the box. A constant force and torque are treated as unknown, too.
     """
 
     model: Annotated[Path, tyro.conf.Positional]
@@ -40,11 +40,11 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """CSV file for the set points: time [s], position [m], yaw [rad], velocity [m/s]."""
     learn: tuple[str, ...] = ()
-    """Parameters that the flight is to tell; by default all of the model's physics."""
+    """Parameters that the flight should identify; by default all of the model's physics."""
     seconds: float = 10.0
     """Length of the flight [s]."""
     low: tuple[float, float, float] = BOX.low
-    """Corner of the box with the least x, y and z [m]; z points up."""
+    """Lower corner of the box, (x, y, z) [m]; z points up."""
     high: tuple[float, float, float] = BOX.high
     """The opposite corner [m]."""
     speed: float = BOX.speed
@@ -52,21 +52,21 @@ class Options:
     tilt: float = BOX.tilt
     """Largest tilt [rad]."""
     yaw: float = BOX.yaw
-    """Largest heading either way of 0 [rad]."""
+    """Largest absolute heading [rad]."""
     bandwidth: float = 2.0
-    """Highest frequency of the flight [Hz]: what your controller cannot follow tells less than planned."""
+    """Highest frequency of the flight [Hz]. Frequencies that your controller cannot track add little information."""
     out: Path = Path("runs/plan")
     """Folder of the page."""
     rotor_speed: Annotated[tuple[float, float], RARE] = BOX.rotor_speed
-    """Least and most that a rotor may turn, as shares of the vehicle's highest speed."""
+    """Lowest and highest rotor speed, as shares of the vehicle's highest speed."""
     noise: Annotated[tuple[float, ...], RARE] = ()
-    """Standard deviation of the noise of each of the 13 states; by default that of motion capture."""
+    """Noise standard deviation of each of the 13 states, by default typical of motion capture."""
     starts: Annotated[int, RARE] = 4
-    """Random flights that the search starts from."""
+    """Number of random initial flights of the search."""
     steps: Annotated[int, RARE] = 200
-    """Steps of the search."""
+    """Iterations of the search."""
     seed: Annotated[int, RARE] = 0
-    """Of the random flights."""
+    """Random seed of the initial flights."""
 
 
 def run(options: Options) -> int:

@@ -1,4 +1,4 @@
-"""`hybrid-jax replay`: a flight in 3-D, and where models expected the vehicle to be."""
+"""`hybrid-jax replay`: show a flight in 3-D with the models' predictions."""
 
 import tempfile
 from collections.abc import Mapping
@@ -32,9 +32,9 @@ Forecasts = Mapping[str, Float[np.ndarray, "n t 3"]]
 
 @dataclass(frozen=True)
 class Options(FlightOptions):
-    """Show a flight in 3-D, and at each time where a model expects the vehicle next, under the inputs that were flown.
+    """Show a flight in 3-D with each model's predictions at each time, under the recorded inputs.
 
-    Writes replay.gif, which the page shows.
+    Writes replay.gif, which is also on the page.
     """
 
     model: Annotated[Path, tyro.conf.Positional]
@@ -42,11 +42,11 @@ class Options(FlightOptions):
     flight: Annotated[Path, tyro.conf.Positional]
     """One log."""
     other: Path | None = None
-    """A second model to compare, such as that before adaptation."""
+    """A second model to compare, for example the one before adaptation."""
     ahead: float = 0.5
-    """How far ahead models predict [s]."""
+    """Prediction horizon [s]."""
     seconds: float = 10.0
-    """How much of the flight is shown [s]."""
+    """Length of the flight to show [s]."""
     out: Path = Path("runs/replay")
     """Folder of the page."""
 
@@ -85,7 +85,7 @@ def run(options: Options) -> int:
 
 
 def _animated(windows: Trajectories, forecasts: Forecasts, dt: float) -> bytes:
-    """An animated picture in real time."""
+    """Animate the flight in real time."""
     path = np.asarray(windows.x0)[:, POSITION]
     middle, half = (path.min(axis=0) + path.max(axis=0)) / 2, max(0.6, 0.6 * np.ptp(path, axis=0).max())
     figure = Figure(figsize=(6.4, 5.2), layout="constrained")

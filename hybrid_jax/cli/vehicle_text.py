@@ -1,4 +1,4 @@
-"""A vehicle file to start from: every number that logs tell, and for the others what to measure."""
+"""Write an initial vehicle file: estimates from logs, and advice on what to measure for the rest."""
 
 import json
 
@@ -13,7 +13,7 @@ TOP = 1000.0  # rad/s at full command, where speeds are not known: thrust alone 
 
 
 def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | None) -> str:
-    """The text of a TOML file; numbers that no log tells are placeholders with a comment that says so."""
+    """Return the text of a TOML file; unidentified numbers are placeholders with a comment."""
     own_mass, own_arm = mass or MASS, arm or ARM
     places = found.positions(own_arm) if found.placed else _even(len(found.hover), own_arm)
     thrust = own_mass * GRAVITY / float((found.hover**2).sum())  # N per squared motor
@@ -53,7 +53,7 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
 
 
 def _turning(found: Estimate, thrust: float, places: np.ndarray, k: float, top: float) -> list[str]:
-    """Inertia, reaction torque and spin."""
+    """Return inertia, reaction torque and spin."""
     spin, why = (
         found.spin(),
         f"correlation of roll, pitch, yaw {', '.join(f'{each:.2f}' for each in found.correlations)}",
