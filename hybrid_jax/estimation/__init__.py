@@ -1,7 +1,6 @@
-"""Estimate the parameters of a field from windows by least squares through the ODE solver, and say how well.
+"""Estimate the parameters of a field by least squares through the ODE solver, with covariances and intervals.
 
-`least_squares` fits, `normal_equations` linearises around a fit, `uncertainty` gives covariances and intervals.
-`record_fit` does the same from records of which not every state was measured.
+`fit_least_squares` uses windows of full states; `fit_records` uses records in which only some states were measured.
 """
 
 from hybrid_jax.estimation.least_squares import LeastSquaresFit, fit_least_squares

@@ -1,8 +1,4 @@
-"""Least squares in parameters θ that all pieces of the data share, and unknowns that each piece has of its own.
-
-A piece is a window or a record. Its own unknowns, such as its initial state, are eliminated from the normal equations
-piece by piece (a Schur complement, as in multiple shooting; Bock 1983), so no matrix grows with the number of pieces.
-"""
+"""Least squares in shared parameters θ and each window's or record's own unknowns, by Schur complements (Bock 1983)."""
 
 from collections.abc import Callable
 from functools import partial
@@ -20,7 +16,7 @@ from hybrid_jax.status import Status
 
 
 class Reduced(NamedTuple):
-    """What is left for θ, and what a step of it means for the rest: that moves by −(offset + slope Δθ)."""
+    """The normal equations of θ after elimination; a step Δθ changes the rest by −(offset + slope Δθ)."""
 
     equations: NormalEquations
     offset: Float[Array, "n s"]
@@ -29,7 +25,7 @@ class Reduced(NamedTuple):
 
 @partial(jax.jit, static_argnums=1)
 def reduced(equations: NormalEquations, p: int, damping: Float[Array, ""] | float = 0.0) -> Reduced:
-    """Eliminate what pieces have of their own; `damping` is relative to the diagonal of its normal equations."""
+    """Eliminate each piece's own unknowns; `damping` is relative to the diagonal of its normal equations."""
     gram, score, square = equations
     size = jnp.sqrt(jnp.diagonal(gram[:, p:, p:], axis1=1, axis2=2))
     unit = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 0)[..., None]
@@ -43,7 +39,7 @@ def reduced(equations: NormalEquations, p: int, damping: Float[Array, ""] | floa
 
 @partial(jax.jit, static_argnums=1)
 def move(equations: NormalEquations, p: int, damping: Float[Array, ""], free: Bool[Array, " p"], least: float):
-    """A step of θ, those of the rest (n, s), and by how much they should lower the cost."""
+    """Return a step of θ, the steps of the rest (n, s), and the expected decrease of the cost."""
     (gram, score, _), offset, slope = reduced(equations, p, damping)
     gram, score = jnp.sum(gram, axis=0), jnp.sum(score, axis=0)
     seen = free & (jnp.diagonal(gram) > least)
@@ -57,12 +53,12 @@ def move(equations: NormalEquations, p: int, damping: Float[Array, ""], free: Bo
 
 
 class End(NamedTuple):
-    """Where a search ended.
+    """The end of a search.
 
     Attributes:
         theta: the parameters (p).
-        own: what each piece has of its own.
-        equations: there.
+        own: the unknowns of each piece.
+        equations: normal equations there.
         steps: of Levenberg–Marquardt.
         status: how it ended.
     """
@@ -84,14 +80,14 @@ def descend(
     max_steps: int = 50,
     tolerance: float = 1e-6,
 ) -> End:
-    """The parameters and unknowns of least cost.
+    """Minimise the cost over the parameters and the pieces' own unknowns.
 
     Args:
-        equations: of θ and what pieces have of their own.
-        theta: the start.
-        own: the start of what pieces have of their own.
-        free: the parameters that move, by default all.
-        least: information of a parameter, after elimination, up to which it stays.
+        equations: normal equations of θ and the own unknowns.
+        theta: initial parameters.
+        own: initial own unknowns.
+        free: the parameters to fit, by default all.
+        least: parameters with no more information than this, after elimination, stay fixed.
         max_steps: of Levenberg–Marquardt.
         tolerance: a step that lowers the cost by a smaller share is slow.
     """
@@ -115,12 +111,12 @@ def descend(
 def covariance(
     equations: NormalEquations, p: int, meat: Float[np.ndarray, "n q q"] | None = None
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "n s"]]:
-    """The covariance of θ, and the variances of what pieces have of their own; infinite where no error tells them.
+    """Return the covariance of θ, and the variances of the own unknowns; infinite if not identifiable.
 
     Args:
         equations: at the minimum.
         p: the number of parameters.
-        meat: the covariance of the score of each piece (a sandwich; White 1980), by default its Gram matrix.
+        meat: covariance of each piece's score (a sandwich; White 1980), by default its Gram matrix.
     """
     gram = np.asarray(equations.gram)
     meat = gram if meat is None else meat

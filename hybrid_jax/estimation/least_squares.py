@@ -1,8 +1,4 @@
-"""Nonlinear least squares for the physical parameters θ_p; a hybrid's residual stays as it is.
-
-Levenberg–Marquardt (`levenberg_marquardt`) needs tens of evaluations where Adam needs thousands. θ_p is in the
-physics' own parametrisation: for a `RigidBody` the log-ratios.
-"""
+"""Nonlinear least squares for the physical parameters θ_p, in the physics' own parametrisation."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -47,8 +43,8 @@ class LeastSquaresFit(eqx.Module):
         mse: L_MSE on the windows, of errors over `scale`.
         steps: evaluations of the residuals and their Jacobian.
         status: how it ended, a `Status`.
-        discretisation: by how many standard errors half the solver's step would move the parameter that it moves most;
-            -1 where this was not looked at.
+        discretisation: by how many standard errors half the solver's step would change a parameter at most; -1 if this
+            was not computed.
     """
 
     field: AbstractVectorField
@@ -72,22 +68,22 @@ def fit_least_squares(
     max_steps: int = 100,
     scale: Scale = None,
 ) -> LeastSquaresFit:
-    """Minimise L_MSE, with the error of each state over `scale`, in inference mode over the θ_p of the field's physics.
+    """Minimise L_MSE over θ_p of the field's physics, in inference mode, with each state's error divided by `scale`.
 
-    Pure: it compiles, maps over stacked fields, and reports failure in `status` instead of raising. In float32 the
-    minimum is met within a few hundredths of a standard error. It warns if `discretisation` is above 0.5: the estimate
-    is then that of other equations, and its interval does not hold the truth as often as it says.
+    Pure: it compiles, maps over stacked fields, and reports failure in `status` instead of raising. In float32 it
+    reaches the minimum within a few hundredths of a standard error. It warns if `discretisation` is above 0.5: you
+    should then use a smaller step, since the intervals do not include this error.
 
     Args:
-        field: its θ_p is the start; a residual beside the physics stays as it is.
-        windows: of the system whose θ_p is sought.
-        solver: takes the field from sample to sample, by default one step of RK4 each.
+        field: its θ_p is the start; a residual beside the physics does not change.
+        windows: of the system whose θ_p you want.
+        solver: integrates the field over each sample interval, by default one step of RK4.
         max_steps: the most evaluations of the residuals and their Jacobian.
         scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
 
     Raises:
-        ValueError: the physics has no parameter, windows that are malformed or not of this field, or an implicit solver
-            finds no step.
+        ValueError: physics without parameters, windows that are malformed or do not fit the field, or an implicit
+            solver that finds no step.
     """
     windows = check_windows(field, windows)
     checks.count("max_steps", max_steps)
@@ -100,7 +96,7 @@ def fit_least_squares(
 
 @contextmanager
 def solver_errors(solver: Solver) -> Iterator[None]:
-    """Say in a line what an implicit solver says in a hundred where its equations are not finite."""
+    """Shorten the message of an implicit solver whose equations are not finite to one line."""
     try:
         yield
     except eqx.EquinoxRuntimeError:
@@ -111,7 +107,7 @@ def solver_errors(solver: Solver) -> Iterator[None]:
 
 
 def warn_of_steps(discretisation: float, remedy: str) -> None:
-    """Say that half the solver's step gives other parameters, where it does."""
+    """Warn if half the solver's step would give other parameters."""
     if discretisation > COARSE:
         errors = f"{discretisation:.2g} standard errors"
         warnings.warn(f"half the solver's step would move a parameter by {errors}: give {remedy}", stacklevel=3)
@@ -119,7 +115,7 @@ def warn_of_steps(discretisation: float, remedy: str) -> None:
 
 @eqx.filter_jit
 def _fit_and_compare(field: AbstractVectorField, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale):
-    """`fit_free`, and its `discretisation`: of the step of Gauss and Newton to what half the step predicts."""
+    """Run `fit_free` and compute `discretisation` by a Gauss–Newton step to the predictions with half the step."""
     fit, jacobian, errors = fit_and_linearise(field, windows, solver, max_steps, scale)
     n = len(windows)
     if n > MANY:  # some tell how far a parameter would move; its standard error is that of all
@@ -142,15 +138,12 @@ def _fit_and_compare(field: AbstractVectorField, windows: Trajectories, solver: 
 
 
 def _linearised(errors: Callable[[Theta, Trajectories], Array], theta: Theta, windows: Trajectories):
-    """The Jacobian of the errors of all windows, and the errors."""
+    """Return the Jacobian of all windows' errors, and the errors."""
     return jax.jacfwd(lambda theta: 2 * (jax.vmap(partial(errors, theta))(windows),), has_aux=True)(theta)
 
 
 def _triangle(errors: Callable[[Theta, Trajectories], Array], theta: Theta, windows: Trajectories):
-    """A Jacobian and errors, of one window of p + 1 errors, with the norms and products of those of all windows.
-
-    They are the triangle of a QR decomposition, some windows at a time: memory does not grow with their number.
-    """
+    """Compress all windows into p + 1 errors by QR, some windows at a time: memory does not grow with their number."""
     n, p = len(windows), theta.size
 
     def add(i, triangle):
@@ -167,7 +160,7 @@ def _triangle(errors: Callable[[Theta, Trajectories], Array], theta: Theta, wind
 
 
 def check_determined(field: AbstractVectorField, n: int, fitted: int | None = None) -> None:
-    """Refuse n windows if as many parameters or more are fitted, by default all of the physics, or if it has none."""
+    """Raise if n windows are too few for the parameters to fit, by default all of the physics, or if there are none."""
     size, name = jax.eval_shape(lambda: ravel_parameters(field)[0]).size, type(physics_of(field)).__name__
     p = size if fitted is None else fitted
     if n <= p:
@@ -175,7 +168,7 @@ def check_determined(field: AbstractVectorField, n: int, fitted: int | None = No
 
 
 def rounding(windows: Trajectories, scale: Scale) -> Float[Array, ""]:
-    """How far rounding moves all states: a parameter with less effect than that cannot be fitted."""
+    """Return the norm of rounding errors of all states: parameters with less effect cannot be fitted."""
     x = windows.x if scale is None else windows.x / scale
     return jnp.finfo(x.dtype).eps * jnp.linalg.norm(x.ravel())
 
@@ -189,7 +182,7 @@ def fit_free(
     scale: Scale,
     free: Bool[Array, " p"] | None = None,
 ) -> LeastSquaresFit:
-    """`fit_least_squares` without its checks; parameters that are not free, or have no effect, stay as they are."""
+    """Run `fit_least_squares` without its checks; parameters that are not free, or have no effect, do not change."""
     return fit_and_linearise(field, windows, solver, max_steps, scale, free)[0]
 
 
@@ -203,15 +196,13 @@ def fit_and_linearise(
     weigh: Callable[[Float[Array, "n t d"]], Float[Array, "n s d"]] | None = None,
     held: Theta | float = 0.0,
 ) -> tuple[LeastSquaresFit, Float[Array, "n s d p"], Float[Array, "n s d"]]:
-    """`fit_free`, and there the Jacobian of the predictions, and their errors with the opposite sign.
+    """Run `fit_free` and return also the Jacobian of the predictions and their negative errors at the end.
 
-    Of more than `MANY` windows that are not weighed, these two are what `_triangle` finds.
-
-    Points are in units, see `_units`; the best one is kept with its errors, their Jacobian and the units.
+    Points are in the units of `_units`. More than `MANY` unweighted windows are compressed by `_triangle`.
 
     Args:
         weigh: a linear map of the errors, such as `starts.projected`.
-        held: what a parameter's distance from the start counts as, an error over a unit of the parameter.
+        held: error per unit of a parameter's distance from the start.
     """
     start, unravel = ravel_parameters(field)
 
@@ -262,11 +253,7 @@ def fit_and_linearise(
 
 
 def _units(jacobian, errors, windows: Trajectories, scale: Scale, free, held) -> tuple[Theta, Float[Array, ""]]:
-    """Of parameters and of errors.
-
-    Each parameter is measured by what it does to the errors, and these by their size at the start, so that the damping
-    and the tolerances, which are absolute numbers, mean the same for any units, data and field (Moré 1978).
-    """
+    """Return units of the parameters and errors in which dampings and tolerances are dimensionless (Moré 1978)."""
     size = _nonzero(jnp.linalg.norm(errors))
     effect = jnp.linalg.norm(jacobian.reshape(-1, jacobian.shape[-1]), axis=0)
     seen, effect = effect > rounding(windows, scale), jnp.sqrt(jnp.square(effect) + jnp.square(held))
@@ -274,12 +261,12 @@ def _units(jacobian, errors, windows: Trajectories, scale: Scale, free, held) ->
 
 
 def in_double(field: Field) -> Field:
-    """A field or a model with its arrays in double precision, where JAX has that."""
+    """Convert the arrays of a field or model to double precision, if JAX has it enabled."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
 
 
 def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta], AbstractVectorField]]:
-    """θ_p as a vector, in the order of the physics' leaves, and the field as a function of it; ValueError if none."""
+    """Return θ_p as a vector in the order of the physics' leaves, and the field as its function; ValueError if none."""
     physics = physics_of(field)
     theta, at = ravel_learned(physics)
     if theta.size == 0:
@@ -291,7 +278,7 @@ def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta
 def prediction_errors(
     field: AbstractVectorField, window: Trajectories, solver: Solver = None, scale: Scale = None
 ) -> Float[Array, "t d"]:
-    """(x_t − x̂_t) / scale of one window, x̂ in inference mode."""
+    """Return (x_t − x̂_t) / scale of one window, with x̂ in inference mode."""
     errors = jnp.asarray(window.x) - rollout(field, window.x0, window.u, window.dt, compact(solver))
     return errors if scale is None else (errors / scale).astype(errors.dtype)
 

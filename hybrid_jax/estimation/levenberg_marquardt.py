@@ -1,9 +1,7 @@
-"""One Levenberg–Marquardt (Levenberg 1944; Marquardt 1963), for all that fit by least squares.
+"""Levenberg–Marquardt (Levenberg 1944; Marquardt 1963) for all least-squares fits.
 
-The loop is ours, not Optimistix's, so that one evaluation serves the start, the steps and the end, whatever is
-eliminated from the equations, and a fit does not go beyond what rounding lets it see. Who fits says how a point is
-evaluated and where the equations there lead under some damping; what is accepted, how the damping changes and when it
-ends is here alone.
+Unlike Optimistix, one evaluation serves the start, the steps and the end, with any elimination, and a fit stops at the
+limit of rounding.
 """
 
 from collections.abc import Callable
@@ -26,14 +24,14 @@ Move = tuple[Float[Array, " p"], Float[Array, ""]]  # a step, and by how much it
 
 
 class State(NamedTuple):
-    """The best point so far, and one to try.
+    """The best point so far, and the next one to try.
 
     Attributes:
-        best: what was found at the best point; the point itself is a part of it.
+        best: results at the best point, including the point itself.
         cost: the sum of squares there.
         tried: the point to try.
-        expected: by how much it should lower the cost.
-        last: whether that is so little that rounding hides it.
+        expected: expected decrease of the cost at that point.
+        last: whether this decrease is below rounding.
         damping: relative to the diagonal of JᵀJ.
         steps: points that were tried.
         slow: how many steps in a row lowered the cost by less than the tolerance.
@@ -52,25 +50,23 @@ class State(NamedTuple):
 
     @property
     def goes_on(self) -> Bool[Array, ""]:
-        """Whether a point is left to try, however many steps were taken."""
+        """Whether a point is left to try, regardless of the number of steps."""
         return ~self.converged & (self.damping <= LARGEST) & ((self.steps == 0) | jnp.isfinite(self.cost))
 
     @property
     def status(self) -> Int[Array, ""]:
-        """How it ended."""
         stalled = ~self.converged & (self.damping > LARGEST)
         return jnp.where(stalled, Status.STALLED, ended(self.converged, jnp.isfinite(self.cost)))
 
 
 def begin(point: PyTree, found: PyTree, damping: float = DAMPING) -> State:
-    """The state before a first point is tried; `found` has the shapes of what is found at a point."""
+    """Return the state before the first point is tried; `found` has the shapes of the results at a point."""
     zero, none, no = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.array(False)
     return State(found, jnp.full((), jnp.inf), point, zero, no, jnp.full((), damping), none, none, no)
 
 
 def judged(state: State, cost: Float[Array, ""], tolerance: float = 0.0) -> tuple[Bool[Array, ""], State]:
-    """Whether the point that was tried is accepted, and the damping after it: as Gould, Orban, Sartenaer and Toint
-    (2005) change a trust region.
+    """Accept or reject the point that was tried, and update the damping as a trust region (Gould et al. 2005).
 
     Args:
         state: with the point that was tried.
@@ -92,7 +88,7 @@ def judged(state: State, cost: Float[Array, ""], tolerance: float = 0.0) -> tupl
 
 
 def aimed(state: State, tried: PyTree, expected: Float[Array, ""], least: Float[Array, ""] | float = 0.0) -> State:
-    """The state with another point to try; the last one if it should lower the cost by less than `least`."""
+    """Set the next point to try; it is the last one if the expected decrease is less than `least`."""
     hidden = HIDDEN * jnp.finfo(state.cost.dtype).eps * state.cost
     return state._replace(tried=tried, expected=expected, last=expected <= jnp.maximum(least, hidden))
 
@@ -108,12 +104,12 @@ def minimise(
     """Try points until one is the last.
 
     Args:
-        evaluate: of a point, and the state before it was tried, the cost and what else is found there.
-        aim: of what was found at a point, and the damping, the next point, what is expected of it, and the least.
+        evaluate: from a point and the previous state, the cost and other results there.
+        aim: from these results and the damping, the next point, the expected decrease, and the least useful one.
         state: `begin`.
         max_steps: points that are tried at most.
         tolerance: see `judged`.
-        loop: drives it: `jax.lax.while_loop` in a compiled program, `in_python` outside.
+        loop: `jax.lax.while_loop` in a compiled program, `in_python` outside.
     """
 
     def step(state: State) -> State:
@@ -126,14 +122,14 @@ def minimise(
 
 
 def in_python(goes_on: Callable[[State], Bool[Array, ""]], step: Callable[[State], State], state: State) -> State:
-    """`jax.lax.while_loop`, one step at a time."""
+    """Run `jax.lax.while_loop` one step at a time."""
     while goes_on(state):
         state = step(state)
     return state
 
 
 def move_of_rows(jacobian: Float[Array, "s p"], r: Float[Array, " s"], damping: Float[Array, ""]) -> Move:
-    """The step that minimises ‖J δ + r‖² + damping ‖δ‖², by QR: JᵀJ would square the condition number."""
+    """Minimise ‖J δ + r‖² + damping ‖δ‖² by QR: JᵀJ would square the condition number."""
     p = jacobian.shape[1]
     rows = jnp.concatenate([jacobian, r[:, None]], axis=1)
     upper = jnp.linalg.qr(jnp.concatenate([rows, jnp.sqrt(damping) * jnp.eye(p, p + 1)]), mode="r")
@@ -142,7 +138,7 @@ def move_of_rows(jacobian: Float[Array, "s p"], r: Float[Array, " s"], damping: 
 
 
 def move_of_equations(gram: Float[Array, "p p"], score: Float[Array, " p"], damping: Float[Array, ""]) -> Move:
-    """The same from JᵀJ and Jᵀr, with each parameter in a unit in which it has the effect 1; one without any stays."""
+    """Minimise the same from JᵀJ and Jᵀr, with parameters scaled to effect 1; one without effect does not change."""
     size = jnp.sqrt(jnp.diagonal(gram))
     seen = size > 0
     unit = jnp.where(seen, 1 / jnp.where(seen, size, 1), 0)

@@ -1,4 +1,4 @@
-"""The normal equations of θ_p, window by window: what windows tell of it, and what leaving one out changes."""
+"""The normal equations of θ_p for each window, and the effect of leaving windows out."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -23,9 +23,9 @@ RANK = 10  # times p and the rounding of one number: a smaller eigenvalue, of pa
 
 
 class NormalEquations(NamedTuple):
-    """The contribution of each of n pieces to the normal equations of q numbers, with J the Jacobian of its errors r.
+    """The normal equations of q numbers from each of n pieces, with J the Jacobian of their errors r.
 
-    Pieces are windows or records; the numbers are θ_p, or all that is learned and then what each piece has of its own.
+    Pieces are windows or records; the numbers are θ_p, or all learned numbers followed by each piece's own unknowns.
 
     Attributes:
         gram: JᵀJ.
@@ -39,7 +39,7 @@ class NormalEquations(NamedTuple):
 
     @staticmethod
     def of_errors(jacobian: Float[Array, "s q"], r: Float[Array, " s"], robust: float = np.inf) -> "NormalEquations":
-        """Of one piece; an error of more than `robust` counts linearly, not as a square (Huber 1964)."""
+        """From one piece; an error of more than `robust` counts linearly, not as a square (Huber 1964)."""
         size = jnp.maximum(jnp.abs(r), FLAT)
         weighted = jacobian * jnp.minimum(1.0, robust / size)[:, None]
         square = r**2 if np.isinf(robust) else jnp.where(size <= robust, r**2, 2 * robust * size - robust**2)
@@ -51,7 +51,7 @@ class NormalEquations(NamedTuple):
 def normal_equations(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, error: ErrorLoss | None, scale: Scale
 ) -> NormalEquations:
-    """The normal equations of each window at a field's θ_p; for arguments see `uncertainty.covariance_of`."""
+    """Return the normal equations of each window at a field's θ_p; for arguments see `uncertainty.covariance_of`."""
     theta, unravel = ravel_parameters(field)
 
     def one(window: Trajectories) -> NormalEquations:
@@ -68,7 +68,7 @@ def normal_equations(
 def equations_of(
     jacobian: Float[Array, "t d p"], r: Float[Array, "t d"], error: ErrorLoss | None = None
 ) -> NormalEquations:
-    """The normal equations of one window, from its errors and their Jacobian."""
+    """Return the normal equations of one window, from its errors and their Jacobian."""
     bent, slope = jacobian, r  # half the curvature of the square times J, half its slope
     if error is not None:
         bent = jnp.einsum("tde,tep->tdp", jax.vmap(jax.hessian(error))(r), jacobian)
@@ -79,23 +79,23 @@ def equations_of(
 
 
 def masked(equations: NormalEquations, free: Bool[Array | np.ndarray, " p"]) -> NormalEquations:
-    """The normal equations of the free parameters; of the others, such that they stay as they are."""
+    """Replace the equations of parameters that are not free so that they do not change."""
     gram = jnp.where(free & free[:, None], equations.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
     return NormalEquations(gram, jnp.where(free, equations.score, 0.0), equations.square)
 
 
 def has_effect(equations: NormalEquations, windows: Trajectories, scale: Scale) -> Bool[Array, " p"]:
-    """Which parameters change the predictions by more than rounding does."""
+    """Which parameters change the predictions by more than rounding."""
     return jnp.diagonal(jnp.sum(equations.gram, axis=0)) > jnp.square(least_squares.rounding(windows, scale))
 
 
 class Inverse(NamedTuple):
-    """The pseudo-inverse of a Gram matrix JᵀJ: zero along what changes no prediction by more than rounding does.
+    """The pseudo-inverse of JᵀJ: zero along directions that change no prediction by more than rounding.
 
     Attributes:
         matrix: the pseudo-inverse.
-        told: the parameters that take no part in such a change.
-        rank: how many directions of θ_p change a prediction by more.
+        told: the identifiable parameters, with no part in such a direction.
+        rank: number of directions of θ_p that change a prediction by more.
     """
 
     matrix: Float[Array, "*n p p"]
@@ -104,7 +104,7 @@ class Inverse(NamedTuple):
 
 
 def inverse(gram: Float[Array, "p p"]) -> Inverse:
-    """The inverse, of a matrix that is scaled to a unit diagonal first: parameters differ in their effect."""
+    """Invert a matrix after scaling it to a unit diagonal."""
     scale = jnp.sqrt(jnp.diagonal(gram))
     scale = jnp.where(scale > 0, scale, 1)
     scales = scale[:, None] * scale
@@ -119,16 +119,16 @@ def inverse(gram: Float[Array, "p p"]) -> Inverse:
 
 
 def inverses(grams: Float[Array, "n p p"]) -> Inverse:
-    """The inverse of each, one after the other: two batches at once can wait for each other, see `matrices.solve`."""
+    """Invert one after the other: two batches at once can wait for each other, see `matrices.solve`."""
     return jax.lax.map(inverse, grams)
 
 
 def steps_without(
     gram: Float[Array, "p p"], score: Float[Array, " p"], grams: Float[Array, "b p p"], scores: Float[Array, "b p"]
 ) -> Float[Array, "b p"]:
-    """The Gauss–Newton step on all windows but some, for each part that is left out, with the sums over all of them.
+    """Compute the Gauss–Newton step without each of several parts, from the sums over all windows and these parts.
 
-    Not finite where a part alone tells what all windows tell; what not even these tell stays as it is.
+    It is not finite if a part is necessary to identify a parameter; one that is never identifiable does not change.
     """
     found = inverses(gram - grams)
     steps = -jnp.einsum("bpq,bq->bp", found.matrix, score - scores)
@@ -136,9 +136,9 @@ def steps_without(
 
 
 def left_out(equations: NormalEquations, horizon: int) -> Float[Array, " n"]:
-    """L_MSE of each window as predicted by a fit of θ_p to all others; not finite where they tell less than all do.
+    """Predict L_MSE of each window by a fit of θ_p to all others (PRESS; Allen 1974), exact for linear residuals.
 
-    Solved from the normal equations at the minimum, which is exact for linear residuals (PRESS; Allen 1974).
+    It is not finite if the others do not identify all that all windows do.
     """
     gram, score, square = equations
     steps = steps_without(jnp.sum(gram, axis=0), jnp.sum(score, axis=0), gram, score)

@@ -1,8 +1,6 @@
-"""Fit a model to records of which not every state was measured, and predict from what was just seen.
+"""Fit a model to records in which only some states were measured, and predict from the last samples.
 
-Unknown are the learned numbers of the model and the state at the start of each record; with process noise, or for a
-first approach, also the states at the starts of segments (`shooting`). Levenberg–Marquardt takes the steps, on normal
-equations summed over segments, so memory grows with the number of unknowns, not with the length of a record.
+Levenberg–Marquardt sums normal equations over segments (`shooting`), so memory does not grow with the record's length.
 """
 
 import dataclasses
@@ -41,18 +39,17 @@ class RecordFit(eqx.Module):
     Attributes:
         model: with the fitted numbers; the start state is that of the first record.
         starts: the state at the start of each record (r, d).
-        starts_error: its standard error (r, d); of an attitude three numbers, its rotation [rad].
+        starts_error: its standard error (r, d); three rotation angles [rad] for an attitude.
         ends: the state at the end of each record (r, d).
-        times: the first and last time of each record that was compared [s] (r, 2).
-        intervals: confidence interval of each physical parameter, number by number. It is infinite for one that the
-            records do not determine.
+        times: first and last time of each record at which outputs were compared [s] (r, 2).
+        intervals: confidence interval of each physical parameter, number by number; infinite if not identifiable.
         errors: RMS of each output's errors in the fit (k).
         set_aside: how many samples of each output counted less, as their errors were too large.
         covariance: of the learned numbers (p, p), in the order of `ravel_learned`.
-        steps: of Levenberg–Marquardt, all rounds together.
+        steps: of Levenberg–Marquardt, summed over rounds.
         status: how the last round ended.
-        discretisation: by how many standard errors half the solver's step would move the learned number that it moves
-            most; 0 if there is none.
+        discretisation: by how many standard errors half the solver's step would change a learned number at most; 0 if
+            there is none.
     """
 
     model: StateSpaceModel
@@ -70,7 +67,7 @@ class RecordFit(eqx.Module):
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """The physical parameters that the records do not determine."""
+        """The physical parameters that are not identifiable from the records."""
         return tuple(name for name, each in self.intervals.items() if not np.isfinite(float(each.high - each.low)))
 
 
@@ -91,7 +88,7 @@ def fit_records(
     substeps: int = 1,
     level: float = 0.95,
 ) -> RecordFit:
-    """Fit the learned numbers of a model to what was measured, whatever was measured, and the initial states.
+    """Fit the learned numbers of a model and the initial states to all measured outputs.
 
     It warns if half the solver's step would give others, see `RecordFit.discretisation`.
 
@@ -100,19 +97,19 @@ def fit_records(
         records: one or more; each output is compared wherever a record has samples of it.
         dt: length of the intervals in which the inputs are constant [s].
         between: how inputs act between their samples: "held", "linear" or "averaged", see `records.on_grid`.
-        segment: length of the pieces of multiple shooting [s], from which a simulation is approached; by default the
-            simulation begins at once. Necessary for unstable systems, far starts, and process noise.
-        prior: how far learned numbers may be expected from where they are, by the beginning of their path, for example
+        segment: length of the segments of multiple shooting [s], used before a simulation; by default the search begins
+            with the simulation. You need it for unstable systems, far starts, and process noise.
+        prior: standard deviations of learned numbers from their start, by the beginning of their path, for example
             {"field.residual": 0.3}; the others are free.
-        noise: the size of the errors that are expected of each output in the first round, by default the deviation of
-            its samples. Against it `prior` is weighed.
+        noise: expected size of each output's errors in the first round, relative to which `prior` is weighed; by
+            default the standard deviation of its samples.
         robust: from the second round on, an error of more than so many times the usual one counts linearly. By default
             all count as squares; 3 is usual for data with outliers.
-        rounds: fits, each with outputs weighted by the errors of the one before.
+        rounds: fits, each with outputs weighted by the previous round's errors.
         max_steps: of Levenberg–Marquardt in each round.
         solver: of diffrax, by default `RK4`.
         substeps: steps of the solver in each interval.
-        level: confidence of the intervals, between 0 and 1.
+        level: confidence level of the intervals, between 0 and 1.
 
     Raises:
         ValueError: a record without a signal of the model, too many unknowns, or an implicit solver that finds no step.
@@ -172,14 +169,14 @@ def simulate(
     solver: Solver = None,
     substeps: int = 1,
 ) -> tuple[dict[str, Float[np.ndarray, "n k"]], Float[np.ndarray, "t d"]]:
-    """The outputs at the times of a record's samples, and the states at the edges of all intervals.
+    """Return the outputs at the times of a record's samples, and the states at the edges of all intervals.
 
     Args:
-        model: what is simulated.
+        model: the model to simulate.
         record: the inputs, and the times of the outputs' samples; the values of outputs are not read.
-        start: the state at the first time (d,), by default that of the model.
+        start: the state at the first time (d,), by default the model's.
         dt: length of the intervals in which inputs are constant [s].
-        begin: the first time [s], by default that of the first sample of an output.
+        begin: the first time [s], by default at the first sample of an output.
         between: how inputs act between samples.
         solver: of diffrax, by default `RK4`.
         substeps: steps of the solver in each interval.
@@ -202,14 +199,13 @@ def simulate(
 def predict(
     model: StateSpaceModel, past: Record, future: Record, *, dt: float, between: Between = "held", **options: Any
 ) -> dict[str, Float[np.ndarray, "n k"]]:
-    """The outputs at the times of a record's samples, from the state in which the record before it ends.
+    """Return the outputs at the times of a record's samples, starting where the previous record ends.
 
-    The states in the past, and what acted on them, are estimated from its samples with the model as it is, by the
-    estimator of `fit_records`.
+    The past states and their disturbances are estimated by `fit_records` with fixed learned numbers.
 
     Args:
-        model: with numbers that are known; its start is what is expected at the first time of the past.
-        past: the last samples. The more is hidden, the longer it has to be.
+        model: with known numbers; its start is the expected state at the first time of the past.
+        past: the last samples; it should be longer if more states are hidden.
         future: the inputs from the end of the past on, and the times of the outputs' samples to predict; the values of
             outputs are not read.
         dt: length of the intervals in which inputs are constant [s].
@@ -253,7 +249,7 @@ def _result(search: record_search.Search, end: End, gridded, errors, robust: flo
 
 
 def _discretisation(search: record_search.Search, end: End, errors) -> float:
-    """How far a step of Gauss and Newton leads with half the solver's step, in standard errors of white noise."""
+    """Return the Gauss–Newton step with half the solver's step, in standard errors of white noise."""
     if not (p := len(search.theta)):
         return 0.0
     problem, segments = search.problem, search.segments
@@ -273,10 +269,10 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
 
 
 def _covariance(search: record_search.Search, end: End) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "r s"]]:
-    """Of θ, and the variances of the nodes; infinite for those along which no output changes.
+    """Return the covariance of θ and the variances of the nodes; infinite where no output changes.
 
-    In a simulation the errors of a model last, so the scores of each piece are one observation (a sandwich; White
-    1980). With process noise errors are independent, and the inverse of the normal equations is the covariance.
+    In a simulation model errors persist, so each piece's score is one observation (a sandwich; White 1980). With
+    process noise errors are independent, and the inverse of the normal equations is the covariance.
     """
     meat = None
     if search.off is None:

@@ -33,7 +33,7 @@ class Sums(NamedTuple):
     cost: Float[np.ndarray, " r"]
 
     def add(self, rows, jacobian, errors, deviations) -> None:
-        """More errors, of known standard deviations; an infinite one counts nothing."""
+        """Add errors with known standard deviations; an infinite one counts nothing."""
         weight = 1 / np.maximum(deviations, TINY)
         jacobian, errors = jacobian * weight[..., None], errors * weight
         self.gram[:, rows[:, None], rows] += jacobian.swapaxes(1, 2) @ jacobian
@@ -42,18 +42,18 @@ class Sums(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The unknowns of a model and records, and how they are judged.
+    """The unknowns of a model and records, and their cost.
 
-    The states at the nodes are unknown: each is `centres` after a change, a tangent vector of the field's state space.
+    The state at each node is `centres` plus an unknown tangent vector of the field's state space.
 
     Attributes:
-        problem: what is compared.
-        centres: the states about which those at the nodes are sought, the expected start of each record first.
-        deviations: of θ from its start that are expected (p); infinite where nothing is.
+        problem: the comparison and its weights.
+        centres: linearisation points of the states at the nodes, the expected start of each record first.
+        deviations: prior standard deviations of θ from its start (p); infinite if free.
         theta: its start (p).
         segments: the records cut; one node each, or one for a record in a simulation.
-        spread: the standard deviations of the start of each record from its centre that are expected.
-        off: what the end of a segment may be off the next node (e); None in a simulation.
+        spread: prior standard deviations of each record's start from its centre.
+        off: standard deviation of the gap between a segment's end and the next node (e); None in a simulation.
     """
 
     problem: Problem
@@ -66,14 +66,14 @@ class Search(NamedTuple):
 
     @property
     def still(self) -> Float[Array, "r q"]:
-        """No change of any node."""
+        """Return zero changes of all nodes."""
         return jnp.zeros((len(self.centres), self.centres.shape[1] * self.problem.model.space.tangent_size))
 
     def model(self, theta) -> Model:
         return ravel_learned(self.problem.model)[1](jnp.asarray(theta))
 
     def nodes(self, own: Float[Array, "r q"]) -> tuple[Float[Array, "r s d"], Float[Array, "r s d e"]]:
-        """The states at the nodes, and their derivatives along the changes."""
+        """Return the states at the nodes, and their derivatives along the changes."""
         return _nodes(self.problem.model, self.centres, own.reshape(*self.centres.shape[:2], -1))
 
     def local(self, theta, own) -> Local:
@@ -83,7 +83,7 @@ class Search(NamedTuple):
         return shooting.shooting(self.problem, theta, nodes, charts, self.segments)
 
     def equations(self, theta, own) -> NormalEquations:
-        """The normal equations of each record in θ and its nodes, with what is expected of θ and of the starts."""
+        """Return each record's normal equations in θ and its nodes, with the priors of θ and of the starts."""
         local, (nodes, charts), model = self.local(theta, own), self.nodes(own), self.problem.model
         found, p, e = jax.tree.map(np.asarray, local.equations), len(self.theta), model.space.tangent_size
         (r, s, _), zero = nodes.shape, self.still.shape[1] + p
@@ -106,7 +106,7 @@ class Search(NamedTuple):
         return NormalEquations(*map(jnp.asarray, total))
 
     def predicted(self, theta, own) -> Predicted:
-        """What a simulation of each record gives, or of each segment from its node."""
+        """Simulate each record, or each segment from its node."""
         model, nodes = self.model(theta), self.nodes(own)[0]
         if self.off is None:
             return shooting.simulated(self.problem, model, nodes[:, 0], self.segments)
@@ -115,23 +115,22 @@ class Search(NamedTuple):
         return jax.tree.map(lambda leaf: leaf.reshape(*nodes.shape[:2], *leaf.shape[2:]), found)
 
     def errors(self, theta, own) -> dict[str, Float[np.ndarray, "n k"]]:
-        """ŷ − y of all samples."""
+        """Return ŷ − y of all samples."""
         found = self.predicted(theta, own).errors
         return {name: np.asarray(each)[self.segments.there[name]] for name, each in found.items()}
 
     def weighted(self, errors: dict[str, Float[np.ndarray, "n k"]], robust: float = np.inf) -> "Search":
-        """The search with outputs weighted by their errors, those of more than `robust` times the usual less."""
+        """Weight outputs by their errors; those of more than `robust` times the usual error count less."""
         sizes = {name: jnp.asarray(size_of(each, robust)) for name, each in errors.items()}
         return self._replace(problem=dataclasses.replace(self.problem, scale=sizes, robust=robust))
 
     def part(self, kept) -> "Search":
-        """Some of the records."""
         segments = jax.tree.map(lambda leaf: leaf[kept], self.segments)
         return self._replace(centres=self.centres[kept], segments=segments, spread=self.spread[kept])
 
 
 def size_of(errors: Float[np.ndarray, "n k"], robust: float = np.inf) -> Float[np.ndarray, " k"]:
-    """The usual size of errors: their RMS, or 1.48 times the median of their sizes, which outliers do not change."""
+    """Return the RMS of errors, or 1.48 times the median of their sizes, which is robust to outliers."""
     found = np.sqrt(np.mean(errors**2, axis=0)) if np.isinf(robust) else 1.4826 * np.median(np.abs(errors), axis=0)
     return np.maximum(found, TINY)
 
@@ -148,7 +147,7 @@ def _nodes(model: Model, centres, changes):
 
 @eqx.filter_jit
 def _missing(model: Model, ends, slopes, nodes, charts):
-    """What leads from each next node to the end of a segment, and its derivative along (θ, node, next node)."""
+    """Return the gap from each next node to a segment's end, and its derivative along (θ, node, next node)."""
 
     def one(end, slope, node, chart):
         of_end, of_node = jax.jacfwd(model.space.difference, (0, 1))(end, node)
@@ -158,7 +157,7 @@ def _missing(model: Model, ends, slopes, nodes, charts):
 
 
 def deviations_of(model: Model, prior: Mapping[str, float]) -> Float[np.ndarray, " p"]:
-    """What is expected of each learned number; ValueError for a path that there is none of."""
+    """Return the prior deviation of each learned number; ValueError for an unknown path."""
     learned = eqx.filter(model, trainable(model))
     leaves = jax.tree_util.tree_leaves_with_path(learned)
     names, found, used = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves], [], set()
@@ -177,7 +176,7 @@ def steps_of(segment: float | None, gridded: list[Gridded], dt: float) -> int:
 
 
 def approached(search: Search, segment: float | None) -> tuple[Search, Float[Array, " p"], Float[Array, "r q"]]:
-    """Where the search begins: after multiple shooting, whose segments drift less and less."""
+    """Return the start of the search: after multiple shooting, with smaller and smaller gaps."""
     space, theta, own = search.problem.model.space, jnp.asarray(search.theta), search.still
     if segment is None:
         return search, theta, own
@@ -198,7 +197,7 @@ def approached(search: Search, segment: float | None) -> tuple[Search, Float[Arr
 
 
 def sizes_of(search: Search, theta, own) -> Float[np.ndarray, " e"]:
-    """The size of each state: as it moves in a simulation, where that is finite."""
+    """Return the size of each state: its variation in a simulation, where finite."""
     model = search.problem.model
     start, spread = np.array(model.start), np.array(model.spread)
     states = search._replace(off=None).predicted(theta, own).states

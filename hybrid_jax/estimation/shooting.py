@@ -1,10 +1,8 @@
-"""The errors of a model along records of which not every state is measured, and their normal equations.
+"""Errors and normal equations of a model along records in which only some states were measured.
 
-A record is cut into segments. In a *simulation* each segment begins where the one before ended: beside the parameters
-only the state at the start of the record is unknown, and sensitivities are carried from segment to segment. In
-*multiple shooting* (Bock 1983) each segment has an unknown initial state, and what is missing between the end of one
-and the start of the next counts as process noise: that converges from worse starts, and it is the model of a state on
-which something acts at random (full-information estimation; Rao, Rawlings and Mayne 2003).
+In a *simulation* only the initial state of a record is unknown. In *multiple shooting* (Bock 1983) each segment has an
+unknown initial state, and the gaps between segments count as process noise, as in full-information estimation (Rao,
+Rawlings and Mayne 2003): this converges from worse starts.
 """
 
 from functools import partial
@@ -27,15 +25,15 @@ Model = Any  # a `StateSpaceModel`, or what has its methods
 
 
 class Segments(NamedTuple):
-    """r records of s segments of t intervals, filled up where a record is shorter.
+    """r records of s segments of t intervals, padded where a record is shorter.
 
     Attributes:
-        u: mean of the inputs over each interval, after those of intervals before a segment that its model asks for.
+        u: mean inputs over each interval, preceded by the earlier intervals that the model needs.
         valid: which intervals are within the record.
-        y: the samples of each output, 0 where there is none.
-        there: which samples there are.
-        index: the interval of the segment in which each sample lies.
-        share: how far into it, from 0 to 1; None where all lie at the ends of intervals.
+        y: the samples of each output, 0 if missing.
+        there: which samples exist.
+        index: the interval of the segment that contains each sample.
+        share: position in it, from 0 to 1; None if all samples are at the ends of intervals.
         whitening: of all errors of a segment, by default none.
     """
 
@@ -49,7 +47,7 @@ class Segments(NamedTuple):
 
 
 def cut(records: list[Gridded], steps: int) -> Segments:
-    """All records in segments of `steps` intervals."""
+    """Cut all records into segments of `steps` intervals."""
     most = max(-(-len(each.u) // steps) for each in records)
     parts = [_cut(each, steps, most) for each in records]
     widest = {name: max(part.there[name].shape[-1] for part in parts) for name in records[0].y}
@@ -87,14 +85,14 @@ def _cut(record: Gridded, steps: int, most: int) -> Segments:
 
 
 class Problem(eqx.Module):
-    """What is compared, and how errors count.
+    """The comparison of a model with measurements, and the weights of errors.
 
     Attributes:
         model: its learned numbers are the start of the search.
         scale: the size of an error that counts as 1, of each output (k).
         robust: an error of more than so many times its scale counts linearly, not as a square (Huber 1964).
         dt: length of an interval [s].
-        solver: takes the field over an interval.
+        solver: integrates the field over an interval.
         substeps: steps of the solver in each interval.
     """
 
@@ -107,7 +105,7 @@ class Problem(eqx.Module):
 
 
 def states_of(problem: Problem, model: Model, x0: Float[Array, " d"], segment: Segments):
-    """The states at the edges of a segment's intervals (t + 1, d), which stay where the record ended; and inputs."""
+    """Return the states at the edges of a segment's intervals (t + 1, d), constant after the record; and inputs."""
     x0, u = model.begin(x0, jnp.asarray(segment.u), problem.dt)
     states = jnp.concatenate([x0[None], integrate(model.field, x0, u, problem.dt, problem.solver, problem.substeps)])
     last = jnp.sum(segment.valid)
@@ -115,7 +113,7 @@ def states_of(problem: Problem, model: Model, x0: Float[Array, " d"], segment: S
 
 
 def outputs_of(model: Model, states, u, segment: Segments, dt: float) -> dict[str, Float[Array, "n k"]]:
-    """The outputs at the times of their samples, from states between which a cubic goes through."""
+    """Return the outputs at the times of their samples, by cubic interpolation of the states."""
     if (shares := segment.share) is None:
         return {name: jax.vmap(partial(model.output, name))(states[i + 1], u[i]) for name, i in segment.index.items()}
     slopes = jax.vmap(model.field)(states[:-1], u) * dt
@@ -130,14 +128,14 @@ def outputs_of(model: Model, states, u, segment: Segments, dt: float) -> dict[st
 
 
 def errors_of(problem: Problem, model: Model, x0, segment: Segments):
-    """Errors of a segment over their scale, zero where nothing was measured, in a vector; and the state at its end."""
+    """Return a segment's errors over their scale as a vector, zero if not measured; and the state at its end."""
     found = predicted(problem, model, x0, segment)
     rows = jnp.concatenate([(error / problem.scale[name]).ravel() for name, error in found.errors.items()])
     return rows if segment.whitening is None else segment.whitening @ rows, found.states[-1]
 
 
 class Predicted(NamedTuple):
-    """What a model says of a segment: outputs, what they are off, and the states at the edges of intervals."""
+    """A model's prediction of a segment: outputs, their errors, and the states at the edges of intervals."""
 
     y: dict[str, Float[Array, "*s n k"]]
     errors: dict[str, Float[Array, "*s n e"]]
@@ -145,7 +143,7 @@ class Predicted(NamedTuple):
 
 
 def predicted(problem: Problem, model: Model, x0, segment: Segments) -> Predicted:
-    """The prediction of a segment; errors are zero where nothing was measured."""
+    """Predict a segment; errors are zero where nothing was measured."""
     segment = segment._replace(index=jax.tree.map(jnp.asarray, segment.index))
     states, u = states_of(problem, model, x0, segment)
     y, errors = outputs_of(model, states, u, segment, problem.dt), {}
@@ -156,7 +154,7 @@ def predicted(problem: Problem, model: Model, x0, segment: Segments) -> Predicte
 
 
 class Local(NamedTuple):
-    """The normal equations of segments in (θ, what their start depends on), and how the end depends on both."""
+    """Normal equations of segments in (θ, the unknowns of their start), and the end's derivatives along both."""
 
     equations: NormalEquations
     slope: Float[Array, "*s d q"]
@@ -164,7 +162,7 @@ class Local(NamedTuple):
 
 
 def local(problem: Problem, theta, x0, through: Float[Array, "d q"], segment: Segments) -> Local:
-    """The normal equations of one segment, where `through` is the derivative of its start."""
+    """Return the normal equations of one segment, where `through` is the derivative of its start."""
     p, unravel = len(theta), ravel_learned(problem.model)[1]
 
     def errors(z):
@@ -178,7 +176,7 @@ def local(problem: Problem, theta, x0, through: Float[Array, "d q"], segment: Se
 
 @eqx.filter_jit
 def shooting(problem: Problem, theta, nodes: Float[Array, "r s d"], charts: Float[Array, "r s d e"], segments) -> Local:
-    """The normal equations of every segment in (θ, change of its own initial state)."""
+    """Return the normal equations of every segment in (θ, change of its own initial state)."""
     slopes = jnp.concatenate([jnp.zeros((*nodes.shape, len(theta))), charts], axis=-1)
     return in_chunks(
         lambda each: jax.vmap(jax.vmap(partial(local, problem, theta)))(*each), (nodes, slopes, segments), CHUNK
@@ -187,7 +185,7 @@ def shooting(problem: Problem, theta, nodes: Float[Array, "r s d"], charts: Floa
 
 @eqx.filter_jit
 def simulation(problem: Problem, theta, starts: Float[Array, "r d"], charts: Float[Array, "r d e"], segments) -> Local:
-    """The normal equations of every segment in (θ, change of the record's initial state), one after the other."""
+    """Return the normal equations of every segment in (θ, change of the record's initial state), in sequence."""
 
     def record(x0, chart, own):
         def step(carry, segment):
@@ -202,7 +200,7 @@ def simulation(problem: Problem, theta, starts: Float[Array, "r d"], charts: Flo
 
 @eqx.filter_jit
 def simulated(problem: Problem, model: Model, starts, segments: Segments) -> Predicted:
-    """The prediction of every segment, in one simulation of each record."""
+    """Predict every segment, in one simulation of each record."""
 
     def step(x, segment):
         found = predicted(problem, model, x, segment)
@@ -213,7 +211,7 @@ def simulated(problem: Problem, model: Model, starts, segments: Segments) -> Pre
 
 @eqx.filter_jit
 def effects(problem: Problem, model: Model, starts: Float[Array, "r d"], segments: Segments, changes):
-    """The errors of records of one segment, and their derivative along changes of their inputs (r, k, a + t, m)."""
+    """Return errors of records of one segment, and their derivative along changes of their inputs (r, k, a + t, m)."""
 
     def one(each):
         x0, segment, ways = each

@@ -1,8 +1,6 @@
-"""Windows whose first state was measured, too: errors that are free of the noise in it.
+"""Remove the noise of measured initial states from windows' errors (errors in variables; Fuller 1987).
 
-That noise is in the errors of a whole window, and in the derivatives along the parameters as well (errors in variables;
-Fuller, Measurement Error Models, 1987). So each window starts where all of its samples say that it did, and what
-another start would change is taken out of the errors. For errors that are normal, these are independent of the start.
+Each window starts at a smoothed state, and the effect of another start is projected out of its errors.
 """
 
 import math
@@ -26,15 +24,15 @@ MOST = 32  # states: with more, such as those of a grid, the measured start is t
 
 
 class Starts(NamedTuple):
-    """What is known of the start of each window.
+    """Estimates of each window's start.
 
     Attributes:
         x0: the smoothed start.
-        jump: the measured start minus it, over scale.
-        effect: of a start on each state of the window, both over scale.
-        inverse: of the normal equations of the start, see `Sums`.
-        trust: what the square of a measured start counts over that of a prediction's error. Where the field errs more
-            than the measurements, as after a large change, a start is as it was measured.
+        jump: measured minus smoothed start, over scale.
+        effect: derivative of each state of the window with respect to the start, both over scale.
+        inverse: inverse of the start's normal equations, see `Sums`.
+        trust: weight of a measured start's square relative to a prediction's; the measured start is used if the field's
+            errors are larger than the measurements', for example after a large change.
     """
 
     x0: Float[Array, "*n d"]
@@ -45,11 +43,11 @@ class Starts(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Normal equations of the start of windows that touch, from their errors.
+    """Normal equations of the start of adjacent windows, from their errors.
 
     Attributes:
-        effect: of the start on the last state.
-        gram: AᵀA, with A its effects on all states.
+        effect: derivative of the last state with respect to the start.
+        gram: AᵀA, with A the derivative of all states.
         score: Aᵀr, with r the errors.
         square: rᵀr.
     """
@@ -61,23 +59,23 @@ class Sums(NamedTuple):
 
     @staticmethod
     def of(jump: Float[Array, " d"], trust: Float[Array, ""]) -> "Sums":
-        """Of the measured start alone."""
+        """From only the measured start."""
         one, trust = jnp.eye(len(jump), dtype=jump.dtype), trust.astype(jump.dtype)
         return Sums(one, trust * one, trust * jump, trust * jump @ jump)
 
     def and_those(self, r: Float[Array, "t d"], effect: Float[Array, "t d d"]) -> "Sums":
-        """With the errors of a window that begins where the last one ended."""
+        """Add the errors of a window that begins where the last one ended."""
         rows = effect @ self.effect
         flat, r = rows.reshape(-1, rows.shape[-1]), r.ravel().astype(rows.dtype)
         return Sums(rows[-1], self.gram + flat.T @ flat, self.score + flat.T @ r, self.square + r @ r)
 
     def unexplained(self) -> Float[Array, ""]:
-        """The square of what no start explains."""
+        """Return the residual sum of squares."""
         return jnp.maximum(self.square - self.score @ solve(self.gram, self.score), 0.0)
 
 
 def unknown_starts(windows: Trajectories) -> Starts:
-    """Starts as they were measured, without any effect."""
+    """Return the measured starts, without any effect."""
     t, d = windows.x.shape[1:]
     n, x0 = len(windows), jnp.asarray(windows.x0)
     return Starts(
@@ -88,10 +86,10 @@ def unknown_starts(windows: Trajectories) -> Starts:
 def smoothed(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale
 ) -> tuple[Starts | None, Float[Array, ""]]:
-    """The starts, from the field's predictions around the measured ones, and the noise of one number over scale.
+    """Return smoothed starts from the field's predictions, and the noise of one number over scale.
 
-    The noise is what differences of the errors, sample by sample, say of it, since an error of the field grows slowly
-    (von Neumann 1941); zero, with no starts, where the state has too many numbers.
+    The noise is estimated from successive differences of the errors (von Neumann 1941), since errors of the field grow
+    slowly. It is zero, with no starts, if the state is too large.
     """
     t, d = windows.x.shape[1:]
     order = min(ORDER, t)
@@ -129,7 +127,7 @@ def smoothed(
 
 
 def _unexplained(rows: Float[Array, "t d k"], r: Float[Array, "t d"]) -> Float[Array, ""]:
-    """The square of what no combination of the rows explains."""
+    """Return the residual sum of squares of r after regression on the rows."""
     flat = rows.reshape(-1, rows.shape[-1])
     gram = flat.T @ flat
     damped = gram + 1e-6 * jnp.diag(jnp.diagonal(gram) + 1e-6)
@@ -137,14 +135,14 @@ def _unexplained(rows: Float[Array, "t d k"], r: Float[Array, "t d"]) -> Float[A
 
 
 def from_starts(windows: Trajectories, starts: Starts | None) -> tuple[Trajectories, Callable[[Array], Array]]:
-    """The windows from smoothed starts, and what takes other starts out of their errors; as they are without any."""
+    """Return the windows from smoothed starts, and the projection of their errors; unchanged without starts."""
     if starts is None:
         return windows, lambda errors: errors
     return replace(windows, x0=starts.x0), partial(projected, starts)
 
 
 def projected(starts: Starts, errors: Float[Array, "n t d"]) -> Float[Array, "n 1+t d"]:
-    """Errors, and those of the measured starts, without what another start would change."""
+    """Project the effect of another start out of the errors, and of the measured starts' errors."""
 
     def one(start: Starts, r):
         change = start.inverse @ (start.trust * start.jump + jnp.einsum("tij,ti->j", start.effect, r))

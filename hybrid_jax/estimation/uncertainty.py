@@ -1,9 +1,4 @@
-"""How well windows determine θ_p, from its normal equations: covariance, intervals, a disturbance or none.
-
-The covariance is **conditional on θ_d**: if the network of a hybrid was trained on the same windows, the intervals are
-too narrow. It contains no bias: effects that the model cannot express, such as an unmodelled drag, move θ̂_p by an
-amount that no interval shows; `experiments/coverage.py` measures both.
-"""
+"""Covariance and intervals of θ_p from its normal equations, and the choice of a constant disturbance."""
 
 from functools import partial
 from typing import Literal, NamedTuple
@@ -73,26 +68,27 @@ def covariance_of(
 ) -> Float[Array, "p p"]:
     """The covariance of θ_p of a field fitted to the windows, given θ_d, in the physics' own parametrisation.
 
-    Rows are in the order of `ravel_parameters`; for a `RigidBody`: log Ix, log Iy, log k. Pure: it compiles and maps
-    over stacked fields. A parameter has an infinite variance if it changes nothing in the windows, or if they do not
-    tell it and others apart.
+    Rows are in the order of `ravel_parameters`, for example log Ix, log Iy, log k of a `RigidBody`. Pure: it compiles
+    and maps over stacked fields. A parameter that is not identifiable has an infinite variance. Note that the
+    covariance does not include bias: intervals are too narrow if a network was trained on the same windows, or if the
+    model lacks an effect such as drag (see `experiments/coverage.py`).
 
     Args:
         field: at, or near, the minimum over θ_p of Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p.
-        windows: those that the field was fitted to.
+        windows: the windows that the field was fitted to.
         kind: with H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2),
             sandwich is H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Only windows must be independent; errors
             within one may be correlated and of any unit (Huber 1967; White 1980; the factor is
             MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for white noise of one variance.
-        solver: takes the field from sample to sample, by default one step of RK4 each.
-        chunk: windows that are held in memory at a time.
+        solver: integrates the field over each sample interval, by default one step of RK4.
+        chunk: windows that are in memory at a time.
         error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
             The slope and curvature of another loss enter M and H (Huber 1967).
         scale: divides the error of each state, as in `fit_least_squares`.
         free: which parameters were fitted, all by default; the others are known and have no variance.
-        cluster: so many consecutive windows may be correlated, as those of one flight are. The sandwich is then the
-            jackknife that leaves one cluster out at a time, as the sandwich of summed J_iᵀr_i is too narrow for few
-            clusters (CV3 of MacKinnon, Nielsen and Webb, J. Applied Econometrics 2023), and intervals need Student's t.
+        cluster: number of consecutive windows that may be correlated, for example in one flight. The sandwich is then
+            the jackknife over clusters (CV3 of MacKinnon, Nielsen and Webb, J. Applied Econometrics 2023), as the
+            sandwich of summed J_iᵀr_i is too narrow for few clusters, and intervals need Student's t.
 
     Raises:
         ValueError: malformed windows, or no more than parameters; an unknown kind, or homoscedastic with an `error`.
@@ -141,7 +137,7 @@ def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Arr
 
 
 def sandwich(equations: NormalEquations, fitted: int, cluster: int) -> Float[Array, "p p"]:
-    """H⁻¹ M H⁻¹ of `covariance_of`, of normal equations in which all but `fitted` parameters are `masked`."""
+    """Compute H⁻¹ M H⁻¹ of `covariance_of` from equations in which all but `fitted` parameters are `masked`."""
     return _covariance(equations, "sandwich", 1, fitted, cluster)
 
 
@@ -151,15 +147,15 @@ def intervals(
 ) -> dict[str, Interval]:
     """The physical parameters of a field, each with a confidence interval; names as in `named_parameters`.
 
-    The error is taken as normal in the physics' own parametrisation: the interval is value · exp(±z s) of a parameter
-    that is held as a logarithm and returned by `theta()`, and value ± z s of one that is held as it is.
+    The error is normal in the physics' own parametrisation: the interval is value · exp(±z s) of a parameter that is
+    stored as a logarithm and returned by `theta()`, otherwise value ± z s.
 
     Args:
         field: at the estimate; a disturbance in its physics is one of the parameters.
-        covariance: of its parameters as the physics holds them (p, p), such as `covariance_of` returns.
-        level: the probability that an interval holds the true value, between 0 and 1.
-        degrees: degrees of freedom of the covariance, one less than its clusters, with which z is Student's quantile;
-            by default it is that of a normal distribution.
+        covariance: covariance in the physics' own parametrisation (p, p), for example from `covariance_of`.
+        level: confidence level, between 0 and 1.
+        degrees: degrees of freedom of the covariance, one less than its clusters, for Student's t; by default the
+            normal distribution is used.
 
     Raises:
         ValueError: a level not between 0 and 1, or a covariance of another shape or with a negative variance.
@@ -184,18 +180,18 @@ def intervals(
 
 
 def check_level(level: float) -> None:
-    """Refuse a confidence level that is not between 0 and 1."""
+    """Raise unless a confidence level is between 0 and 1."""
     if not 0 < (checks.real(level) or 0) < 1:
         raise ValueError(f"level must be between 0 and 1, got {checks.short_repr(level)}")
 
 
 def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
-    """The parameters of a field's physics, number by number.
+    """Return the parameters of a field's physics, number by number.
 
-    Where the class has a method `theta() -> dict[str, Array]`, such as `RigidBody`, that gives names and values in
-    physical units; each entry must be a monotonic function of one parameter. Otherwise names are those of the fields of
-    the class. Entries of arrays are k_rotors[0], aerodynamic_moment[0,2], …; those of a constant disturbance have the
-    names that the state space gives to states, or their places: disturbance[vx], disturbance[0].
+    If the class has a method `theta() -> dict[str, Array]`, such as `RigidBody`, it gives names and values in physical
+    units; each entry must be a monotonic function of one parameter. Otherwise the names are the class's fields.
+    Entries of arrays are k_rotors[0], aerodynamic_moment[0,2], …; those of a constant disturbance use the state
+    space's names of states, or indices: disturbance[vx], disturbance[0].
     """
     physics, disturbance = physics_of(field), disturbance_of(field)
     if isinstance(physics, Hybrid) and disturbance is not None:
@@ -213,13 +209,13 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
 
 
 class DisturbanceSelection(eqx.Module):
-    """The fit that was kept, and why.
+    """The better of two fits, with and without a disturbance.
 
     Attributes:
         fit: the better of the two fits, with a disturbance of zero if none is needed.
         needed: whether the windows need a disturbance: the gain is more than its standard error.
         gain: by how much a disturbance lowers L_MSE of left-out windows, mean over windows.
-        standard_error: of the gain.
+        standard_error: standard error of the gain.
     """
 
     fit: LeastSquaresFit
@@ -238,19 +234,16 @@ def select_disturbance(
     scale: Scale = None,
     indices: tuple[int, ...] | None = None,
 ) -> DisturbanceSelection:
-    """Fit θ_p with and without a constant disturbance and keep the fit that predicts left-out windows better.
+    """Fit θ_p with and without a constant disturbance and choose by leave-one-out cross-validation (Stone 1974).
 
-    More parameters always fit the same windows better, if only the errors of a network. So each window is predicted by
-    a fit to all others (leave-one-out cross-validation; Stone 1974), and the simpler model is kept unless it is worse
-    by more than one standard error of the difference (Breiman, Friedman, Olshen and Stone, Classification and
-    Regression Trees, 1984, Sec. 3.4.3). A single window, or windows that do not determine θ_p, need no disturbance.
-
-    Pure, and raises as `fit_least_squares`.
+    The simpler model is chosen unless it is worse by more than one standard error of the difference (Breiman, Friedman,
+    Olshen and Stone, Classification and Regression Trees, 1984, Sec. 3.4.3), or if windows do not identify θ_p. Pure,
+    and raises as `fit_least_squares`.
 
     Args:
         field: its θ_p, and its disturbance if it has one, are the start.
-        windows: of the system whose θ_p is sought, independent of each other.
-        solver: takes the field from sample to sample, by default one step of RK4 each.
+        windows: of the system whose θ_p you want, independent of each other.
+        solver: integrates the field over each sample interval, by default one step of RK4.
         max_steps: the most steps of each of the two fits.
         scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
         indices: the disturbed states, see `with_disturbance`.
