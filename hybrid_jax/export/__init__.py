@@ -1,10 +1,8 @@
 """Export ẋ = f(x, u), or a step x⁺ = F(x, u), for programs that do not use this library.
 
 - `export_program`, `load_program`: StableHLO in a file, through `jax.export` (extra `export`).
-- `casadi_function`: a CasADi function, for optimal control (extra `casadi`).
+- `casadi_function`: a CasADi function, for example for optimal control (extra `casadi`).
 - `export_c`, `export_adaptation_c`: C99 for a flight controller.
-
-See docs/howto/export.md for an example.
 """
 
 from hybrid_jax.export.c.adaptation import export_adaptation_c

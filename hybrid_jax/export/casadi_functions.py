@@ -25,19 +25,19 @@ def casadi_function(
     name: str = "f",
     smooth: float | None = None,
 ) -> "casadi.Function":
-    """ẋ = f(x, u) of a field in inference mode, or a step of it, from x (d × 1) and u (m × 1), in double precision.
+    """Convert a field, or a step of it, to a CasADi function of x (d × 1) and u (m × 1), in double precision.
 
-    Its output is xdot, or xnext of a step. CasADi differentiates it, saves it (`.save`) and translates it to C
-    (`.generate`).
+    The field is in inference mode, and the output is xdot, or xnext for a step. CasADi can differentiate the function,
+    save it (`.save`) and translate it to C (`.generate`).
 
     Args:
-        field: ẋ = f(x, u), of one state x (d,) and one input u (m,).
+        field: ẋ = f(x, u), for one state x (d,) and one input u (m,).
         dt: length of a step of RK4 with the input held [s], x⁺ = F(x, u); without it the function is ẋ.
-        state_size: d; by default that of the field's vehicle or, failing that, its attribute of this name.
-        input_size: m; likewise.
+        state_size: d; by default from the field's vehicle or its attribute of this name.
+        input_size: m; by default from the field's vehicle or its attribute of this name.
         name: of the function, as CasADi accepts it.
-        smooth: β of ½ (z + √(z² + 1/β²)), to take the place of the ReLU of networks (see `smoothed`). Solvers that use
-            second derivatives, such as IPOPT, need it.
+        smooth: β of ½ (z + √(z² + 1/β²)), which replaces the ReLU of networks (see `smoothed`). You should set it for
+            solvers that use second derivatives, for example IPOPT.
 
     Raises:
         ValueError: unknown sizes, more than 512 states, a field that does not accept such x and u, or an operation

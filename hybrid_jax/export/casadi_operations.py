@@ -15,7 +15,7 @@ Column = ca.SX | ca.DM
 
 
 def evaluate(program: ClosedJaxpr, symbols: Sequence[ca.SX]) -> ca.SX:
-    """The result of a program from vectors to one vector, as a dense column; ValueError for an unknown operation."""
+    """Evaluate a program from vectors to one vector, as a dense column; ValueError for an unknown operation."""
     (result,) = CasadiTranslation().run(program, [Entries(one, (one.numel(),)) for one in symbols])
     return ca.densify(ca.SX(result))
 

@@ -1,4 +1,4 @@
-"""What is exported of a field: a function of x and u in one precision, and its sizes."""
+"""Prepare a field for export: a function of x and u in one precision, and its sizes."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -25,9 +25,9 @@ def program_of(
     smooth: float | None,
     batched: bool = False,
 ) -> Derivative:
-    """ẋ = f(x, u), or the step of RK4 over dt [s], of a field with its numbers in the precision of `likes`.
+    """Return ẋ = f(x, u), or the step of RK4 over dt [s], with the field's numbers in the precision of `likes`.
 
-    `likes` are of one x and one u; if `batched`, the function is one of rows of them. ValueError if they do not fit.
+    `likes` are one x and one u; if `batched`, the function takes rows of them. ValueError if they do not fit.
     """
     field = prepared(field, likes, smooth)
 
@@ -42,10 +42,7 @@ def program_of(
 def prepared(
     field: AbstractVectorField, likes: Sequence[jax.ShapeDtypeStruct], smooth: float | None
 ) -> AbstractVectorField:
-    """The field with its numbers in the precision of x and u, and with `SmoothRelu` of β = `smooth` if that is given.
-
-    ValueError if the field does not take such x and u.
-    """
+    """Convert the field to the precision of x and u, with `SmoothRelu` if asked; ValueError if they do not fit."""
     precision = likes[0].dtype
     field = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision) if eqx.is_inexact_array(leaf) else leaf, field)
     if smooth is not None:
@@ -56,10 +53,7 @@ def prepared(
 
 
 def sizes_of(field: Any, state_size: Size, input_size: Size) -> tuple[int, int]:
-    """The sizes that are given, or else those that the field knows; ValueError if it does not.
-
-    A field knows them if it, or a field in it, has attributes `state_size` and `input_size`, or a `vehicle`.
-    """
+    """Return the given sizes, or the sizes that the field or a part of it has as attributes; else ValueError."""
     known = _known_sizes(field) or (None, None)
     d, m = state_size if state_size is not None else known[0], input_size if input_size is not None else known[1]
     for name, size, least in (("state_size", d, 1), ("input_size", m, 0)):
@@ -70,13 +64,13 @@ def sizes_of(field: Any, state_size: Size, input_size: Size) -> tuple[int, int]:
 
 
 def vehicle_in(field: Any) -> Vehicle | None:
-    """The vehicle that a field, or a field in it, is of."""
+    """Return the vehicle of a field or of its parts."""
     vehicles = (getattr(part, "vehicle", None) for part in _parts(field))
     return next((one for one in vehicles if isinstance(one, Vehicle)), None)
 
 
 def _known_sizes(tree: Any) -> tuple[int, int] | None:
-    """Those of the outermost module in a tree that knows them."""
+    """Return the sizes of the outermost module in a tree that has them."""
     for part in _parts(tree):
         if isinstance(vehicle := getattr(part, "vehicle", None), Vehicle):
             return STATE_SIZE, vehicle.rotors
@@ -86,7 +80,7 @@ def _known_sizes(tree: Any) -> tuple[int, int] | None:
 
 
 def _parts(tree: Any) -> Iterator[Any]:
-    """A tree and all trees in it, each before its own parts."""
+    """Yield a tree and all trees in it, each before its own parts."""
     yield tree
     for child in jax.tree.leaves(tree, is_leaf=lambda node: node is not tree):
         if child is not tree:

@@ -1,8 +1,4 @@
-"""Fields and steps as StableHLO programs in files, through `jax.export`: JAX runs them without this library.
-
-A file is an archive (see archive.py) whose array "exported" holds the bytes of `jax.export.Exported.serialize`.
-Programs with external calls are neither written nor loaded.
-"""
+"""Fields and steps as StableHLO programs in files, through `jax.export`: JAX runs them without this library."""
 
 import importlib.util
 import re
@@ -38,7 +34,7 @@ class Program:
         state_size: d.
         input_size: m.
         batched: whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
-        platforms: on which it runs.
+        platforms: platforms that can run it.
         about: JSON values that describe the model.
     """
 
@@ -53,7 +49,7 @@ class Program:
     def __call__(
         self, x: Float[Array | np.ndarray, "*b d"], u: Float[Array | np.ndarray, "*b m"]
     ) -> Float[Array, "*b d"]:
-        """ẋ, or the state dt later with the input held, in single precision; ValueError for other arrays.
+        """Return ẋ, or the state dt later with the input held, in single precision; ValueError for other arrays.
 
         Args:
             x: state (d,), or states (b, d).
@@ -81,22 +77,22 @@ def export_program(
     smooth: float | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a field, or a step of it, in inference mode and single precision, to a file that `load_program` reads.
+    """Write a field, or a step of it, in inference mode and single precision, to a file for `load_program`.
 
     Args:
-        path: of the file.
-        field: ẋ = f(x, u), of one state x (d,) and one input u (m,).
+        path: of the file, an archive with the bytes of `jax.export.Exported.serialize`.
+        field: ẋ = f(x, u), for one state x (d,) and one input u (m,).
         dt: length of a step of RK4 with the input held [s], x⁺ = F(x, u); without it ẋ is written.
-        state_size: d; by default that of the field's vehicle or, failing that, its attribute of this name.
-        input_size: m; likewise.
+        state_size: d; by default from the field's vehicle or its attribute of this name.
+        input_size: m; by default from the field's vehicle or its attribute of this name.
         batched: take x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
         platforms: a subset of PLATFORMS; each makes the file longer.
-        smooth: as of `casadi_function`.
+        smooth: see `casadi_function`.
         about: JSON values to store with the program.
 
     Raises:
         ValueError: unknown sizes, a field that does not accept such x and u, an unknown platform, `about` that is not
-            JSON, or a program with an external call, such as to LAPACK.
+            JSON, or a program with an external call, for example to LAPACK.
         ImportError: flatbuffers is not installed (extra `export`).
         OSError: the folder cannot be written.
     """
@@ -149,7 +145,7 @@ def _exported(field, dt: float | None, sizes, batched: bool, platforms, smooth) 
 
 @contextmanager
 def _without_source_locations() -> Iterator[None]:
-    """Leave out the paths and lines of the source that a program is traced from."""
+    """Omit the paths and lines of the traced source from programs."""
     before = jax.config.jax_traceback_in_locations_limit  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_traceback_in_locations_limit", 0)
     try:
@@ -159,14 +155,14 @@ def _without_source_locations() -> Iterator[None]:
 
 
 def _check_calls(exported: jax.export.Exported) -> None:
-    """Refuse a program that depends on libraries of a machine."""
+    """Raise for a program with external calls, which would depend on the machine's libraries."""
     for call in re.findall(r"custom_call\W*(\w*)", exported.mlir_module()):
         if call != "shape_assertion":  # JAX's check of a symbolic length
             raise ValueError(f"field: its program calls {call or 'something'}, which is not an operation of StableHLO")
 
 
 def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int]:
-    """(batched, d, m) of a program (x, u) → ẋ or x⁺."""
+    """Return (batched, d, m) of a program (x, u) → ẋ or x⁺."""
     (x, u), (result,) = exported.in_avals, exported.out_avals
     batched, d, m = len(x.shape) == 2, x.shape[-1], u.shape[-1]
     batch = (BATCH,) if batched else ()

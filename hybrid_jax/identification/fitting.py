@@ -1,9 +1,8 @@
-"""Identify a vehicle from recordings of commands and of whatever was measured, by the estimator of records.
+"""Identify a vehicle from recordings of its commands and sensors.
 
-The state in which a window begins is unknown, with the estimate of `recordings.initial_states` as a prior (an arrival
-cost; Rao, Rawlings and Mayne 2003). So is a force and a torque that is constant over it: wind, a battery that sags, and
-other slow errors that a pilot corrects, which would pass for effects of the commands. These disturbances get the
-variance that they turn out to have (empirical Bayes by expectation maximisation; Dempster, Laird and Rubin 1977).
+The initial state of a window has a prior from earlier samples (an arrival cost; Rao, Rawlings and Mayne 2003). Each
+window also has a constant force and torque, for example wind or a sagging battery, whose variance is estimated
+(empirical Bayes by expectation maximisation; Dempster, Laird and Rubin 1977).
 """
 
 from collections.abc import Sequence
@@ -53,11 +52,11 @@ class Identified(NamedTuple):
         field: with the fitted parameters.
         intervals: 95 % confidence interval of each parameter, number by number.
         errors: RMS of each quantity's channels over the windows, from the estimated initial states.
-        windows: how many were fitted.
+        windows: number of fitted windows.
         seconds: length of all windows [s].
         status: how the last round ended.
         covariance: of the parameters (p, p), in the parametrisation of `ravel_parameters`.
-        explained: share of the change of each body rate in a window that is told (3); 1 if not measured.
+        explained: R² of the change of each body rate in a window (3); 1 if not measured.
     """
 
     field: AbstractVectorField
@@ -88,19 +87,19 @@ def identify(
     """Fit the learned parameters of the field's physics to recordings.
 
     Args:
-        field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
-        recordings: of one vehicle; one or more.
+        field: an `Actuated` field if the input is commands; any other field takes the measured rotor speeds.
+        recordings: one or more, of one vehicle.
         layout: how they are cut into windows, by default `Layout()`.
-        measured: quantities that are compared, by default all that every recording has.
-        free: names of parameters that are fitted, such as k or efficiency[2], by default all; the others stay.
-        known: the covariance of those that stay, to which the fitted ones owe a part of theirs; by default zero.
+        measured: quantities to compare, by default all that every recording has.
+        free: names of parameters to fit, such as k or efficiency[2], by default all; the others do not change.
+        known: covariance of the other parameters, which adds to the covariance of the fitted ones; by default zero.
 
     Returns:
-        A parameter that the windows do not tell has an infinite interval and stays as it was, as do those of
-        `OF_VELOCITY` where no recording holds a velocity or position.
+        A parameter that is not identifiable has an infinite interval and does not change, nor do those in `OF_VELOCITY`
+        if no recording has a velocity or position.
 
     Raises:
-        ValueError: of a recording that lacks something, or too few windows: name and what was expected.
+        ValueError: a recording that lacks something, or too few windows, with name and what was expected.
     """
     layout = Layout() if layout is None else layout
     with jax.enable_x64(True):
@@ -137,7 +136,7 @@ def identify(
 def _search(
     field, recordings: Sequence[Recording], layout: Layout, measured: Sequence[str], most: int
 ) -> tuple[Search, Windows, Float[np.ndarray, "m k"]]:
-    """The windows of recordings, in double precision, and what is compared in them."""
+    """Return the windows of recordings, in double precision, and the quantities to compare."""
     physics = physics_of(field)
     commanded = isinstance(physics, Actuated)
     if volts := commanded and physics.reads_voltage:
@@ -164,16 +163,16 @@ def _search(
 def identify_in_turn(
     field: AbstractVectorField, recordings: Sequence[Recording], layout: Layout | None = None
 ) -> Identified:
-    """First what makes the thrust, from the accelerometer; then, given that, what turns the vehicle, from the gyro.
+    """Fit first the thrust to the accelerometer, then the torques to the gyro, given the thrust.
 
-    An error of the torques, such as the delay of a filtered gyro, then cannot bend the thrust curve and the lag. The
-    second intervals hold the uncertainty of the first. Where one of the two has no parameter or no sensor, this is
-    `identify`. Windows of forces are `FORCE_STEPS` times as long.
+    An error in the torques, for example the delay of a filtered gyro, then cannot bias the thrust curve and the lag.
+    The second intervals include the uncertainty of the first fit. If one of the two has no parameter or no sensor, you
+    get `identify`. Windows for the forces are `FORCE_STEPS` times as long.
 
     Args:
-        field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
-        recordings: of one vehicle; one or more.
-        layout: how they are cut into windows of torques, by default `Layout()`.
+        field: an `Actuated` field if the input is commands; any other field takes the measured rotor speeds.
+        recordings: one or more, of one vehicle.
+        layout: how they are cut into windows for the torques, by default `Layout()`.
     """
     layout = Layout() if layout is None else layout
     theta = {*dict(_names(field))}
@@ -196,13 +195,13 @@ def prediction_errors(
     layout: Layout | None = None,
     measured: Sequence[str] = (),
 ) -> dict[str, Float[np.ndarray, "n t k"]]:
-    """y − ŷ of every window, from the state that the samples before it tell; NaN where there is no y.
+    """Return y − ŷ of every window, from the state estimated from earlier samples; NaN where there is no y.
 
     Args:
-        field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
-        recordings: of one vehicle; one or more.
+        field: an `Actuated` field if the input is commands; any other field takes the measured rotor speeds.
+        recordings: one or more, of one vehicle.
         layout: how they are cut into windows, by default `Layout()`.
-        measured: quantities that are compared, by default all that every recording has.
+        measured: quantities to compare, by default all that every recording has.
     """
     layout = Layout() if layout is None else layout
     with jax.enable_x64(True):
@@ -213,10 +212,9 @@ def prediction_errors(
 
 
 def _telling(equations: NormalEquations, p: int, most: int, moves) -> Int[np.ndarray, " most"]:
-    """Which windows are fitted: half have the greatest leverage tr G⁻¹ Gᵢ, the others are spread evenly.
+    """Select the windows to fit: half have the greatest leverage tr G⁻¹ Gᵢ, the others are spread evenly.
 
-    Gᵢ is what a window tells at the start of the search, and G what all of them do, so a few seconds that alone tell a
-    parameter are among them. The others stand for the whole, which a model that is wrong should fit on average.
+    Gᵢ is the information of window i at the start of the search, and G their sum.
     """
     gram = masked(reduced(equations, p).equations, moves).gram
     leverage = jnp.einsum("pq,nqp->n", inverse(jnp.sum(gram, axis=0)).matrix, gram)
@@ -227,7 +225,7 @@ def _telling(equations: NormalEquations, p: int, most: int, moves) -> Int[np.nda
 
 
 def _whitened(search: Search, theta, own, between, root) -> Search:
-    """The search with errors weighted by what commands may have done between their samples."""
+    """Weight the search's errors by the possible effect of commands between their samples."""
     segments, (scale, dt) = search.segments._replace(whitening=None), (search.problem.scale, search.problem.dt)
     ways = slow_commands.bridges(between, dt * np.arange(segments.u.shape[2] + 1), root)
     r, along = effects(search.problem, search.model(theta), search.nodes(own)[0][:, 0], segments, ways)
@@ -245,7 +243,7 @@ def _whitened(search: Search, theta, own, between, root) -> Search:
 
 
 def _explained(search: Search, theta, own) -> np.ndarray:
-    """R² of each body rate over a window, of what is neither its start nor a constant acceleration; else 1."""
+    """Return R² of each body rate over a window, beyond its start and a constant acceleration; else 1."""
     if "rates" not in search.segments.y:
         return np.ones(3)
     error, y = np.asarray(search.predicted(theta, own).errors["rates"])[:, 0], search.segments.y["rates"][:, 0]
@@ -258,17 +256,14 @@ def _explained(search: Search, theta, own) -> np.ndarray:
 
 
 def _widened(name: str, interval: Interval, shares) -> Interval:
-    """An interval that holds both regressions, of torque on acceleration and the other way round.
-
-    Noise in the one that explains shrinks a coefficient, to R² of the other at most (Klepper and Leamer 1984).
-    """
+    """Widen an interval to both regressions, of torque on acceleration and the inverse (Klepper and Leamer 1984)."""
     value, low, high = map(np.asarray, interval)
     share = np.asarray(shares[AXES_OF[name]]) if name in AXES_OF else np.ones(())
     return Interval(value, low * share, np.divide(high, share, out=np.full((), np.inf), where=share > 0))
 
 
 def _names(field) -> list[tuple[str, str]]:
-    """Of each number of θ, the parameter that it belongs to, and its own name."""
+    """Return for each number of θ its parameter and its own name."""
     physics = physics_of(field)
     leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(physics, trainable(physics)))[0]
     named = [(jax.tree_util.keystr(path[-1:], simple=True), leaf.size) for path, leaf in leaves]
@@ -276,7 +271,7 @@ def _names(field) -> list[tuple[str, str]]:
 
 
 def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
-    """Which numbers of θ are fitted, and which are not of a velocity that no recording measures."""
+    """Return which numbers of θ are fitted; those of velocity are not if no recording measures one."""
     own = _names(field)
     for name in free or ():
         if name.partition("[")[0] not in dict(own):
@@ -287,7 +282,7 @@ def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) 
 
 
 def _covariance(equations: NormalEquations, cluster: int, moves, known, measurable) -> Array:
-    """The sandwich with windows clustered, and S C Sᵀ of known parameters with S = −H⁻¹ ∂g/∂known; ∞ of no effect."""
+    """The clustered sandwich, plus S C Sᵀ of known parameters with S = −H⁻¹ ∂g/∂known; ∞ if not identifiable."""
     gram = np.asarray(equations.gram.sum(axis=0))
     seen = (np.diagonal(gram) > NO_EFFECT) & moves & measurable
     found, both = np.zeros_like(gram), np.ix_(seen, seen)

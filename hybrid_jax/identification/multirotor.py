@@ -34,11 +34,11 @@ class Settled(Quantity):
 
 
 class Multirotor(eqx.Module):
-    """A body, its rotors' speeds where they lag, and a constant disturbance of v̇ and ω̇; methods of `StateSpaceModel`.
+    """A body, its rotors' speeds if they lag, and a constant disturbance of v̇ and ω̇, as a `StateSpaceModel`.
 
     Attributes:
         field: with the disturbance as a hidden part.
-        axes: of each quantity that is compared, which of its axes were measured.
+        axes: the measured axes of each compared quantity.
         ahead: intervals of inputs before a window, from which rotor speeds follow.
     """
 
@@ -52,7 +52,7 @@ class Multirotor(eqx.Module):
 
     @property
     def rotor_states(self) -> int:
-        """How many states of rotors follow those of the body."""
+        """The number of rotor states after those of the body."""
         body = self.field.field
         return body.rotor_states if isinstance(body, Actuated) else 0
 

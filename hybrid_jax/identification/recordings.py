@@ -1,4 +1,4 @@
-"""Windows of recordings, each with an estimate of its initial state from the samples before it."""
+"""Windows of recordings, each with an estimate of its initial state from earlier samples."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,10 +30,10 @@ class Layout:
     Attributes:
         dt: of the solver's steps and of the grid on which measurements are compared [s].
         steps: intervals of a window.
-        most: windows at most, spread evenly; of those that `identify` fits, half are those that tell most.
-        span: of the samples before a window that its initial state is estimated from [s].
-        disturbance: first guess of the standard deviation of a window's constant disturbances (6), 0 for none: along x,
-            y and z [m/s²], and about x, y and z [rad/s²].
+        most: windows at most, spread evenly; `identify` chooses half by their information.
+        span: duration of the samples before a window from which its initial state is estimated [s].
+        disturbance: initial standard deviation of a window's constant disturbances (6), 0 for none: along x, y and z
+            [m/s²], and about x, y and z [rad/s²].
 
     Raises:
         ValueError: a number out of range.
@@ -61,9 +61,9 @@ class Windows(NamedTuple):
     """n windows of t intervals.
 
     Attributes:
-        segments: their inputs and what was measured, one segment each.
-        centres: an estimate of the state in which each begins, without rotor speeds (n, 19).
-        spread: standard deviations of its error (n, 18); 0 of what is taken as exact.
+        segments: their inputs and measurements, one segment each.
+        centres: estimate of each initial state, without rotor speeds (n, 19).
+        spread: standard deviations of its error (n, 18); 0 if exact.
         between: intervals between samples of slow commands, from the first of a window's inputs on [s] (n, i, 2).
     """
 
@@ -76,16 +76,16 @@ class Windows(NamedTuple):
 def cut(
     recordings: Sequence[Recording], layout: Layout, told: str, measured: Sequence[str], most: int, volts: bool = False
 ) -> tuple[Windows, dict[str, tuple[int, ...]], Float[np.ndarray, "m k"]]:
-    """The windows in flight that no gap crosses, the axes of what is compared, and the root of `slow_commands`.
+    """Return windows in flight without gaps, the compared axes, and the root of `slow_commands`.
 
     Args:
         told: the quantity that is the field's input, "command" or "rotor_speed".
-        measured: what is compared, by default all of `MEASURED` that every recording has, but for the input.
+        measured: quantities to compare, by default all of `MEASURED` that every recording has, but for the input.
         most: windows at most, spread evenly.
         volts: whether the battery's voltage is the last input.
 
     Raises:
-        ValueError: a recording lacks a quantity, or no window is left: name and what was expected.
+        ValueError: a recording lacks a quantity, or no window is left, with name and what was expected.
     """
     found = [name for name in MEASURED if name != told and all(name in each.signals for each in recordings)]
     names = tuple(measured) or tuple(found)
@@ -111,7 +111,7 @@ def cut(
 
 
 def columns_of(name: str, recordings: Sequence[Recording]) -> tuple[int, ...]:
-    """Which axes of a quantity were measured; ValueError unless the recordings agree."""
+    """Return the measured axes of a quantity; ValueError unless the recordings agree."""
     axes = recordings[0].signals[name].axes
     for each in recordings:
         if each.signals[name].axes != axes:
@@ -121,7 +121,7 @@ def columns_of(name: str, recordings: Sequence[Recording]) -> tuple[int, ...]:
 
 
 def _starts(recording: Recording, layout: Layout, told: str, names) -> Float[np.ndarray, " n"]:
-    """When windows begin [s]: one after the other, where all of one, and of what comes before it, is in flight."""
+    """Return the start times of consecutive windows [s] that are in flight, together with their past."""
     signals, length, before = recording.signals, layout.dt * layout.steps, max(layout.span, WARM)
     first, last = (limit(signals[name].t[end] for name in (told, *names)) for limit, end in ((max, 0), (min, -1)))
     starts = np.arange(first + before, last - length, length)
@@ -148,7 +148,7 @@ def _windows(recording: Recording, layout: Layout, told: str, names, starts, mos
 
 
 def _clear(recording: Recording, told: str, names, begin, end) -> Bool[np.ndarray, " n"]:
-    """Whether each span is in flight and meets no gap."""
+    """Whether each span is in flight and without gaps."""
     flights = airborne(recording, told)
     clear = np.any([(begin >= first) & (end <= last) for first, last in flights] or [np.zeros(len(begin))], axis=0)
     for name in (told, *names):
@@ -162,9 +162,9 @@ def _at(signal: Signal, t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n k"]
 
 
 def on_grid(signal: Signal, t: Float[np.ndarray, "n t"], dt: float):
-    """The signal at times dt apart, and whether there is one: of a slow signal at the time nearest to each sample.
+    """Resample a signal at times dt apart, and return where it exists: a slow signal only at the nearest times.
 
-    A signal of more than two samples in dt is the mean over it, without delay; attitudes are never averaged.
+    A signal with more than two samples in dt is averaged over dt, without delay; attitudes are never averaged.
     """
     values, attitude = np.asarray(signal.values), set(signal.axes) == set(AXES["attitude"][0])
     if attitude:
@@ -184,11 +184,11 @@ def on_grid(signal: Signal, t: Float[np.ndarray, "n t"], dt: float):
 def initial_states(
     recording: Recording, starts: Float[np.ndarray, " n"], layout: Layout
 ) -> tuple[Float[np.ndarray, "n 13"], Float[np.ndarray, "n 12"]]:
-    """The state at each time and the standard deviations of its error, from samples up to that time.
+    """Estimate the state at each time, and the standard deviations of its error, from samples up to that time.
 
-    A quadratic is fitted to the samples of `layout.span` before it; velocity and rates that are not measured are the
-    slopes of position and attitude. What nothing measures is zero, with the deviations of `UNKNOWN`; unknown position
-    and heading are exact by choice of the origin.
+    A quadratic is fitted to the samples of `layout.span` before it; unmeasured velocity and rates are the slopes of
+    position and attitude. Other unmeasured states are zero with the deviations of `UNKNOWN`; unknown position and
+    heading are exact by choice of the origin.
     """
     n, signals = len(starts), recording.signals
     x, spread = np.zeros((n, STATE_SIZE)), np.zeros((n, RIGID_BODY_SPACE.tangent_size))
@@ -222,12 +222,12 @@ def _rotation(q) -> "scipy.spatial.transform.Rotation":
 
 
 def fitted(signal: Signal, starts: Float[np.ndarray, " n"], layout: Layout, numbers: Callable | None = None):
-    """Value (n, k), its standard deviation (k), slope and its deviation, of a quadratic through the samples before.
+    """Fit a quadratic to the last samples: value (n, k), its standard deviation (k), slope and its deviation.
 
-    They are those of `layout.span`, at least six, or as many as there are.
+    They are the samples of `layout.span`, at least six, or all if there are fewer.
 
     Args:
-        numbers: what stands for the samples of a slice of the signal (s, k), by default their values.
+        numbers: converts a slice of the signal to samples (s, k), by default their values.
     """
     found = []
     for t in starts:

@@ -1,13 +1,11 @@
-"""What commands may have done between two samples of a log that holds few of them.
+"""Weight errors by what slowly logged commands may have done between two samples.
 
-Between two samples a command is the line between them plus a Brownian bridge, with the covariance of the changes from
-sample to sample, here by its Karhunen–Loève series
+A command is the line between its samples plus a Brownian bridge (Karhunen–Loève series over an interval of T seconds)
 
     B(s) = √T L Σⱼ ξⱼ √2 sin(jπ s) / (jπ),   ξⱼ ~ N(0, 1),   L Lᵀ = cov(changes) / T,   0 ≤ s ≤ 1
 
-over an interval of T seconds. Predictions know the line only; what the bridge does to them is an error of covariance
-B Bᵀ, B = ∂ŷ/∂ξ, by which the errors of a window are weighted (generalised least squares). Fitted as unknowns, like an
-initial state, the ξ would favour vehicles that turn at smaller ξ: inertias come out too small.
+Predictions use the line; the bridge adds a covariance B Bᵀ, B = ∂ŷ/∂ξ, to the errors (generalised least squares).
+Fitted ξ would bias the inertias, since smaller ones need smaller ξ.
 """
 
 import numpy as np
@@ -26,12 +24,12 @@ def is_slow(signal: Signal) -> bool:
 
 
 def count(signal: Signal, length: float) -> int:
-    """How many intervals between samples may matter to a window of this length [s]; 0 of fast commands."""
+    """Return how many intervals between samples affect a window of this length [s]; 0 for fast commands."""
     return int(np.ceil((length + REACH) / signal.interval)) + 1 if is_slow(signal) else 0
 
 
 def root(signals: list[Signal]) -> Float[np.ndarray, "m m"]:
-    """L of the slow signals [1/√s]; 0 if there are none."""
+    """Return L of the slow signals [1/√s]; 0 if there are none."""
     m = signals[0].values.shape[1]
     slow = [each for each in signals if is_slow(each)]
     steps = [np.diff(each.values, axis=0) / np.sqrt(np.diff(each.t))[:, None] for each in slow]
@@ -48,16 +46,16 @@ def whitened(
     there: Bool[np.ndarray, "n r"],
     channel: Int[np.ndarray, " r"],
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, "n r r"]]:
-    """The noise of each channel beside what the bridges do, and the whitening W of each window: Wᵀ W = (1 + B Bᵀ)⁻¹.
+    """Return the noise of each channel without the bridges, and the whitening W of each window: Wᵀ W = (1 + B Bᵀ)⁻¹.
 
-    Errors and B are in units of the noise there. It is found by expectation maximisation (Dempster, Laird and Rubin
+    Errors and B are in units of the noise there, which is found by expectation maximisation (Dempster, Laird and Rubin
     1977).
 
     Args:
         r: the errors of n windows.
         effects: ∂r/∂ξ.
         there: which were measured.
-        channel: to which channel of a sensor each belongs.
+        channel: the sensor's channel of each error.
     """
     noise = np.ones(channel.max() + 1)
     precision, counts = _precision(effects, noise[channel]), np.bincount(channel, there.sum(axis=0))
@@ -75,7 +73,7 @@ def _precision(b: Float[np.ndarray, "n r u"], unit: Float[np.ndarray, " r"]) -> 
 
 
 def spans(signal: Signal, begin: Float[np.ndarray, " n"], end: Float[np.ndarray, " n"], most: int):
-    """The last intervals between samples before each end, from its begin on [s] (n, most, 2); of a fast signal none."""
+    """Return the last intervals between samples from each begin to its end [s] (n, most, 2); none for a fast signal."""
     if not is_slow(signal):
         return np.zeros((len(end), most, 2))
     last = np.searchsorted(signal.t, end)[:, None] - np.arange(most)
@@ -85,7 +83,7 @@ def spans(signal: Signal, begin: Float[np.ndarray, " n"], end: Float[np.ndarray,
 def bridges(
     spans: Float[np.ndarray, "n i 2"], edges: Float[np.ndarray, " k"], root: Float[np.ndarray, "m w"]
 ) -> Float[np.ndarray, "n j k-1 m"]:
-    """The mean over each interval between `edges` [s] of every term of the bridges over spans."""
+    """Return the mean over each interval between `edges` [s] of every term of the bridges over spans."""
     begin, length = spans[..., :1], np.diff(spans)
     s = np.clip((edges - begin) / np.where(length > 0, length, 1.0), 0.0, 1.0)
     waves = np.pi * np.arange(1, MODES + 1)

@@ -1,4 +1,4 @@
-"""Plan the experiment that tells parameters best, before it is made: `excitation`."""
+"""Plan the most informative experiment before you fly it: `excitation`."""
 
 from hybrid_jax.planning.input_designs import FlightBounds, InputBounds
 from hybrid_jax.planning.optimal_design import Excitation, excitation

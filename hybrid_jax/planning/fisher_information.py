@@ -1,4 +1,4 @@
-"""What a planned trajectory will tell of the parameters: the covariance of least squares, before any flight."""
+"""Predict the least-squares covariance of the parameters for a planned trajectory."""
 
 from typing import NamedTuple
 
@@ -24,10 +24,7 @@ class Information(NamedTuple):
     noise: Float[Array, "p p"]
 
     def covariance(self, free: Bool[Array, " p"]) -> Float[Array, "p p"]:
-        """The covariance of θ_p by least squares on the free parameters, zero for the others.
-
-        The variance is infinite of parameters that the trajectory does not tell apart.
-        """
+        """The covariance of the free parameters by least squares, infinite if not identifiable; zero for the others."""
         both = free & free[:, None]
         bread, told, _ = inverse(jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0))))
         return bread @ jnp.where(both, self.noise, 0.0) @ bread + jnp.diag(jnp.where(told, 0.0, jnp.inf))
@@ -42,10 +39,9 @@ def information_of(
     noise: Float[Array, " d"],
     solver: Solver = None,
 ) -> Information:
-    """The information in a trajectory, cut into windows of `steps` intervals; what is left at its end is not used.
+    """Return the information in a trajectory, cut into windows of `steps` intervals; the remainder is not used.
 
-    Windows touch, and each is compared with a rollout from its first sample. So the noise of a first sample acts on the
-    whole window, and that of a sample that two windows share on both.
+    Each window is a rollout from its first sample, whose noise acts on the whole window and on the previous one.
 
     Args:
         x: the true states, one before each interval of `dt` [s] and one after the last.

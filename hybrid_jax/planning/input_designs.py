@@ -1,8 +1,7 @@
-"""Trajectories as functions of the coefficients of Fourier series, and how much of each limit they use.
+"""Trajectories from Fourier series, and their use of each limit.
 
-Of a multirotor the series are its flat outputs, position and yaw, from which states and rotor speeds follow (Mellinger
-and Kumar, "Minimum snap trajectory generation and control for quadrotors", 2011). Of any other system they are its
-inputs, squashed into their limits, and the states follow from the model.
+A multirotor's series are its flat outputs, position and yaw (Mellinger and Kumar 2011). For any other system they are
+its inputs, squashed into their limits.
 """
 
 import math
@@ -34,15 +33,15 @@ SMOOTH = np.polynomial.Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])
 
 @dataclass(frozen=True)
 class FlightBounds:
-    """The box that a multirotor stays in, and how hard it flies there.
+    """The box and the limits of a multirotor's flight.
 
     Attributes:
         low: corner of the box with the least x, y and z [m]; z points up.
         high: the opposite corner [m].
         speed: highest speed [m/s].
         tilt: largest angle between thrust and the vertical [rad], below π/2.
-        yaw: largest heading either way of 0 [rad].
-        rotor_speed: least and most that a rotor may turn, as shares of the vehicle's highest speed.
+        yaw: largest heading either side of 0 [rad].
+        rotor_speed: lowest and highest rotor speed, as shares of the vehicle's highest speed.
 
     Raises:
         ValueError: an empty box, a limit that is not positive, or a tilt or share out of its range.
@@ -68,14 +67,14 @@ class FlightBounds:
 
 @dataclass(frozen=True)
 class InputBounds:
-    """The limits of any system's inputs, where it starts, and the box that its states stay in, by default none.
+    """The limits of any system's inputs, its first state, and optionally a box for its states.
 
     Attributes:
-        low: the least that each of the m inputs may be, in its own unit.
-        high: the most that each input may be.
+        low: lower limit of each of the m inputs, in its own unit.
+        high: upper limit of each input.
         start: the d numbers of the first state.
-        state_low: the least that each of the d states may be; None for no box. Given together with `state_high`.
-        state_high: the most that each state may be; None for no box.
+        state_low: lower limit of each of the d states; None for no box. You must set it together with `state_high`.
+        state_high: upper limit of each state; None for no box.
 
     Raises:
         ValueError: an empty box, or tuples of different lengths.
@@ -124,7 +123,7 @@ class FlatOutputs(eqx.Module):
         return 4, self.harmonics, 2
 
     def unit(self) -> Float[np.ndarray, "4 harmonics 1"]:
-        """The amplitude that alone would use up the box, the tilt, or the thrust that the rotors' range leaves."""
+        """The amplitude that uses up the box, the tilt, or the thrust within the rotors' range."""
         vehicle, bounds = self.vehicle, self.bounds
         least, most = (share * vehicle.max_rotor_speed for share in bounds.rotor_speed)
         thrust = vehicle.thrust_coefficient * (most**2 - least**2) / 2  # of each rotor, either way [N]
@@ -150,7 +149,7 @@ class FlatOutputs(eqx.Module):
         return path
 
     def trajectory(self, coefficients: Coefficients, model: AbstractVectorField) -> Trajectory:
-        """Reference states, and the rotor speeds of a rigid body that follows them, without drag."""
+        """Return reference states, and the rotor speeds of a rigid body that follows them without drag."""
         times = self.dt * np.arange(round(self.seconds / self.dt) + 1)
         place, q, velocity, rates = self._moving(coefficients, times)[:4]
         states = jnp.concatenate([place[:, :3], q, velocity[:, :3], rates], axis=1)
@@ -160,7 +159,7 @@ class FlatOutputs(eqx.Module):
         return states, jnp.where(squares < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(jnp.abs(squares), 1.0))
 
     def _moving(self, coefficients: Coefficients, times: Float[np.ndarray, " n"]) -> list[Array]:
-        """Flat outputs, attitude, their slope, body rates, specific force, and the slope of the body rates."""
+        """Return flat outputs, attitude, its slope, body rates, specific force, and the slope of the body rates."""
         amplitudes = (coefficients * self.unit()).reshape(4, -1)
         basis = _derivatives(times, self.seconds, self.harmonics)
         flat, slope, *others = (jnp.asarray(each, amplitudes.dtype) @ amplitudes.T for each in basis)
@@ -168,7 +167,7 @@ class FlatOutputs(eqx.Module):
         lift = others[0][:, :3] + self.vehicle.gravity * np.eye(3, dtype=flat.dtype)[2]
 
         def turned(lift, jerk, snap, yaw):
-            """Attitude, body rates and their slope, of thrust and yaw as polynomials of time."""
+            """Return attitude, body rates and their slope from thrust and yaw as polynomials of time."""
 
             def attitude(s):
                 return attitude_along(lift + jerk * s + snap * s**2 / 2, yaw[0] + yaw[1] * s + yaw[2] * s**2 / 2)
@@ -187,14 +186,14 @@ class FlatOutputs(eqx.Module):
     def _squares(
         self, rates: Float[Array, "n 3"], lift: Float[Array, "n 3"], turning: Float[Array, "n 3"]
     ) -> Float[Array, "n rotors"]:
-        """The squared rotor speeds that give a specific force and a slope of the body rates; negative where none do."""
+        """Return squared rotor speeds for a specific force and a slope of the body rates; negative if infeasible."""
         vehicle, inertia = self.vehicle, np.array(self.vehicle.inertia, np.float32)
         torque = inertia * turning + jnp.cross(rates, inertia * rates)
         thrust = vehicle.mass * jnp.linalg.norm(lift, axis=1, keepdims=True)
         return jnp.concatenate([thrust, torque], axis=1) @ jnp.asarray(np.linalg.pinv(vehicle.mixer).T, lift.dtype)
 
     def uses(self, x: Float[Array, "n+1 13"], u: Float[Array, "n rotors"]) -> Float[Array, "n limits"]:
-        """How much of each limit of `names` is used over time; 1 is all of it."""
+        """Return the used fraction of each limit of `names` over time."""
         bounds, x = self.bounds, x[1:]
         low, high = np.array(bounds.low), np.array(bounds.high)
         place = jnp.abs(x[:, POSITION] - (low + high) / 2) / ((high - low) / 2)
@@ -208,7 +207,7 @@ class FlatOutputs(eqx.Module):
 
 
 class InputSeries(eqx.Module):
-    """Inputs between their limits, as tanh of a Fourier series, whose large coefficients switch between the two."""
+    """Inputs as tanh of a Fourier series between their limits; large coefficients switch between the two."""
 
     bounds: InputBounds = eqx.field(static=True)
     seconds: float = eqx.field(static=True)
@@ -234,13 +233,13 @@ class InputSeries(eqx.Module):
         return inputs
 
     def trajectory(self, coefficients: Coefficients, model: AbstractVectorField) -> Trajectory:
-        """The inputs in the middle of each interval, and the states that the model predicts."""
+        """Return the inputs in the middle of each interval, and the predicted states."""
         middles = self.dt * (jnp.arange(round(self.seconds / self.dt)) + 0.5)
         u, start = jax.vmap(self.path(coefficients))(middles), jnp.asarray(self.bounds.start, float)
         return jnp.concatenate([start[None], rollout(model, start, u, self.dt)]), u
 
     def uses(self, x: Float[Array, "n+1 d"], u: Float[Array, "n m"]) -> Float[Array, "n limits"]:
-        """How much of the box each state uses over time; 1 is all of it."""
+        """Return the used fraction of each state's box over time."""
         if self.bounds.state_low is None or self.bounds.state_high is None:
             return jnp.zeros((len(u), 0), x.dtype)
         low, high = np.array(self.bounds.state_low), np.array(self.bounds.state_high)
@@ -256,7 +255,7 @@ def _series(amplitudes: Coefficients, t: Scalar, seconds: float) -> Float[Array,
 
 
 def _derivatives(times: Float[np.ndarray, " n"], seconds: float, harmonics: int) -> list[Float[np.ndarray, "n k"]]:
-    """The ramped series' sines and cosines at some times, k = 2 harmonics, and their derivatives up to the fourth."""
+    """Return sines and cosines of the ramped series, k = 2 harmonics, and their derivatives up to the fourth."""
     rates = 2 * np.pi / seconds * np.arange(1, harmonics + 1)
     up, down = times / RAMP, (seconds - times) / RAMP
     ramps = [

@@ -1,8 +1,5 @@
-"""The experiment that tells the parameters best: a D-optimal reference or input inside limits.
-
-D-optimal: the smallest volume of the parameters' confidence ellipsoid (Fedorov, Theory of Optimal Experiments, 1972;
-Mehra, "Optimal input signals for parameter estimation in dynamic systems", IEEE TAC 1974; as Fourier series within
-limits Swevers, Ganseman, Tükel, De Schutter and Van Brussel, "Optimal robot excitation and identification", 1997).
+"""D-optimal references or inputs within limits: the smallest confidence ellipsoid of the parameters (Fedorov, Theory of
+Optimal Experiments, 1972; Mehra, IEEE TAC 1974; as Fourier series Swevers et al. 1997).
 """
 
 import math
@@ -52,14 +49,14 @@ class Excitation:
     """The result of `excitation`: a plan of n intervals.
 
     Attributes:
-        reference: function of time t [s] that gives position [m] and yaw [rad] of a multirotor, else the inputs.
+        reference: function of time t [s] that returns position [m] and yaw [rad] of a multirotor, else the inputs.
         t: times of the states [s], from 0.
         states: planned states at these times.
         inputs: planned inputs, each held over an interval; rotor speeds [rad/s] of a multirotor.
-        parameters: names of the q parameters that were asked for and that the inputs excite.
-        information: inverse covariance of these, in the physics' own parametrisation, the others being unknown too.
-        standard_errors: predicted, of all that were asked for, in the units of `intervals`; infinite if not excited.
-        margins: least share of each limit that is left, by the limit's name; 0 where all of it is used.
+        parameters: names of the q requested parameters that the inputs excite.
+        information: their inverse covariance in the physics' own parametrisation, with the others unknown.
+        standard_errors: predicted for all requested parameters, in the units of `intervals`; infinite if not excited.
+        margins: least unused share of each limit, by the limit's name; 0 if all of it is used.
     """
 
     reference: Callable[..., Any]
@@ -92,31 +89,30 @@ def excitation(
     steps: int = 200,
     seed: int = 0,
 ) -> Excitation:
-    """Find the flight, or the inputs, whose data tell parameters best.
+    """Design the most informative flight, or inputs, for estimating parameters.
 
-    Maximised is log det of the inverse covariance of `parameters` that `fit_least_squares(…, scale=noise)` will have on
-    windows of the flight. All other parameters of the model's physics are fitted, too: with
-    `with_disturbance(model)`, an unknown constant force and torque. Adam from random series; a series that leaves the
-    limits is shrunk until it keeps them, so the result keeps them and tells no less than any start.
-
-    The vehicle need not follow the reference exactly: what it tells is computed from the plan.
+    It maximises log det of the inverse covariance of `parameters` that `fit_least_squares(…, scale=noise)` will have on
+    windows of the flight. All other parameters of the model's physics are unknown as well: with
+    `with_disturbance(model)`, also a constant force and torque. Adam improves random series; a series outside the
+    limits is shrunk, so the result satisfies them and is at least as informative as any start. Note that the
+    prediction uses the plan, which the vehicle need not follow exactly.
 
     Args:
-        model: of a multirotor with `FlightBounds`, else any field with `InputBounds`, at a guess of its parameters.
+        model: a multirotor with `FlightBounds`, else any field with `InputBounds`, with a guess of its parameters.
         parameters: names as in `intervals`; by default all but a disturbance.
-        bounds: limits that the plan keeps.
+        bounds: limits of the plan.
         seconds: duration of the plan [s].
-        noise: standard deviation of each state's white noise; by default that of motion capture for a multirotor.
+        noise: standard deviation of each state's white noise; by default typical of motion capture for a multirotor.
         window: length of the windows [s], a multiple of `dt`.
         dt: interval between samples, over which an input is held [s].
         bandwidth: highest frequency of the series [Hz].
-        starts: random series to start from, of which the best end is kept.
+        starts: number of random series to start from; the best result is returned.
         steps: of Adam.
         seed: of the random series.
 
     Raises:
-        ValueError: an unknown parameter, bounds of the wrong kind, limits that not even rest keeps, or parameters that
-            no start tells apart. A parameter that nothing excites is a warning that names it.
+        ValueError: an unknown parameter, bounds of the wrong kind, limits that rest violates, or parameters that
+            no start distinguishes. A parameter that no input excites causes a warning with its name.
     """
     design = _design(model, bounds, seconds, window, dt, bandwidth)
     for name, value in (("starts", starts), ("steps", steps)):
@@ -151,7 +147,7 @@ class _Search(eqx.Module):
         return information_of(self.model, x, u, self.design.dt, self.window, self.noise)
 
     def value(self, x, u, asked: Bool[Array, " p"], seen: Bool[Array, " p"]) -> Float[Array, ""]:
-        """log det of the inverse covariance of the parameters asked for, over their number."""
+        """Return log det of the inverse covariance of the requested parameters, over their number."""
         covariance = self.information(x, u).covariance(seen)
         size = jnp.sqrt(jnp.where(asked, jnp.diagonal(covariance), 1.0))
         scaled = jnp.where(asked & asked[:, None], covariance / (size * size[:, None]), jnp.eye(len(size)))
@@ -159,7 +155,7 @@ class _Search(eqx.Module):
 
     @eqx.filter_jit
     def kept(self, coefficients: Coefficients) -> Coefficients:
-        """The series shrunk until it keeps the limits."""
+        """Shrink the series into the limits."""
 
         def keeps(factor):
             uses = self.design.uses(*self.planned(factor * coefficients))
@@ -170,7 +166,7 @@ class _Search(eqx.Module):
 
     @eqx.filter_jit
     def values(self, found: Starts, asked, seen) -> Float[Array, " s"]:
-        """What each series tells once it keeps the limits, −∞ if nothing finite."""
+        """Return the information of each series within the limits, −∞ if not finite."""
 
         def one(coefficients):
             value = self.value(*self.planned(self.kept(coefficients)), asked, seen)
@@ -181,7 +177,7 @@ class _Search(eqx.Module):
     # Equinox passes the options to jax.jit, but does not declare them.
     @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
     def improved(self, begun: Starts, asked, seen, steps: int) -> Starts:
-        """The series after some steps of Adam."""
+        """Improve the series by some steps of Adam."""
 
         def loss(coefficients, penalty):
             x, u = self.planned(coefficients)
@@ -261,7 +257,7 @@ def _begun(search: _Search, starts: int, seed: int) -> Starts:
 
 
 def _excited(search: _Search, begun, wanted: tuple[str, ...]) -> tuple[Bool[Array, " p"], Bool[Array, " p"]]:
-    """Which parameters are asked for and which have an effect, with a warning for those that are not both."""
+    """Return which parameters are requested and which have an effect; warn about those that are not both."""
     names = list(named_parameters(search.model))
     found = [search.planned(one) for one in begun]
     each = [search.information(*flown) for flown in found]

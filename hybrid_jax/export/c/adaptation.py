@@ -1,4 +1,4 @@
-"""The step of an `OnlineAdaptation` as C99: its state is an array, as `ravel_pytree` makes one."""
+"""The step of an `OnlineAdaptation` as C99, with its state as an array of `ravel_pytree`."""
 
 import re
 from collections.abc import Callable
@@ -82,17 +82,17 @@ def export_adaptation_c(
     state_size: Size = None,
     input_size: Size = None,
 ) -> tuple[Path, Path]:
-    """Write NAME.h and NAME.c: NAME_begin and NAME_update of an `OnlineAdaptation`, as its methods.
+    """Write NAME.h and NAME.c: NAME_begin and NAME_update of an `OnlineAdaptation`, like its methods.
 
-    Errors as of `export_c`.
+    It raises the errors of `export_c`.
 
     Args:
-        folder: where the files are written; it is made if there is none.
+        folder: where the files are written; it is created if it does not exist.
         adaptation: an `OnlineAdaptation`.
-        name: as of `export_c`, like `double`, `state_size` and `input_size`.
+        name: prefix of the files and definitions, see `export_c`.
         double: compute in double precision, else in single.
-        state_size: d; by default what the filter's field knows.
-        input_size: m; likewise.
+        state_size: d; by default from the filter's field.
+        input_size: m; by default from the filter's field.
 
     Returns:
         The paths of the header and of the source.
@@ -132,12 +132,12 @@ def export_adaptation_c(
 
 
 def _in_turn(one: Callable) -> Callable:
-    """As `jax.vmap`, but a loop, which keeps C small."""
+    """Replace `jax.vmap` by a loop, which makes the C code small."""
     return lambda *stacked: jax.lax.map(lambda row: one(*row), stacked)
 
 
 def _parts(adaptation: Any, state: Any) -> dict[str, Any]:
-    """Where what lies in the state, in words."""
+    """Describe the layout of the state in words."""
     places, at = [], 0
     for path, value in jax.tree_util.tree_leaves_with_path(state):
         places.append((jax.tree_util.keystr(path, simple=True, separator="."), at, value.size))
@@ -151,5 +151,5 @@ def _parts(adaptation: Any, state: Any) -> dict[str, Any]:
 
 
 def _plain(name: str) -> str:
-    """A name of a model file as it may stand in a comment, which it cannot end."""
+    """Replace characters of a name that could end a comment."""
     return re.sub(r"[^A-Za-z0-9_.\[\]]", "_", name)

@@ -37,25 +37,25 @@ def export_c(
 ) -> tuple[Path, Path]:
     """Write NAME.h and NAME.c: ẋ = f(x, u) in inference mode, a step of RK4 over dt [s], and the Jacobians of both.
 
-    The functions are NAME_derivative, NAME_step, NAME_derivative_jacobian and NAME_step_jacobian; the header says what
-    they take. They are C99, use the stack alone, and may be called from several threads.
+    The functions are NAME_derivative, NAME_step, NAME_derivative_jacobian and NAME_step_jacobian; the header describes
+    their arguments. They are C99, use only the stack, and you can call them from several threads.
 
     Args:
-        folder: where the files are written; it is made if there is none.
-        field: ẋ = f(x, u), of one state x (d,) and one input u (m,).
+        folder: where the files are written; it is created if it does not exist.
+        field: ẋ = f(x, u), for one state x (d,) and one input u (m,).
         dt: length of a step [s].
-        name: of the files and, as a prefix, of all that the header defines; a lower-case C identifier.
+        name: of the files and, as a prefix, of all definitions in the header; a lower-case C identifier.
         double: compute in double precision, else in single.
-        smooth: as of `casadi_function`.
-        state_size: d; by default that of the field's vehicle or, failing that, its attribute of this name.
-        input_size: m; likewise.
+        smooth: see `casadi_function`.
+        state_size: d; by default from the field's vehicle or its attribute of this name.
+        input_size: m; by default from the field's vehicle or its attribute of this name.
 
     Returns:
         The paths of the header and of the source.
 
     Raises:
-        ValueError: unknown sizes, a field that does not accept such x and u, an operation that is not known in C, by
-            its name, or a name that is no identifier.
+        ValueError: unknown sizes, a field that does not accept such x and u, an operation without C code, by
+            its name, or a name that is not an identifier.
         OSError: the folder cannot be written.
     """
     checks.positive("dt", dt, "a positive number of seconds")
@@ -80,7 +80,7 @@ def export_c(
 
 
 def check_name(name: str) -> None:
-    """ValueError if files and functions of C cannot have this name."""
+    """Raise ValueError if C files and functions cannot have this name."""
     # math.h is the one header that a source includes.
     if not isinstance(name, str) or not re.fullmatch("[a-z][a-z0-9_]*", name) or name == "math":
         raise ValueError(f"name must be a lower-case C identifier, got {checks.short_repr(name)}")
@@ -95,7 +95,7 @@ def written(folder: str | Path, name: str, header: str, source: str, parts: Mapp
 
 
 def _with_slopes(field: AbstractVectorField, x, u):
-    """ẋ, and its Jacobian in x and u (d × (d + m))."""
+    """Return ẋ and its Jacobian in x and u (d × (d + m))."""
     directions = jnp.eye(len(x) + len(u))
     return as_field(field).linearize(x, u, directions[: len(x)], directions[len(x) :])
 
@@ -103,7 +103,7 @@ def _with_slopes(field: AbstractVectorField, x, u):
 def body_of(
     function: Callable, likes, tables: Tables, outputs: tuple[str, ...], inputs: tuple[str, ...] = ("x", "u")
 ) -> tuple[Statement, ...]:
-    """The statements of a C function of some arrays, x and u by default, that fills others."""
+    """Return the statements of a C function from arrays, by default x and u, to output arrays."""
     translation = CTranslation(tables)
     pairs = zip(inputs, likes, strict=True)
     arguments = [Entries(column(Entry(name, i) for i in range(like.size)), like.shape) for name, like in pairs]
@@ -112,7 +112,7 @@ def body_of(
 
 
 def _about(is_multirotor: bool, smooth: float | None) -> str:
-    """What x and u are, as lines of a comment."""
+    """Describe x and u as lines of a comment."""
     lines = []
     if is_multirotor:
         lines = [

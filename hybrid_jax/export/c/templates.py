@@ -1,4 +1,4 @@
-"""The text of the header and of the source that `export_c` writes; places are those of `string.Template`."""
+"""The text of the header and of the source of `export_c`, as `string.Template`."""
 
 HEADER = """\
 /* A model dx/dt = f(x, u), written by hybrid_jax.
