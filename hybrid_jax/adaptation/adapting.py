@@ -49,9 +49,9 @@ NAMED = 50  # physics with more parameters is a network, and its weights are not
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; are dt and all units right?"
 NOT_FITTED = "no parameter was fitted"
-NO_MOTION = "field: it does not say what it learned from, and all its errors count as changes: pass learned_from="
-FEW = "windows: {} do not determine {} parameters; where they tell nothing the source stays"
-OVERLAP = "windows overlap: blocks left out share samples with the others, so the errors to expect are too small"
+NO_MOTION = "field: its training windows are unknown, so all its errors count as changes; pass learned_from="
+FEW = "windows: {} do not determine {} parameters; the others stay at the source's values"
+OVERLAP = "windows overlap: left-out blocks share samples with the others, so the expected errors are too small"
 
 METHODS: Mapping[str, Method] = {
     "auto": Auto(),
@@ -157,18 +157,16 @@ class Adaptation:
             found = ", ".join(f"{name} {share:.2g}" for name, share in known if share >= SHOWN)
             lines.append(f"Chosen: {self.chosen}. Probability of each change: {found}.")
         if self.alone:
-            lines.append("Physics without the network predicts the source's own motion better and takes its place.")
+            lines.append("Physics without the network predicts the source's own motion better and replaces the source.")
         if self.refused:
             names = ", ".join(self.refused)
-            lines.append(f"Refused: {names}: the source may err as much where nothing has changed.")
+            lines.append(f"Refused: {names}: the source's own errors may be as large without any change.")
         if self.expected:
-            lines.append("RMSE to expect on a flight not seen (80% intervals, from blocks left out of these windows):")
+            lines.append("Expected RMSE on an unseen flight (80% intervals, from left-out blocks of these windows):")
             lines += lines_of(self.expected, self.units)
         for name, share in self.outside.items():
             if share > WARN:
-                lines.append(
-                    f"Warning: {name} is outside of what the source learned from in {share:.0%} of the samples."
-                )
+                lines.append(f"Warning: {name} is outside the source's training range in {share:.0%} of the samples.")
         if self.parameters:
             note = f"{self.level:.0%} confidence intervals" if self.without_intervals is None else "no intervals"
             width = max(map(len, self.parameters))
@@ -178,7 +176,7 @@ class Adaptation:
             rest = [name for name in self.parameters if name not in told]
             if rest and self.chosen is not None:
                 names = f"{', '.join(told) or 'no parameter'}, and not {', '.join(rest)}"
-                lines.append(f"These windows tell {names}; hj.excitation plans a flight that does.")
+                lines.append(f"These windows identify {names}; hj.excitation plans a flight for all of them.")
             if unseen := [name for name, one in self.parameters.items() if one.high == np.inf]:
                 names = ", ".join(unseen)
                 lines.append(f"Warning: these windows do not determine {names}: other values fit them as well.")
@@ -319,7 +317,7 @@ def _split(windows: Trajectories, validation: Trajectories | None, needed: bool)
     if validation is not None or not needed:
         return windows, windows if validation is None else validation
     if len(windows) < 2:
-        raise ValueError("windows: one is too few to hold some out; pass validation=")
+        raise ValueError("windows must be at least two to hold one out, got 1; pass validation=")
     last = len(windows) - max(1, len(windows) // HELD_OUT)
     return windows[:last], windows[last:]
 

@@ -171,7 +171,7 @@ def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int]:
     single = all(value.dtype == np.float32 for value in (x, u, result))
     trees = (exported.in_tree, exported.out_tree) == tuple(map(jax.tree.structure, (((0, 0), {}), 0)))
     if not (fits and single and trees):
-        raise ValueError(f"it maps {exported.in_avals} to {exported.out_avals}")
+        raise ValueError(f"the program maps {exported.in_avals} to {exported.out_avals}")
     return batched, int(d), int(m)
 
 

@@ -212,7 +212,7 @@ def _design(model, bounds, seconds: float, window: float, dt: float, bandwidth: 
     parts = jax.tree.leaves(model, is_leaf=lambda node: isinstance(node, RigidBody))
     bodies = [part for part in parts if isinstance(part, RigidBody)]
     if not bodies or state_space(model) != RIGID_BODY_SPACE:
-        raise ValueError("bounds must be InputBounds, as the model is no multirotor that is told its rotor speeds")
+        raise ValueError("bounds must be InputBounds, as the model is not a multirotor with rotor speeds as inputs")
     vehicle = bodies[0].vehicle
     least, most = bounds.rotor_speed
     if not least < vehicle.hover_speed / vehicle.max_rotor_speed < most or vehicle.rotors < 4:
@@ -275,7 +275,7 @@ def _excited(search: _Search, begun, wanted: tuple[str, ...]) -> tuple[Bool[Arra
     values, vectors = np.linalg.eigh(grams / (sizes[:, :, None] * sizes[:, None]))
     if not (values[:, 0] > TOLD_APART).any():
         alike = [name for name, share in zip(names, np.abs(vectors[0, :, 0]), strict=True) if share > 0.3]
-        raise ValueError(f"parameters: no input tells {' and '.join(alike)} apart; learn one of them")
+        raise ValueError(f"parameters: no input distinguishes {' and '.join(alike)}; learn one of them")
     return asked, seen
 
 

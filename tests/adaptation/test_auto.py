@@ -95,7 +95,7 @@ def test_windows_of_many_flights_are_not():
 
 
 def test_windows_that_overlap_are_adapted_to_with_a_warning():
-    with pytest.warns(UserWarning, match="windows overlap: blocks left out share samples"):
+    with pytest.warns(UserWarning, match="windows overlap: left-out blocks share samples"):
         adapt(pendulum(0.7), flight(5, 2)[:40], method="source")
 
 

@@ -72,7 +72,7 @@ def test_errors_after_windows_that_touch_are_those_of_one_long_prediction():
 
 def test_a_report_says_what_to_expect():
     found = hj.adapt(hybrid(), flown(hybrid(LENGTH)))
-    assert "RMSE to expect on a flight not seen (80% intervals" in found.report()
+    assert "Expected RMSE on an unseen flight (80% intervals" in found.report()
     rmse, _, _ = found.expected["0.4 s"]["x[0]"]
     other = flown(hybrid(LENGTH), seed=5)
     errors = hj.rollout_batch(found.field, other.x0, other.u, other.dt)[:, -1] - other.x[:, -1]
@@ -88,4 +88,4 @@ def test_a_flight_unlike_those_learned_from_is_named():
     other = hj.adapt(hybrid(), fast, method="source", learned_from=slow)
     assert other.outside["x[1]"] > 0.3
     assert other.outside["u[0]"] < 0.03
-    assert "Warning: x[1] is outside of what the source learned from" in other.report()
+    assert "Warning: x[1] is outside the source's training range" in other.report()

@@ -99,7 +99,7 @@ def test_a_parameter_that_nothing_excites_is_named():
     ("change", "said"),
     [
         ({"parameters": ("d",)}, r"parameters must be names of b, got \('d',\)"),
-        ({"model": Doubled(jnp.array(1.0), jnp.array(2.0))}, "no input tells a and b apart"),
+        ({"model": Doubled(jnp.array(1.0), jnp.array(2.0))}, "no input distinguishes a and b"),
         ({"bounds": hj.FlightBounds()}, "bounds must be InputBounds"),
         ({"bounds": hj.InputBounds((-1.0,), (1.0,), (2.0,), (-1.0,), (1.0,))}, "x0 leaves its limits even at rest"),
         ({"noise": None}, "noise must be given"),
