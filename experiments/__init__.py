@@ -1,10 +1,10 @@
-"""The experiments: programs that are started as `python -m experiments.NAME`."""
+"""The experiments: programs that you start with `python -m experiments.NAME`."""
 
 import sys
 
 
 def _say_in_a_line(kind, error, trace) -> None:
-    """Ctrl-C while modules load, before a program can say so itself."""
+    """Report Ctrl-C while modules load, before a program can."""
     if issubclass(kind, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)
     else:

@@ -1,4 +1,4 @@
-"""What there is to run: python -m experiments."""
+"""List all experiments: python -m experiments."""
 
 import ast
 from pathlib import Path
@@ -7,7 +7,7 @@ RUN = 'if __name__ == "__main__":'
 
 
 def main() -> None:
-    """Print a line for each program: its command, and what it is."""
+    """Print each program's command and purpose."""
     folder = Path(__file__).parent
     for path in sorted(folder.rglob("*.py")):
         source, name = path.read_text(), ".".join(path.relative_to(folder).with_suffix("").parts)

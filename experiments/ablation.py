@@ -49,9 +49,9 @@ Choice = Literal["residual", "weight", "form", "norm", "start", "source", "noise
 
 @dataclass(frozen=True)
 class AblationConfig(Config):
-    """Change one choice of the hybrid at a time; pre-train, fine-tune, test in both experiments.
+    """Change one choice of the hybrid at a time; pre-train, fine-tune and test in both experiments.
 
-    Without options: 3000 source trajectories, a third of the paper's, at most 400 epochs, and N = 100.
+    Defaults: 3000 source trajectories, a third of the paper's, at most 400 epochs, and N = 100.
     """
 
     over: tuple[Choice, ...] = get_args(Choice)
@@ -79,7 +79,7 @@ PRESETS = {
 
 
 def varied(choice: str, config: Kind) -> dict[str, Kind]:
-    """Name of each value of a choice → the configuration with it; the default's is the configuration itself."""
+    """Map the name of each value of a choice to its configuration."""
     seen = {"all": "all of x", "no_xy": "no p_x, p_y", "body": "seen from the body"}
     added = {"all": "all 13", "accelerations": "v̇, ω̇"}
     low, high = config.guess
@@ -119,7 +119,7 @@ def experiment(config: AblationConfig, console: Console) -> None:
 
 
 def run(config: AblationConfig, stages: Stages) -> Results:
-    """The rows of the hybrid, pre-trained and fine-tuned in a configuration."""
+    """Return the rows of the hybrid, pre-trained and fine-tuned, in a configuration."""
     learned = pretrained(HYBRID, IRIS, config, stages, flown(SOURCE, source_splits(config), config, stages))
     rows = Results()
     for domain in DOMAINS:
@@ -130,7 +130,7 @@ def run(config: AblationConfig, stages: Stages) -> Results:
 
 
 def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> None:
-    """Write the figure of each choice and the report of all rows so far."""
+    """Write each choice's figure and the report of all rows so far."""
     out, drawn = config.out / NAME, {}
     for choice, group in rows.group("choice").items():
         title = f"{choice.capitalize()}: test error over 1 s after fine-tuning"
@@ -151,9 +151,9 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
 
 
 def effects(rows: Results) -> dict[tuple[str, str], dict[str, Interval]]:
-    """By choice and value, and by domain: the error after fine-tuning at the smallest N over that of the default.
+    """Return the error after fine-tuning at the smallest N over the default's, by choice, value and domain.
 
-    Geometric means over seeds, paired, with a 95 % interval, which seeds that diverged do not leave.
+    Geometric means over seeds, paired, with a 95 % interval without diverged seeds.
     """
     found: dict[tuple[str, str], dict[str, Interval]] = {}
     tuned = rows.where(mode=FINE_TUNED)
@@ -169,7 +169,7 @@ def effects(rows: Results) -> dict[tuple[str, str], dict[str, Interval]]:
 
 
 def conclusion(rows: Results) -> list[str]:
-    """Which choices help in every domain, which do nothing, which harm, and by how much."""
+    """Summarise which choices help in every domain, which have no effect, which harm, and by how much."""
     found = effects(rows)
     largest = {key: max(ratio.value for ratio in ratios.values()) for key, ratios in found.items()}
     better = [key for key, ratios in found.items() if all(ratio.below(1) for ratio in ratios.values())]

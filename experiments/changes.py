@@ -1,4 +1,4 @@
-"""What one flight of ten seconds is adapted by, after seven changes of the vehicle: python -m experiments.changes"""
+"""Which method adapts to one flight of ten seconds, after seven changes: python -m experiments.changes"""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -72,7 +72,7 @@ error that is gone. Test error: L^T_MSE over 1 s of other flights.
 
 @dataclass(frozen=True)
 class ChangesConfig(OneFlight):
-    """Adapt with one flight after each change of the vehicle; every candidate is tested, to know what was missed."""
+    """Adapt to one flight after each change of the vehicle, and test every candidate to see what the choice missed."""
 
     compared: tuple[Compared, ...] = get_args(Compared)
     """Methods to compare with. fine_tune: Adam, as in the paper. fine_tune_offset: with --rates.offset 0.3. l2_sp: with
@@ -128,7 +128,7 @@ def experiment(config: ChangesConfig, console: Console) -> None:
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
-    """The figures and their captions, by name."""
+    """Return the figures and their captions, by name."""
     errors = (
         "Prediction error by change, % of that without adaptation; bands reach from the least to the most of all cases"
     )
@@ -138,7 +138,7 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
 def adapted(
     domain: Domain, fields: AbstractVectorField, learned_from: Trajectories, config: ChangesConfig, stages: Stages
 ) -> list[Row]:
-    """The rows of a domain: every candidate, and the methods to compare with, for every draw and seed."""
+    """Return the rows of a domain: every candidate, and the methods to compare with, for every draw and seed."""
     target = flown(domain, target_splits(config), config, stages)
     pool, test, drawn = target.splits["train"], target.splits["test"], windows_of(METHOD, config.sizes[0], config)[0]
 
@@ -163,7 +163,7 @@ def adapted(
 
 
 def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages, target: Dataset) -> list[Row]:
-    """The rows of the methods that are no candidates."""
+    """Return the rows of the methods that are not candidates."""
     tuned = partial(study.adapted, HYBRID, FINE_TUNED, fields)
     offset = replace(config, rates=replace(config.rates, offset=OFFSET))
     fits = {
@@ -183,16 +183,15 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
 
 
 class Tested(eqx.Module):
-    """The candidates of each seed, and which was taken.
+    """The candidates of each seed, and the chosen one.
 
     Attributes:
         names: of the candidates.
-        probability: of each that it is what changed; of the network, beside the one taken before (s, c).
+        probability: probability of each change; the network's is relative to the one chosen before it (s, c).
         test_mse: their test errors (s, c).
-        taken: the index of the candidate that was taken (s,).
-        ends: of that one the mean squared errors at the ends of windows, and of those that touch, of the blocks that
-            were left out, as in `BlockErrors` (s, b, 2, d).
-        flown: the same of each of the flights (s, f, 2, d).
+        taken: index of the chosen candidate (s,).
+        ends: its errors of left-out blocks, as in `BlockErrors` (s, b, 2, d).
+        flown: the same errors of each flight (s, f, 2, d).
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -207,7 +206,7 @@ class Tested(eqx.Module):
 def _candidates(
     fields: Any, windows: Trajectories, flights: Trajectories, test: Trajectories, shared: Settings, known: Trajectories
 ):
-    """Each seed's candidates on its windows."""
+    """Return each seed's candidates on its windows."""
     places = blocks_of(windows.x0.shape[1], BLOCKS)
 
     def one(run) -> Tested:
@@ -243,7 +242,7 @@ def _candidates(
 
 
 def _share_inside(ends: np.ndarray, flown: np.ndarray) -> float | None:
-    """Of other flights, quantities and horizons the share whose error is in its 80 % interval; None without flights."""
+    """Return the share of other flights' errors inside the 80 % interval; None without flights."""
     options = (1.0, 2.0), RIGID_BODY_SPACE  # names of the horizons, which do not matter
     expected = expected_errors(ends, *options).values()
     inside = []

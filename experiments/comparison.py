@@ -47,7 +47,7 @@ class ComparisonConfig(Config):
     encoding: Encoding = field(default_factory=Encoding)
 
     def pooled(self) -> int:
-        """By default those of the experiments' largest N, so that a seed draws the same N as there."""
+        """By default the pool of the experiments' largest N, so that a seed draws the same N."""
         if self.draw == "random" and self.pool is None:
             return max(*TABLE_SIZES, *self.sizes)
         return Config.pooled(self)
@@ -95,7 +95,7 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
 
 
 def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, Fit], Fit | None]:
-    """What is pre-trained on the source: a model for each method that starts from one, and the experts."""
+    """Pre-train a model for each method that starts from one, and the experts."""
     source = flown(SOURCE, source_splits(config), config, stages)
     models = dict.fromkeys([HYBRID, *map(source_of, config.methods)])
     learned = {model: pretrained(model, IRIS, config, stages, source) for model in models}
@@ -111,7 +111,7 @@ def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, F
 
 
 def past_splits(**windows: int) -> dict[str, SplitSpec]:
-    """Splits whose windows begin with the past that an encoder reads: `train=1000` makes `train_with_past`."""
+    """Return splits with the past that an encoder reads: `train=1000` becomes `train_with_past`."""
     return {f"{name}_with_past": SplitSpec(count, 2 * PAST) for name, count in windows.items()}
 
 

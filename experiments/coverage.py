@@ -60,7 +60,7 @@ intervals that are not pooled.
 
 @dataclass(frozen=True)
 class CoverageConfig(OneFlight):
-    """Adapt to each of many flights after each change of the vehicle; count how often intervals contain the truth."""
+    """Adapt to many flights after each change of the vehicle, and count how often intervals contain the true value."""
 
     seeds: Count = SOURCES
     """Sources, whose intervals are pooled."""
@@ -130,7 +130,7 @@ def experiment(config: CoverageConfig, console: Console) -> None:
 def adapted(
     domain: Domain, fields: AbstractVectorField, learned_from: Trajectories, config: CoverageConfig, stages: Stages
 ) -> list[Row]:
-    """A row for each flight and parameter: whether the pooled interval, and single ones, contain the true value."""
+    """Return a row for each flight and parameter: whether pooled and single intervals contain the true value."""
     splits = {"train": target_splits(config)["train"]}
     flights = flown(domain, splits, config, stages)
     pool = flights.splits["train"]
@@ -153,7 +153,7 @@ def adapted(
 
 @jit_with(FAST_COMPILE)
 def _fits(fields: Any, windows: Trajectories, shared: Settings, known: Trajectories):
-    """θ_p of each source as the physics holds them, logarithms, and their standard errors; NaN where not fitted."""
+    """Return log θ_p of each source and their standard errors; NaN if not fitted."""
     cluster = blocks_of(windows.x0.shape[1], CLUSTERS)[0].shape[1]  # windows of one flight are correlated
 
     def one(run):
@@ -168,7 +168,7 @@ def _fits(fields: Any, windows: Trajectories, shared: Settings, known: Trajector
 
 
 def _compared(logs: np.ndarray, stds: np.ndarray, true: float) -> Row:
-    """Whether pooled and single intervals contain the truth; error and half-width in %. None where not fitted."""
+    """Whether pooled and single intervals contain the truth; error and half-width in %; None if not fitted."""
     columns = ("inside", "error", "half_width", "alone")
     if not np.isfinite(stds).all():
         return dict.fromkeys(columns)
@@ -183,7 +183,7 @@ def _compared(logs: np.ndarray, stds: np.ndarray, true: float) -> Row:
 
 
 def pooled_table(rows: Results) -> Table:
-    """A line for each change, noise and parameter."""
+    """Return a line for each change, noise and parameter."""
 
     def text(column: str, scale: float, form: str, statistic=np.mean):
         def of(own: Results) -> str:
@@ -204,13 +204,13 @@ def pooled_table(rows: Results) -> Table:
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
-    """The figure and its caption, by name."""
+    """Return the figure and its caption, by name."""
     return {"coverage": (coverage_figure(rows), "Share of flights whose 95 % interval contains the true value")}
 
 
 @mpl.rc_context(STYLE)
 def coverage_figure(rows: Results) -> Figure:
-    """A panel for each noise: the share of pooled intervals, and of those of one source, that contain the truth."""
+    """Draw the share of pooled and single-source intervals that contain the truth, a panel for each noise."""
     fitted = rows.where(lambda row: row["inside"] is not None)
     noises, changes = fitted.unique("noise"), fitted.unique("domain")
     figure, (panels,) = subplots((PAGE, 1.5 + 0.42 * len(changes)), 1, len(noises), sharey=True)
@@ -234,7 +234,7 @@ def coverage_figure(rows: Results) -> Figure:
 
 
 def conclusion(rows: Results) -> list[str]:
-    """What share of all intervals contains the true value, where it is smallest, and what pooling is worth."""
+    """Summarise the share of intervals that contain the true value, its minimum, and the effect of pooling."""
     fitted = rows.where(lambda row: row["inside"] is not None)
     if not len(fitted):
         return ["No parameter was fitted, so there are no intervals."]

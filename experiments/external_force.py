@@ -18,7 +18,7 @@ ABOUT = "A side wind that no source flight had: adapt to it."
 
 
 def sine_floor(mass: float, times: np.ndarray) -> float:
-    """L_MSE at the times [s] of a model that is exact but for the wind's sine, which ẋ = f(x, u) cannot see.
+    """L_MSE at the times [s] of an exact model without the wind's sine, which ẋ = f(x, u) cannot represent.
 
     For an acceleration (A / m) sin(ω t) with a random phase at the start, the mean squares over the phase are
     (A / m)² (1 − cos ωs) / ω² in velocity and (A / m)² (s² / 2ω² + (1 − cos ωs) / ω⁴ − s sin ωs / ω³) in position.

@@ -24,8 +24,8 @@ class Options:
     """Fly a simulated quadrotor along random paths and save windows of the flights as one dataset file.
 
     The pilot flies between waypoints at up to about 5 m/s, a quarter of the time less than 0.5 m above ground, and
-    excites roll and pitch so that the inertia is identifiable. Every split comes from its own flights. The same
-    arguments give the same file, byte for byte; an existing file with other content is never overwritten.
+    excites roll and pitch so that the inertia is identifiable. Every split has its own flights. The same arguments give
+    the same file, byte for byte; an existing file with other content is never overwritten.
 
     Example: python -m experiments.make_flights --domain source --out source.npz --train 10000 --validation 1000
     """
@@ -60,13 +60,13 @@ class Options:
 
 
 def flights(domain: Domain, splits: Mapping[str, SplitSpec], seed: int, cache_dir: Path) -> Dataset:
-    """The dataset of a domain, from the cache folder if it is there, else flown and saved there; as `read_or_fly`."""
+    """Return a domain's dataset from the cache folder, or fly and save it; as `read_or_fly`."""
     key = digest(configuration(domain, splits, seed), {})[:12]
     return read_or_fly(cache_dir / f"flights-{domain.name}-{key}.npz", domain, splits, seed)
 
 
 def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> Dataset:
-    """The dataset in a file; it is flown and saved if the file does not exist."""
+    """Return the dataset in a file, or fly and save it if the file does not exist."""
     if not path.exists():
         with Line(f"flights {domain.name}", Console(stderr=True), "compiling the simulator") as line:
             dataset = make_dataset(domain, splits, seed, lambda share: line.show_share("flying", share))
@@ -75,7 +75,7 @@ def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], see
 
 
 def chosen_flights(path: Path, domain: Domain, splits: Mapping[str, SplitSpec]) -> Dataset:
-    """The first windows of each split of an existing file."""
+    """Return the first windows of each split of an existing file."""
     whole = load_dataset(path, domain.describe())
     parts = {name: whole.first(name, spec.windows) for name, spec in splits.items()}
     for name, spec in splits.items():
@@ -86,7 +86,7 @@ def chosen_flights(path: Path, domain: Domain, splits: Mapping[str, SplitSpec]) 
 
 
 def make_flights(options: Options) -> None:
-    """Fly and save the dataset unless it exists; print counts and statistics of its splits."""
+    """Fly and save the dataset unless it exists; print statistics of its splits."""
     dataset = read_or_fly(options.out, DOMAINS[options.domain], options.splits(), options.seed)
     if options.picture is not None:
         picture(options.picture)

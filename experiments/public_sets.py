@@ -1,4 +1,4 @@
-"""What `hybrid-jax` alone makes of public logs: python -m experiments.public_sets FLIGHTS LOGS OUT [SET …]"""
+"""Run `hybrid-jax` on public logs: python -m experiments.public_sets FLIGHTS LOGS OUT [SET …]"""
 
 import json
 import resource
@@ -18,7 +18,7 @@ HEADER = "| set | hybrid-jax … | s, wall s | answer | RMSE after 0.1, 0.5 s; o
 
 
 def main() -> None:
-    """Run the sets of public_sets.toml, or those that are named, and print a line of Markdown for each command."""
+    """Run the sets of public_sets.toml, or the given ones, and print a line of Markdown for each command."""
     if len(sys.argv) < 4:
         sys.exit((__doc__ or "").partition(": ")[2])
     flights, logs, out = (Path(each).resolve() for each in sys.argv[1:4])
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def ran(folder: Path, given: list[str]) -> dict[str, Any]:
-    """The report of a command, or why there is none."""
+    """Return the report of a command, or why there is none."""
     run = [sys.executable, "-m", "hybrid_jax", *given]
     done = subprocess.run(run, cwd=folder, capture_output=True, text=True)
     if done.returncode not in (0, 4):
@@ -56,7 +56,7 @@ def shown(errors: list[list[float]]) -> str:
 
 
 def processor() -> float:
-    """Seconds that the commands took of all processors."""
+    """Return the processor seconds of the commands."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

@@ -73,7 +73,7 @@ EXACT = "It knows the true state without noise."
 
 
 def head(config: ClosedLoopConfig) -> str:
-    """The introduction of the report, with the hardware that was flown with."""
+    """Return the introduction of the report, with the hardware of the flights."""
     hardware = config.hardware()
     if hardware == Hardware():
         return HEAD.format(knows=EXACT).strip()
@@ -98,7 +98,7 @@ def train_one(console: Console, training: Training, name: str, model: str, confi
 
 
 def train_all(config: ClosedLoopConfig, console: Console, training: Training) -> dict[str, Trained]:
-    """All trained models by their id in `results.LEARNED`."""
+    """Return all trained models by their id in `results.LEARNED`."""
     trained = {name: train_one(console, training, name, model, config) for name, model in MODELS.items()}
     own = config.invariant()
     trained["invariant"] = train_one(console, training, "invariant", "hybrid", own)
@@ -118,13 +118,13 @@ def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], training: 
 
 
 def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Places) -> list[Scenario]:
-    """The models of each domain along each reference at each distance from home [m]."""
+    """Return the models of each domain along each reference at each distance from home [m]."""
     own = [domain for domain in (SOURCE, *DOMAINS) if domain.name in sets]
     return [Scenario(domain, *place, sets[domain.name], config.bandwidth) for domain in own for place in places]
 
 
 def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, dict[str, float]]:
-    """Time of one call on one core: with physics alone, with the paper's network and with the invariant one."""
+    """Time one call on one core: with only physics, with the paper's network and with the invariant one."""
     few = min(config.sizes)
     fields = {Agent("nominal").name: rigid_body(IRIS)}
     for model in ("hybrid", "invariant"):
@@ -162,7 +162,7 @@ def write(config: ClosedLoopConfig, trained: dict[str, Trained], flown: Sequence
 
 
 def draw(rows: Results, flown: Sequence[Flown], few: int) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
-    """Figures with their captions by file, and notes on those that could not be drawn."""
+    """Return figures with their captions by file, and notes on figures that could not be drawn."""
     followed = (Agent("nominal"), Agent("hybrid"), *(Agent(model, few) for model in SOURCES), ORACLE)
     made, missing = {}, []
     for domain in (each.name for each in DOMAINS):

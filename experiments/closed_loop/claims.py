@@ -1,4 +1,4 @@
-"""Hypotheses about closed-loop flight, as data: each text states the definition that its predicate evaluates."""
+"""Hypotheses about closed-loop flight, as data."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -43,7 +43,7 @@ class Evidence:
     speed: Speed
 
     def group(self, agent: Agent, domain: str, reference: str | None = None, distance: float = 0.0) -> Results:
-        """The flights of an agent in a domain, along one reference or all."""
+        """Select the flights of an agent in a domain, along one reference or all."""
         place = {} if reference is None else {"reference": reference}
         rows = self.rows.where(domain=domain, distance=distance, **place, **asdict(agent))
         if not len(rows):
@@ -52,21 +52,21 @@ class Evidence:
         return rows
 
     def errors(self, *place: Any) -> np.ndarray:
-        """Position RMSE [cm] of each seed of a `group`; infinite for a crash."""
+        """Return the position RMSE [cm] of each seed of a `group`; infinite for a crash."""
         return self.group(*place).numbers(RMSE)
 
     def difference(self, first: tuple[Any, ...], second: tuple[Any, ...], times: float = 1.0) -> Interval:
-        """The mean RMSE [cm] of the first `group` minus `times` that of the second, paired by seed."""
+        """Return the mean RMSE [cm] of the first `group` minus `times` the second's, paired by seed."""
         return self.group(*first).interval(RMSE, self.group(*second), times)
 
     def references(self, agent: Agent) -> list[str]:
-        """What an agent flew at home under the parameter shift."""
+        """Select an agent's flights at home under the parameter shift."""
         own = self.group(agent, PARAMETER_SHIFT)["reference"]
         return [name for name in REFERENCES if name in own]
 
 
 def claims(few: int) -> list[Claim[Evidence]]:
-    """All hypotheses, those on a model for each of SOURCES; `few` is the smallest N."""
+    """Return all hypotheses, with those about a model for each of SOURCES; `few` is the smallest N."""
     made: list[Claim[Evidence]] = [Claim(id, text, lambda e, f=fast: f(e.speed)) for id, text, fast in SPEED_CLAIMS]
     for (number, text, parts), (letter, model) in product(CLAIMS, zip("abc", SOURCES, strict=True)):
         own = partial(parts, Agent(SOURCES[model]), Agent(model, few))
@@ -155,7 +155,7 @@ def _equal(one: float, other: float) -> bool:
 
 
 def _cm(*means: float) -> list[str]:
-    """Errors in cm, with as few decimals as distinguish those that differ: two, or up to DECIMALS."""
+    """Format errors in cm, with as few decimals as distinguish different ones: two, or up to DECIMALS."""
     texts: list[str] = []
     for decimals in range(2, DECIMALS + 1):
         texts = [f"{mean:.{decimals}f} cm" if math.isfinite(mean) else "∞ (a crash)" for mean in means]

@@ -14,9 +14,10 @@ THREE: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
 
 @dataclass(frozen=True)
 class ClosedLoopConfig(Config):
-    """Train as param_shift and external_force do (their stages in --cache are reused). A model predictive controller
-    then flies both targets with each model, adapted with the smallest and the largest of --sizes, and the unchanged
-    vehicle with each model that was not adapted.
+    """Fly a model predictive controller with each model, before and after adaptation.
+
+    Training is that of param_shift and external_force (their stages in --cache are reused). Models that adapt use the
+    smallest and the largest of --sizes; models that do not adapt also fly the unchanged vehicle.
     """
 
     seconds: Positive = 10.0
@@ -79,7 +80,6 @@ class ClosedLoopConfig(Config):
         self.hardware().delay(self.controller().period)
 
     def hardware(self) -> Hardware:
-        """Between controller and vehicle."""
         return hardware(self.noise, self.latency, self.rotor_lag)
 
     def controller(self) -> Controller:
@@ -97,10 +97,7 @@ class ClosedLoopConfig(Config):
         return tuple(dict.fromkeys((min(self.sizes), max(self.sizes))))
 
     def invariant(self) -> Config:
-        """The configuration that trains the invariant residual, with the sizes that fly.
-
-        It has the options of all experiments in simulation, so that their stages are shared.
-        """
+        """The configuration for the invariant residual, with the shared options so that stages are reused."""
         first, *others = self.invariant_rates
         offset = self.rates.offset if self.invariant_offset is None else self.invariant_offset
         return preset_like(

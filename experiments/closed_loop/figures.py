@@ -41,7 +41,7 @@ VIEWS = {"low_pass": [0, 2]}  # x, z: the altitude matters
 
 @mpl.rc_context(STYLE)
 def errors(rows: Results, domain: str) -> Figure:
-    """A row of panels per question, a column per reference at home; a line per agent, a dot per seed."""
+    """Draw a row of panels per question, a column per reference at home; a line per agent, a dot per seed."""
     rows = rows.where(domain=domain, distance=0.0).sort(reference=list(REFERENCES))
     places = {reference: by_agent(group) for reference, group in rows.group("reference").items()}
     if not places:
@@ -66,7 +66,7 @@ def errors(rows: Results, domain: str) -> Figure:
 
 
 def questions(agents: Sequence[Agent]) -> dict[str, list[Agent]]:
-    """The agents that answer each question, each question with some; the true vehicle is a line in all panels."""
+    """Return the agents that answer each question; the true vehicle is a line in all panels."""
     few = min((agent.n_train for agent in agents if agent.n_train), default=0)
     networks = ("hybrid", "no_physics")
     found = {
@@ -93,7 +93,7 @@ def _draw_errors(axes: Axes, found: Mapping[Agent, Results], group: Sequence[Age
 
 @mpl.rc_context(STYLE)
 def shares(rows: Results, domain: str) -> Figure:
-    """Position error before and after each way to adapt, and of the true vehicle [cm], a panel per reference."""
+    """Draw the position error before and after each adaptation, and the true vehicle's [cm], a panel per reference."""
     found = gaps(rows, domain)
     names = [name for name in REFERENCES if any(name in line for line in found.values())]
     if not names:
@@ -122,7 +122,7 @@ def shares(rows: Results, domain: str) -> Figure:
 def paths(
     flights: Mapping[str, Mapping[Agent, States]], references: Mapping[str, States], dt: float, title: str
 ) -> Figure:
-    """A row per reference: left the path, right the distance from it. Both are given as states every dt [s]."""
+    """Draw a row per reference: the path, and the distance from it, both from states every dt [s]."""
     if not flights:
         raise ValueError("flights must not be empty: there is nothing to draw")
     figure, panels = subplots((9.5, 0.9 + 2.9 * len(flights)), len(flights), 2, width_ratios=(1, 1.25))
@@ -148,7 +148,7 @@ def paths(
 
 
 def flown_paths(flown: Sequence[Flown], domain: str, agents: Sequence[Agent]) -> Figure:
-    """`paths` of seed 0 at home."""
+    """Draw `paths` of seed 0 at home."""
     own = {each.scenario.name: each for each in flown}
     at_home = {name: own[f"{domain} {name}"] for name in THREE if f"{domain} {name}" in own}
     flights = {name: {agent: each.states(agent) for agent in agents} for name, each in at_home.items()}
@@ -163,12 +163,12 @@ def flown_paths(flown: Sequence[Flown], domain: str, agents: Sequence[Agent]) ->
 
 
 def floor_note(smallest: float, floor: float, before: str, after: str = "") -> str:
-    """A remark for a title, if any error [cm] is below the floor at which it is drawn."""
+    """Return a remark for a title if any error [cm] is below the floor of the drawing."""
     return f"{before}below {floor:g} cm drawn there{after}" if smallest < floor else ""
 
 
 def _grid(count: int, labels: Sequence[str], width: float = 1.9) -> tuple[Figure, list[Axes]]:
-    """So many panels, with room for the labels of lines in the first column."""
+    """Create panels, with room for the labels of lines in the first column."""
     columns = 2 if count == 4 else min(count, 3)
     rows, room = -(-count // columns), 0.06 * max(map(len, labels))
     size = width * columns + room, rows * (0.8 + 0.17 * len(set(labels))) + 0.6
@@ -180,7 +180,7 @@ def _grid(count: int, labels: Sequence[str], width: float = 1.9) -> tuple[Figure
 
 
 def _frame(axes: Axes, wanted: Float[np.ndarray, "t 2"], top: bool) -> None:
-    """Limits from the reference, so that a flight that diverges does not shrink the others."""
+    """Set limits from the reference, so that a flight that diverges does not shrink the others."""
     low, high = wanted.min(axis=0), wanted.max(axis=0)
     if not top:
         axes.set(xlim=(low[0] - 0.5, high[0] + 0.5), ylim=(0.0, 1.25 * high[1]))

@@ -1,7 +1,4 @@
-"""Closed-loop flights: which models fly which reference in which domain, simulated, and kept in the cache.
-
-One program is compiled for each structure of prediction model; no flight is simulated twice.
-"""
+"""Closed-loop flights, simulated and cached, with one program for each structure of prediction model."""
 
 import time
 from collections import Counter, defaultdict
@@ -58,7 +55,7 @@ class Flight(NamedTuple):
     seed: Int[Any, ""]
 
     def structure(self) -> tuple:
-        """What flights must have in common to be stacked: the tree of the model, and its shapes and dtypes."""
+        """The tree of the model, with shapes and dtypes: flights are stacked if it is equal."""
         leaves, tree = jax.tree.flatten(self.model)
         return tree, *((leaf.shape, leaf.dtype) for leaf in leaves)
 
@@ -71,7 +68,7 @@ class Scenario:
         domain: the true system.
         reference: a key of PATHS.
         distance: from home [m], equally far in x and y.
-        models: that fly.
+        models: of the controllers.
         bandwidth: of the disturbance observers [rad/s].
     """
 
@@ -90,7 +87,6 @@ class Scenario:
         return [(agent, seed) for agent, models in self.models.items() for seed in range(count(models))]
 
     def flights(self) -> Iterator[Flight]:
-        """In the order of `keys`."""
         home = np.array([self.distance, self.distance, 0.0], np.float32) / np.float32(np.sqrt(2))
         world, path = world_of(self.domain), np.asarray(list(PATHS).index(self.reference), np.int32)
         for agent, seed in self.keys():
@@ -98,7 +94,7 @@ class Scenario:
             yield Flight(lane(self.models[agent], seed), world, path, home, bandwidth, np.asarray(seed, np.int32))
 
     def described(self) -> list[Any]:
-        """What the results depend on, beside the controller and the hardware; see `identity_of`."""
+        """Describe all inputs of the results except controller and hardware; see `identity_of`."""
         return [self.name, self.bandwidth, [asdict(agent) for agent in self.models], *self.models.values()]
 
 
@@ -107,11 +103,11 @@ class Flown:
     """The results of a scenario.
 
     Attributes:
-        scenario: that was flown.
+        scenario: the scenario.
         arrays: by name, one value per flight; see `_simulate`.
         seconds: wall-clock time of the simulation, without compiling.
-        processor_seconds: likewise on all cores.
-        devices: how many there were.
+        processor_seconds: the same on all cores.
+        devices: number of devices.
     """
 
     scenario: Scenario
@@ -121,7 +117,7 @@ class Flown:
     devices: int
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per flight: its tags, and NUMBERS, away from home the RMSE alone."""
+        """Return one row per flight: its tags, and NUMBERS, away from home only the RMSE."""
         place = {"reference": self.scenario.reference, "distance": self.scenario.distance}
         numbers = NUMBERS[:1] if self.scenario.distance else NUMBERS
         return [
@@ -132,7 +128,7 @@ class Flown:
         ]
 
     def states(self, agent: Agent, seed: int = 0) -> np.ndarray:
-        """The states of one flight, every `DRAW_EVERY` periods."""
+        """Return the states of one flight, every `DRAW_EVERY` periods."""
         return self.arrays["states"][self.scenario.keys().index((agent, seed))]
 
 
@@ -147,10 +143,7 @@ def fly_all(
     stages: Stages,
     hardware: Hardware | None = None,
 ) -> list[Flown]:
-    """The results of all scenarios in flights of so many seconds, each a stage that is found in the cache or flown now.
-
-    The hardware is that of `control.fly`; the controller must have its rotor lag.
-    """
+    """Simulate all scenarios, each a cached stage; the controller must have the hardware's rotor lag."""
     hardware = Hardware() if hardware is None else hardware
     references = sampled(controller, seconds)
     starts = references[:, 0].copy()
@@ -170,10 +163,7 @@ def fly_all(
 
 
 def _fly(simulate, most: Mapping[tuple, int], made: dict[tuple, LaneMap], shared: tuple, scenario: Scenario) -> Found:
-    """Results of all flights of a scenario, one per entry, and SPENT, the time that they took without compiling.
-
-    Programs of structures that are not yet in `made` are compiled and added to it.
-    """
+    """Simulate a scenario; return its results and SPENT, the time without compiling, and add programs to `made`."""
     groups, flights = defaultdict(list), list(scenario.flights())
     for i, flight in enumerate(flights):
         groups[flight.structure()].append(i)

@@ -1,4 +1,4 @@
-"""Prediction models of the closed loop, trained or from the shared cache, and that of the true vehicle."""
+"""Prediction models of the closed loop, trained or from the shared cache, and the true vehicle's model."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ def train(model: str, config: Config, stages: Stages) -> Trained:
 
 
 def least_squares(source: AbstractVectorField, method: Method, config: Config, stages: Stages) -> Trained:
-    """Fit θ_p and a constant disturbance of the source models to the smallest N of each domain by least squares."""
+    """Fit θ_p and a constant disturbance of the source models to the smallest N of each domain."""
     own = replace(config, sizes=(min(config.sizes),), pool=config.shared_pool())
 
     def fit(target: Dataset) -> Fit:
@@ -66,14 +66,14 @@ def _adapt(start: AbstractVectorField, config: Config, stages: Stages, fit: Call
 
 
 def disturbance_counts(fitted: Trained) -> list[str]:
-    """For each domain a sentence on how many seeds have a constant disturbance."""
+    """Return for each domain a sentence on how many seeds have a constant disturbance."""
     fields: dict[tuple[str, int], Any] = {**fitted.adapted}
     found = {domain: np.any(field.physics.residual.value != 0, axis=1) for (domain, _), field in fields.items()}
     return [f"{domain}: {own.sum()} of {len(own)} seeds have a disturbance." for domain, own in found.items()]
 
 
 def model_set(domain: Domain, trained: dict[str, Trained], sizes: Sequence[int]) -> ModelSet:
-    """All models that fly in a domain, by agent: with each model its observed version, and last the true vehicle.
+    """Return all models of a domain by agent, each also with an observer, and last the true vehicle.
 
     `trained` is by id in `results.LEARNED`; `sizes` begins with the smallest N, or is empty for the unchanged vehicle.
     """
@@ -91,12 +91,11 @@ def model_set(domain: Domain, trained: dict[str, Trained], sizes: Sequence[int])
 
 
 def fused(fields: AbstractVectorField) -> AbstractVectorField:
-    """Stacked fields in their inference layout, on the host."""
+    """Return stacked fields in their inference layout, on the host."""
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(lambda field: as_field(field).fuse_for_inference()))(fields))
 
 
 def as_stack(field: Any) -> Any:
-    """One field as a stack of one."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[None], field)
 
 
@@ -121,7 +120,7 @@ class TrueField(AbstractVectorField):
 
 
 def true_field(domain: Domain, vehicle: Vehicle) -> TrueField:
-    """The true vehicle of a domain under its forces, of the wind only the mean; `vehicle` is that of the models."""
+    """Return a domain's true vehicle with its forces and the mean wind; `vehicle` is the models' vehicle."""
     truth = nominal(domain.vehicle)
     body = RigidBody({name: jnp.log(truth[name] / value) for name, value in nominal(vehicle).items()}, vehicle)
     push = jnp.array([0.0, WIND_MEAN if wind in domain.forces else 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""The results of closed-loop flight: tags and labels, the agents that flew, and tables of a line per agent."""
+"""Results of closed-loop flight: tags, labels, agents, and tables with a line per agent."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -48,7 +48,7 @@ NUMBERS = ("position_rmse", "yaw_rmse", "largest_error", "saturation", "promised
 
 
 def uncrashed(column: str, factor: float = 1.0) -> Callable[[Row], float]:
-    """One of NUMBERS times a factor; infinite for a crash or where it was not finite."""
+    """Return one of NUMBERS times a factor; infinite for a crash or a value that is not finite."""
     return lambda row: math.inf if row["crashed"] or row[column] is None else factor * row[column]
 
 
@@ -56,17 +56,17 @@ ERROR = uncrashed("position_rmse")
 
 
 def by_agent(rows: Results) -> dict[Agent, Results]:
-    """The rows of each agent, in order of appearance."""
+    """Group rows by agent, in order of appearance."""
     return {Agent(*key): group for key, group in rows.group(*asdict(ORACLE)).items()}
 
 
 def away(distance: float) -> str:
-    """What a name of a place has at its end."""
+    """Return the suffix of a place's name."""
     return f", {distance:g} m away" if distance else ""
 
 
 def conclusion(rows: Results, few: int) -> list[str]:
-    """How close the vehicle flies before and after adaptation, alone and with an observer, next to what is possible."""
+    """Summarise errors before and after adaptation, with and without an observer, against the true vehicle's."""
     sentences = []
     for domain in (PARAMETER_SHIFT, EXTERNAL_FORCE):
         flown = {agent: _at_home(own) for agent, own in by_agent(rows.where(domain=domain, distance=0.0)).items()}
@@ -93,7 +93,7 @@ def conclusion(rows: Results, few: int) -> list[str]:
 
 
 def _at_home(rows: Results) -> float:
-    """The median over references and seeds, infinite if half of them crash."""
+    """Return the median over references and seeds, infinite if half of them crash."""
     return float(np.median(rows.numbers(ERROR)))
 
 
@@ -102,7 +102,6 @@ def _in_cm(error: float) -> str:
 
 
 def tables(rows: Results) -> list[Table]:
-    """All tables of flights, at home and away from it."""
     seeds = mean_over_seeds(rows)
     titles: dict[str, Cell] = {
         f"Position RMSE [cm] ({seeds}; less is better)": number_text("position_rmse", 100.0, ".2f"),
@@ -121,7 +120,7 @@ def tables(rows: Results) -> list[Table]:
 
 
 def gap_tables(rows: Results) -> list[Table]:
-    """The share of the gap between source model and true vehicle that each way to adapt closes, per domain."""
+    """Return the share of the gap between source model and true vehicle that each adaptation closes, per domain."""
     made = []
     for domain in DOMAINS:
         shares = gaps(rows, domain)
@@ -134,7 +133,7 @@ def gap_tables(rows: Results) -> list[Table]:
 
 
 def gaps(rows: Results, domain: str) -> dict[Agent, dict[str, Interval]]:
-    """For each adapted or observed hybrid the share of the gap that it closes at home, by reference."""
+    """Return the share of the gap that each adapted or observed hybrid closes at home, by reference."""
     shares: dict[Agent, dict[str, Interval]] = {}
     for reference in REFERENCES if domain != UNCHANGED else ():
         flown = by_agent(rows.where(domain=domain, reference=reference, distance=0.0))
@@ -148,7 +147,7 @@ def gaps(rows: Results, domain: str) -> dict[Agent, dict[str, Interval]]:
 
 
 def speed_table(speeds: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Milliseconds per call of the controller, for each model that was timed."""
+    """Return milliseconds per call of the controller, for each timed model."""
     header = ("model", "median [ms]", "99 of 100 are below [ms]", "processor time, mean [ms]")
     keys = ("median_ms", "p99_ms", "processor_ms")
     lines = [(name, *(f"{speed[key]:.2f}" for key in keys)) for name, speed in speeds.items()]
@@ -156,19 +155,19 @@ def speed_table(speeds: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def number_text(column: str, factor: float, form: str) -> Cell:
-    """Mean ± std over seeds, and the number of crashes if there are any."""
+    """Format mean ± std over seeds, and the number of crashes if there are any."""
     return lambda rows: spread_text(rows.spread(uncrashed(column, factor)), form, what="crashed")
 
 
 def crash_text(rows: Results) -> str:
-    """Number of crashes, and mean saturation."""
+    """Format the number of crashes, and mean saturation."""
     values = [value for value in rows["saturation"] if value is not None]
     share = f"{100 * sum(values) / len(values):.1f}" if values else EMPTY
     return f"{sum(rows['crashed'])} of {len(rows)}; {share}"
 
 
 def cost_text(rows: Results) -> str:
-    """Mean predicted cost, and mean relative error of the actual one, over the flights that did not crash."""
+    """Format the mean predicted cost, and the actual cost's mean relative error, of flights without a crash."""
     sound = rows.where(lambda row: None not in (row["promised"], row["excess"]), crashed=False)
     if not len(sound):
         return EMPTY

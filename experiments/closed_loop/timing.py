@@ -14,12 +14,12 @@ WARM_UP = 10  # calls that are not counted
 
 
 def call_times(fields: Sequence[AbstractVectorField], controller: Controller, calls: int) -> list[dict[str, float]]:
-    """With each field: median and 99th percentile of wall-clock time, mean processor time of all cores [ms]."""
+    """For each field: median and 99th percentile of wall-clock time, mean processor time of all cores [ms]."""
     return [_call_times(field, controller, calls) for field in fields]
 
 
 def _call_times(field: AbstractVectorField, controller: Controller, calls: int) -> dict[str, float]:
-    """Calls along a figure-8."""
+    """Time calls along a figure-8."""
     control, simulate = eqx.filter_jit(controller), eqx.filter_jit(advance)
     reference = sample(figure_eight(3.5), controller, controller.period * (WARM_UP + calls))
     plan, x = controller.begin(), reference[0]

@@ -1,4 +1,4 @@
-"""What the flight that tells the parameters best is worth: python -m experiments.excitation --help"""
+"""How much a designed flight narrows the intervals: python -m experiments.excitation --help"""
 
 import math
 from collections.abc import Mapping
@@ -72,7 +72,7 @@ A seed draws the noise, and the random flight.
 
 @dataclass(frozen=True)
 class ExcitationConfig(Run):
-    """Design a flight, fly it and others of equal length in the simulator, and compare the intervals that they give."""
+    """Design a flight, simulate it and others of equal length, and compare their intervals."""
 
     seconds: Positive = 10.0
     """Length of each flight [s]."""
@@ -155,13 +155,13 @@ def noise_of(config: ExcitationConfig) -> Noise:
 
 
 def sizes(noise: Noise) -> Float[Array, "13"]:
-    """The standard deviation of the noise on each state."""
+    """Return the standard deviation of the noise on each state."""
     groups = (3, noise.position), (4, noise.quaternion), (3, noise.velocity), (3, noise.body_rates)
     return jnp.concatenate([jnp.full(count, size) for count, size in groups])
 
 
 def flown(config: ExcitationConfig, domain: Domain, design: Excitation) -> dict[tuple[str, int], Flown]:
-    """By flight and seed; the flights of the controller are the same for every seed."""
+    """Return flights by name and seed; the controller's flights are the same for every seed."""
     controller = Controller(IRIS)
     altitude = (config.bounds.low[2] + config.bounds.high[2]) / 2
     paths = {
@@ -200,7 +200,7 @@ def _fly(domain: Domain, controller: Controller, references: Float[Array, "k n 1
 def fitted(
     config: ExcitationConfig, domain: Domain, flights: Mapping[tuple[str, int], Flown], name: str, seed: int
 ) -> list[Row]:
-    """A row for each parameter: the interval after a flight, what was predicted, and the truth."""
+    """Return a row for each parameter: the interval after a flight, the prediction, and the truth."""
     states, inputs = flights[name, seed]
     key = jax.random.fold_in(jax.random.key(2 + seed), FLIGHTS.index(name))
     log = jnp.asarray(states, jnp.float32), jnp.asarray(inputs, jnp.float32)

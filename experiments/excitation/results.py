@@ -1,4 +1,4 @@
-"""What the flights told: claims, tables and figures."""
+"""Claims, tables and figures of the designed flights."""
 
 import math
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ class Evidence(NamedTuple):
 
 
 def margins(bounds: FlightBounds, states: Float[np.ndarray, "n 13"]) -> dict[str, tuple[float, float]]:
-    """How far the vehicle went towards each limit, and the limit, from the middle of the box."""
+    """Return the vehicle's distance towards each limit, and the limit, from the middle of the box."""
     place = states[:, POSITION] - (np.array(bounds.low) + np.array(bounds.high)) / 2
     half = (np.array(bounds.high) - np.array(bounds.low)) / 2
     upright = 1 - 2 * (states[:, QUATERNION.start + 1] ** 2 + states[:, QUATERNION.start + 2] ** 2)
@@ -46,12 +46,12 @@ def margins(bounds: FlightBounds, states: Float[np.ndarray, "n 13"]) -> dict[str
 
 
 def worst(rows: Results, column: str) -> dict[int, float]:
-    """The widest interval of each seed, in %."""
+    """Return the widest interval of each seed, in %."""
     return {seed: float(own.numbers(column).max()) for seed, own in rows.group("seed").items()}
 
 
 def ratio(rows: Results, name: str, column: str = "half_width") -> Interval:
-    """The worst interval after the designed flight over that after another: geometric mean over seeds."""
+    """Geometric mean over seeds of the designed flight's worst interval over another flight's."""
     ours, theirs = (worst(rows.where(flight=flight), column) for flight in (DESIGNED, name))
     with np.errstate(divide="ignore"):  # nothing beside an infinite interval
         logs = [float(np.log(ours[seed] / theirs[seed])) for seed in ours]
@@ -141,7 +141,7 @@ def described(design: Excitation) -> dict[str, Any]:
 
 @mpl.rc_context(STYLE)
 def interval_figure(rows: Results) -> Figure:
-    """A panel per parameter, a line per flight; what is wider than `WIDEST` is a triangle there."""
+    """Draw a panel per parameter, a line per flight; intervals wider than `WIDEST` are triangles."""
     names = rows.unique("parameter")
     figure, panels = subplots((PAGE, 2.4), 1, len(names), sharex=True, sharey=True)
     for axes, name in zip(panels[0], names, strict=True):
@@ -162,7 +162,7 @@ def interval_figure(rows: Results) -> Figure:
 
 @mpl.rc_context(STYLE)
 def flight_figure(design: Excitation, flown: Flown) -> Figure:
-    """Position, tilt, body rates and rotor speeds over time."""
+    """Draw position, tilt, body rates and rotor speeds over time."""
     figure, panels = subplots((PAGE, 4.2), 2, 2, sharex=True)
     states, inputs = flown
     shown = {

@@ -1,1 +1,1 @@
-"""Closed-loop flights in the simulator, which several experiments fly."""
+"""Closed-loop flights in the simulator for several experiments."""

@@ -1,7 +1,4 @@
-"""Image of the simulated vehicle (Fig. 6), rendered by MuJoCo in a process of its own.
-
-MuJoCo chooses its OpenGL backend when it is first imported; one backend after the other is tried.
-"""
+"""Image of the simulated vehicle (Fig. 6), rendered by MuJoCo in a process for each OpenGL backend until one works."""
 
 # MuJoCo's compiled modules carry no type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -35,7 +32,7 @@ def picture(path: str | Path) -> None:
 
 
 def render(path: str) -> None:
-    """Write the picture with the backend that the environment names."""
+    """Write the picture with the backend in the environment."""
     import mujoco
 
     from hybrid_jax.sim.scene import build_model

@@ -36,7 +36,7 @@ def world_of(domain: Domain, clock: float = 0.0) -> World:
 
 
 def plant_of(world: World, period: float) -> Plant:
-    """The state one period later, as `control.fly` and `Loop.tick` ask for it."""
+    """Return the function to the state one period later, for `control.fly` and `Loop.tick`."""
 
     def force(x, u, t, parameters) -> Wrench:
         wrenches = [each(x, u, t, parameters) for each in FORCES]

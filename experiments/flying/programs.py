@@ -1,4 +1,4 @@
-"""Programs that fly many flights at once: one for each kind of flight, compiled before the first of them."""
+"""Programs that fly many flights at once, compiled once for each kind of flight."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,12 +16,12 @@ WIDTH = {"cpu": 4}  # flights in one vmap; on another backend an even share of a
 def compiled(
     simulate: Callable, kinds: Mapping[Any, Sequence[Any]], most: Mapping[Any, int], shared: tuple
 ) -> dict[Any, LaneMap]:
-    """A program for each kind of flight.
+    """Compile a program for each kind of flight.
 
     Args:
-        simulate: a pure function of a flight, a tree of arrays, and of what all flights share.
+        simulate: a pure function of a flight, a tree of arrays, and of shared arguments.
         kinds: flights of each kind, equal in structure and shapes.
-        most: flights of each kind that will fly at once, for which the program has places.
+        most: most flights of each kind that fly at once.
         shared: further arguments of `simulate`.
     """
     programs = {}
@@ -36,5 +36,5 @@ def compiled(
 
 
 def fly(program: LaneMap, flights: Sequence[Any], shared: tuple, none: bool = False) -> Any:
-    """What `simulate` returns of each flight, stacked."""
+    """Return the stacked results of `simulate` for all flights."""
     return program(stack(flights), shared, np.ones(len(flights)), range(0 if none else len(flights)))

@@ -1,4 +1,4 @@
-"""What is flown: references, and the hardware between controller and vehicle."""
+"""References, and the hardware between controller and vehicle."""
 
 from collections.abc import Mapping
 from dataclasses import astuple
@@ -46,11 +46,11 @@ REFERENCES = {  # as reports call them
 
 
 def sampled(controller: Controller, seconds: float) -> Float[np.ndarray, "k n 13"]:
-    """All PATHS, a state for each period and the horizon after the last."""
+    """Sample all PATHS: a state for each period and the horizon after the last."""
     return np.stack([np.asarray(sample(path, controller, seconds)) for path in PATHS.values()])
 
 
 def hardware(noise: float, latency: float, rotor_lag: float) -> Hardware:
-    """Between controller and vehicle; noise 1 is typical of motion capture and a gyroscope."""
+    """The hardware between controller and vehicle; noise 1 is typical of motion capture and a gyroscope."""
     m, quaternion, speed, rate = (noise * size for size in astuple(Noise()))
     return Hardware(latency, rotor_lag, (m, quaternion, speed, rate))

@@ -1,4 +1,4 @@
-"""Times on one core, as a flight computer would have it."""
+"""Times on one core, as on a flight computer."""
 
 import os
 import signal
@@ -15,10 +15,7 @@ Result = TypeVar("Result")
 
 
 def on_one_core(function: Callable[..., Result], *arguments: object) -> Result:
-    """What the function returns in a process with one core: more do not make small matrix products faster.
-
-    A system that cannot bind a process to a core (macOS) leaves it all of them.
-    """
+    """Call a function in a process with one core, if the system can bind it (macOS cannot)."""
     # Spawned, not forked: JAX already runs threads here and has fixed the devices.
     with ProcessPoolExecutor(1, get_context("spawn"), _use_one_core) as process:
         return process.submit(function, *arguments).result()

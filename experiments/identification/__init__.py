@@ -1,1 +1,1 @@
-"""Public records for system identification of which not every state was measured, each with a program."""
+"""Public records for system identification in which only some states were measured, each with a program."""

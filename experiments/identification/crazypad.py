@@ -51,8 +51,8 @@ class Options:
     """Which rotor is damaged, and by how much, in the data set CrazyPAD: a vehicle whose propeller M3 was cut in steps.
 
     The effectiveness of each rotor is learned from normal flights, then from three seconds of a damaged one, by thrust
-    and trim. In all flights the thrust of a command grows in the seconds after take-off. So damage is found against the
-    same seconds of normal flights, and what is left of each rotor then predicts with what whole normal flights tell.
+    and trim. Since the thrust of a command grows after take-off, damage is measured against the same seconds of normal
+    flights, and predictions use the effectiveness of whole normal flights.
     """
 
     folder: Annotated[Path, tyro.conf.Positional]
@@ -60,14 +60,14 @@ class Options:
 
 
 class Flight(NamedTuple):
-    """A flight, and the length [mm] that is left of its propeller M3."""
+    """A flight, and the remaining length [mm] of its propeller M3."""
 
     recording: Recording
     length: float
 
 
 def flights(folder: Path, vehicle: str = "E8") -> tuple[list[Flight], list[Flight]]:
-    """Normal flights, and those with a cut propeller from long to short."""
+    """Return normal flights, and flights with a cut propeller from long to short."""
     normal = [Flight(read_recording(path), WHOLE) for path in sorted((folder / "normal_flight").glob(f"{vehicle}_*"))]
     found = sorted(folder.glob(f"cut_propeller_M3_*/{vehicle}_*"))
     cut = [Flight(read_recording(path), float(re.findall(r"([\d.]+)mm", path.parent.name)[-1])) for path in found]
@@ -77,7 +77,7 @@ def flights(folder: Path, vehicle: str = "E8") -> tuple[list[Flight], list[Fligh
 
 
 def cut_out(recording: Recording, begin: float, end: float) -> Recording:
-    """The part of a recording between two times."""
+    """Return the part of a recording between two times."""
 
     def part(signal: Signal) -> Signal:
         inside = (signal.t >= begin) & (signal.t <= end)
@@ -87,7 +87,7 @@ def cut_out(recording: Recording, begin: float, end: float) -> Recording:
 
 
 def force_errors(field: Any, recording: Recording, after: float = 0.0) -> np.ndarray:
-    """Specific force along the thrust less that predicted of commands and voltage [m/s²], in flight, from a time on."""
+    """Measured minus predicted specific force along the thrust [m/s²], in flight, from a time on."""
     command, force = (recording.signals[name] for name in ("command", "specific_force"))
     edges = np.arange(command.t[0], command.t[-1], 0.01)
     speeds = rotor_speeds(field, command.t, inputs_of(recording, field), edges)
@@ -103,28 +103,28 @@ def rms(errors: np.ndarray) -> float:
 
 
 def source(normal: list[Flight]) -> Any:
-    """What normal flights tell: effectiveness of each rotor, and lag."""
+    """Estimate effectiveness of each rotor, and lag, from normal flights."""
     learn = rigid_body(VEHICLE, ("k_rotors",))
     field = actuated(learn, ACTUATOR, ("time_constant",))
     return identify(field, [each.recording for each in normal], LAYOUT, MEASURED).field
 
 
 def first_seconds(recording: Recording, seconds: float = SECONDS) -> tuple[Recording, float]:
-    """The first seconds in the air, and when they end."""
+    """Return the first seconds in the air, and when they end."""
     begin, _ = airborne(recording)[0]
     return cut_out(recording, begin, begin + seconds), begin + seconds
 
 
 def take_off(field: Any, normal: list[Flight]) -> Any:
-    """The field with what normal flights tell of each rotor in the seconds after take-off."""
+    """Fit each rotor to normal flights in the seconds after take-off."""
     parts = [first_seconds(each.recording)[0] for each in normal]
     return identify(changed(field, np.zeros(VEHICLE.rotors)), parts, SHORT, MEASURED, free=("efficiency",)).field
 
 
 def damage(fresh: Any, flight: Flight) -> tuple[np.ndarray, Float[np.ndarray, " n"], float]:
-    """Thrust that each rotor has lost, as a share, with intervals, by the first seconds; log efficiencies; their end.
+    """Return each rotor's lost share of thrust in the first seconds, with intervals; log efficiencies; their end.
 
-    All four are found by thrust and trim. Then the one that lost most alone is fitted to the accelerometer.
+    All four are estimated from thrust and trim; then only the worst one is fitted to the accelerometer.
     """
     (part, end), whole = first_seconds(flight.recording), np.asarray(fresh.body.deviations["efficiency"])
     found = identify(fresh, [part], SHORT, MEASURED, free=("efficiency",))
@@ -136,7 +136,7 @@ def damage(fresh: Any, flight: Flight) -> tuple[np.ndarray, Float[np.ndarray, " 
 
 
 def changed(field: Any, log_efficiency) -> Any:
-    """The field with rotors that give other shares of their thrust."""
+    """Return the field with other efficiencies of the rotors."""
     body: Any = corrected(field.body)
     return replace(field, body=replace(body, deviations=body.deviations | {"efficiency": jnp.asarray(log_efficiency)}))
 

@@ -1,4 +1,4 @@
-"""An electro-mechanical positioning system, position alone measured: python -m experiments.identification.emps --help
+"""Electro-mechanical positioning with only position measured: python -m experiments.identification.emps --help
 
 Physics: a mass with viscous and Coulomb friction and an offset (Janot, Gautier and Brunot, Data set and reference
 models of EMPS, 2019). The record is on nonlinearbenchmark.org.
@@ -22,8 +22,8 @@ class Slide(hj.AbstractVectorField):
         log_viscous: ln of the viscous friction at 0.1 m/s [N s/m].
         log_coulomb: ln of the Coulomb friction [N].
         offset: of the force [N].
-        power: of the velocity in the viscous friction, beyond 1; None if it is linear.
-        direction: by what share the viscous friction is larger one way and smaller the other; None if it is equal.
+        power: exponent of the velocity in the viscous friction, beyond 1; None if it is linear.
+        direction: relative difference of the viscous friction in the two directions; None if equal.
     """
 
     log_mass: jax.Array
@@ -45,7 +45,7 @@ class Slide(hj.AbstractVectorField):
 
 
 def candidate(*extra: str):
-    """A slide, whose viscous friction may depend on direction, and on a power of the velocity."""
+    """Return a slide whose viscous friction may depend on direction and on a power of the velocity."""
     mass, viscous, coulomb, offset = (jnp.array(number) for number in (4.55, 5.3, 3.0, -3.0))
     more = {name: jnp.zeros(()) if name in extra else None for name in ("power", "direction")}
     start = Slide(mass, viscous, coulomb, offset, **more)

@@ -53,7 +53,7 @@ SCALE = np.repeat([0.1, 0.05, 0.2, 0.2], [3, 4, 3, 3]).astype(np.float32)  # of 
 class Options:
     """From one airframe to another, in the data set NanoBench: flights of an airframe A, and of B, which replaced it.
 
-    Each flight of B is left out in turn. The others, or ten seconds of one of them, are learned from.
+    Each flight of B is left out in turn; the model learns from the others, or from ten seconds of one of them.
     """
 
     folder: Annotated[Path, tyro.conf.Positional]
@@ -61,7 +61,7 @@ class Options:
 
 
 def thrust_of(recordings: list[Recording], voltage: bool = True, start: Actuated | None = None, free=None) -> Actuated:
-    """The actuators that explain the accelerometer of some flights; without the voltage, of a constant gain."""
+    """Fit the actuators to the accelerometer of some flights; without the voltage, with a constant gain."""
     own = ACTUATOR if voltage else replace(ACTUATOR, nominal_voltage=0.0, voltage_exponent=0.0)
     learn = ("curve", "time_constant", "voltage_exponent") if voltage else ("curve", "time_constant")
     field = start if start is not None else actuated(rigid_body(VEHICLE, ()), own, learn)
@@ -69,7 +69,7 @@ def thrust_of(recordings: list[Recording], voltage: bool = True, start: Actuated
 
 
 def flight_of(recording: Recording, field: Actuated) -> FlightLog:
-    """The time in the air, every 10 ms, with rotor speeds that follow from commands and voltage."""
+    """Resample the time in the air every 10 ms, with rotor speeds from commands and voltage."""
     command = recording.signals["command"]
     flights = airborne(recording)
     t = np.arange(flights[0][0], flights[-1][1], DT)
@@ -91,13 +91,13 @@ def windows_of(recordings, field: Actuated, stride: int = STRIDE) -> hj.Trajecto
 
 
 def tests_of(recording: Recording, field: Actuated) -> hj.Trajectories:
-    """Windows of a flight, each with the `PAST` before it."""
+    """Return windows of a flight, each with the `PAST` before it."""
     return cut_windows([flight_of(recording, field)], PAST + STEPS, STRIDE).windows
 
 
 @eqx.filter_jit
 def predicted(field, tests: hj.Trajectories, observed: bool) -> Float[Array, "n t 13"]:
-    """The states after each past; if `observed`, with the mean acceleration that the field lacked in it."""
+    """Predict the states after each past; if `observed`, add the mean acceleration error in it."""
     x, u, dt = tests.x, tests.u, tests.dt
     past = hj.Trajectories(tests.x0, u[:, :PAST], x[:, :PAST], dt)
     lacked = defects(field, past).reshape(len(x), PAST, -1).mean(axis=1)[:, VELOCITY.start :]
@@ -115,7 +115,7 @@ def errors(field, tests: hj.Trajectories, observed: bool = False) -> list[float]
 
 
 def fitted_to(start, recordings: list[Recording], field: Actuated, stride: int = 50):
-    """The physics of a field, fitted to windows of flights by least squares."""
+    """Fit a field's physics to windows of flights by least squares."""
     windows = windows_of(recordings, field, stride)
     return fit_least_squares(start, windows, max_steps=FIT_STEPS, scale=jnp.asarray(SCALE)).field
 

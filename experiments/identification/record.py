@@ -1,4 +1,4 @@
-"""What the programs for public records share: reading, the choice of a model by parts left out, a table, a test."""
+"""Shared parts of the programs for public records: reading, model selection on left-out parts, a table, a test."""
 
 import csv
 import dataclasses
@@ -21,8 +21,7 @@ from experiments.runner import command
 
 @dataclass(frozen=True)
 class Options:
-    """Fits physics, and physics with a residual, to a record, chooses between them by parts that are left out, and
-    predicts the whole record, or another one, from its inputs alone."""
+    """Fit physics, with and without a residual, to a record, choose by left-out parts, and predict from inputs only."""
 
     record: Annotated[Path, tyro.conf.Positional]
     """CSV with the columns t, u and the measured output; it may be packed by gzip."""
@@ -32,16 +31,16 @@ class Options:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A system and how it is judged.
+    """A system and its evaluation.
 
     Attributes:
         title: of the table.
         columns: the names of input and output in the file.
-        unit: of the errors that are printed, and how many there are in one of the output.
-        candidates: a model to begin with, and its prior, by name.
+        unit: unit of the printed errors, and how many there are in one of the output.
+        candidates: an initial model and its prior, by name.
         options: of `hj.fit_records`.
         start: the initial state of another record, from its first output and the fitted model.
-        hidden: the deviation of the state where a record begins in the middle.
+        hidden: standard deviation of the state if a record begins in the middle.
     """
 
     title: str
@@ -54,7 +53,7 @@ class Benchmark:
 
 
 def read(path: Path, columns: tuple[str, str]) -> hj.Record:
-    """The record in a file; ValueError with file, row and column."""
+    """Read the record in a file; ValueError with file, row and column."""
     with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
         header, *rows = csv.reader(file)
     for name in ("t", *columns):
@@ -71,12 +70,12 @@ def read(path: Path, columns: tuple[str, str]) -> hj.Record:
 
 
 def main(benchmark: Benchmark, name: str, arguments: Sequence[str] | None = None) -> None:
-    """The command of one benchmark."""
+    """Run the command of one benchmark."""
     command.call(name, Options, lambda options: run(benchmark, options, Console()), arguments)
 
 
 def run(benchmark: Benchmark, options: Options, console: Console) -> None:
-    """Fit, choose, predict, and print it."""
+    """Fit, choose and predict, and print the results."""
     began, record = time.perf_counter(), read(options.record, benchmark.columns)
     test = None if options.test is None else read(options.test, benchmark.columns)
     table = Table("model", "left out", "this record", title=benchmark.title)
@@ -103,26 +102,24 @@ def run(benchmark: Benchmark, options: Options, console: Console) -> None:
 
 
 def fit(benchmark: Benchmark, model: hj.StateSpaceModel, prior: dict[str, float], record: hj.Record):
-    """The model fitted to a record."""
     return hj.fit_records(model, [record], prior=prior, **benchmark.options)
 
 
 def free_run(benchmark: Benchmark, model: hj.StateSpaceModel, record: hj.Record, start) -> np.ndarray:
-    """The errors of a simulation from a start, with the inputs alone."""
+    """Return the errors of a simulation from a start, with only the inputs."""
     kept = {name: value for name, value in benchmark.options.items() if name in ("dt", "between", "substeps")}
     y = hj.simulate(model, record, start, **kept)[0][benchmark.columns[1]]
     return (y - record.signals[benchmark.columns[1]].values[: len(y)])[:, 0]
 
 
 def rmse(errors: np.ndarray) -> float:
-    """The root of the mean square."""
     return float(np.sqrt(np.mean(errors**2)))
 
 
 def left_out(benchmark: Benchmark, candidate, record: hj.Record) -> tuple[float, float]:
-    """RMSE on the last third, into which the simulation of a fit to the others goes on, and on the first third.
+    """RMSE on the last third, simulated on from a fit to the others, and on the first third.
 
-    The initial state before the first third is estimated from its first tenth, with the fitted model.
+    The initial state of the first third is estimated from its first tenth.
     """
     signal = record.signals[benchmark.columns[1]]
     begin, span = signal.t[0], signal.t[-1] - signal.t[0]

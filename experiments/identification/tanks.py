@@ -1,4 +1,4 @@
-"""Cascaded tanks, of which one of two levels is measured: python -m experiments.identification.tanks --help
+"""Cascaded tanks, with one of two levels measured: python -m experiments.identification.tanks --help
 
 Physics: water leaves each tank through a hole, and over its edge when it is full (Schoukens, Mattsson, Wigren and Noël,
 Cascaded tanks benchmark combining soft and hard nonlinearities, 2016). The record is on nonlinearbenchmark.org.
@@ -30,13 +30,13 @@ class Tanks(hj.AbstractVectorField):
 
     Attributes:
         log_flow: ln of the flows out of the upper tank, out of the lower tank, and of the pump (3,).
-        log_ratio: ln of the upper tank's cross-section over that of the lower one.
+        log_ratio: ln of the ratio of upper to lower cross-section.
         power: of the level in the flow out of each tank, 0.5 by Torricelli (2,).
         offset: of the hole below the sensor's zero [V] (2,).
         edge: of each tank [V] (2,).
         log_weir: ln of the flow over each edge, per V (2,).
         caught: the share of it that the lower tank catches, as a logit.
-        shape: how the cross-section of each tank changes with its level, linear and square (2, 2); None if it does not.
+        shape: how the cross-section of each tank changes with its level, linear and square (2, 2); None if constant.
     """
 
     log_flow: jax.Array
@@ -62,14 +62,14 @@ class Tanks(hj.AbstractVectorField):
 
 
 def residual(hidden: int) -> ResidualNetwork:
-    """One hidden layer of tanh units, of levels and pump, that adds nothing yet."""
+    """One hidden layer of tanh units of levels and pump, zero at the start."""
     scaling = ChannelScaling(tuple(MIDDLE.tolist()), tuple(SIZE.tolist()), (RATE, RATE))
     made = residual_network(2, 1, jax.random.key(0), hidden=hidden, scaling=scaling, norm="none", activation="tanh")
     return eqx.tree_at(lambda made: (made.weight_out, made.bias_out), made, (jnp.zeros((2, hidden)), jnp.zeros(2)))
 
 
 def physics(shaped: bool = False) -> Tanks:
-    """The start of the search."""
+    """Return initial physics."""
     flow, half = jnp.log(jnp.array([0.05, 0.05, 0.04])), jnp.full(2, 0.5)
     edge = jnp.array([9.0, 10.0])
     shape = jnp.zeros((2, 2)) if shaped else None
@@ -82,7 +82,7 @@ def level(x, u):
 
 
 def model(field) -> hj.StateSpaceModel:
-    """With the level of the upper tank unknown."""
+    """Return a model with an unknown level of the upper tank."""
     return hj.StateSpaceModel(field, ("u",), {"y": level}, start=(4.0, 5.2), spread=(5.0, 0.3))
 
 
@@ -90,13 +90,13 @@ NEAR = {"offset": 0.3, "edge": 0.7, "log_weir": 0.7, "caught": 1.5, "power": 0.1
 
 
 def white(shaped: bool):
-    """Physics, with straight walls or not."""
+    """Return physics, with or without straight walls."""
     near = NEAR | ({"shape": 0.2} if shaped else {})
     return model(physics(shaped)), {f"field.{name}": value for name, value in near.items()}
 
 
 def hybrid(size: float = 0.1, hidden: int = 6):
-    """Physics, with a residual whose outer weights are about that large."""
+    """Return physics with a residual whose outer weights have about this size."""
     prior = {f"field.physics.{name}": value for name, value in NEAR.items()}
     prior |= {"field.residual": 0.7, "field.residual.weight_out": size, "field.residual.bias_out": size}
     return model(hj.Hybrid(physics(), residual(hidden))), prior

@@ -1,4 +1,4 @@
-"""What flies: prediction models of the Iris, estimators that adapt them in the air, and the truth after each change."""
+"""Prediction models of the Iris, estimators that adapt them in the air, and the truth after each change."""
 
 import math
 from collections.abc import Mapping
@@ -76,13 +76,13 @@ HYPOTHESES = (
 
 
 def nominal() -> AbstractVectorField:
-    """The Iris with its drag and without ground effect; inertia, centre of mass, efficiencies and drag may change."""
+    """The Iris with drag and without ground effect; inertia, centre of mass, efficiencies and drag may change."""
     body = rigid_body(IRIS, LEARNED, Terms(drag=(DRAG_COEFFICIENT, DRAG_COEFFICIENT, DRAG_COEFFICIENT)))
     return corrected(body)
 
 
 def true_theta(domain: Domain) -> Float[np.ndarray, " 12"]:
-    """The truth after a change as `nominal` holds it. Its mass is fixed, so that another mass shows in all others."""
+    """Return `nominal`'s θ after a change; since its mass is fixed, another mass changes all other parameters."""
     vehicle, share = domain.vehicle, IRIS.mass / domain.vehicle.mass
     inertia = np.log(share * np.divide(vehicle.inertia, IRIS.inertia))
     centre = np.subtract(IRIS.rotor_positions, vehicle.rotor_positions)[0] / units_of(IRIS)["centre_of_mass"]
@@ -94,7 +94,7 @@ def true_theta(domain: Domain) -> Float[np.ndarray, " 12"]:
 
 
 def with_theta(theta: Float[Array | np.ndarray, " 12"]) -> AbstractVectorField:
-    """`nominal` at other parameters, in the order of `true_theta`."""
+    """Return `nominal` with other parameters, in the order of `true_theta`."""
     return ravel_learned(nominal())[1](jnp.asarray(theta, float))
 
 
@@ -103,7 +103,7 @@ class FixedModel(AbstractEstimator):
 
     Attributes:
         observer: of the disturbance, with the model; bandwidth 0 for none.
-        share: 1 if it knows the wind, else 0.
+        share: 1 if it includes the wind, else 0.
         clock: of the wind when the flight begins [s].
     """
 
@@ -124,11 +124,8 @@ class FixedModel(AbstractEstimator):
 
 
 class L1(AbstractEstimator):
-    """L1 adaptive augmentation with a piecewise constant law.
-
-    Hanover, Foehn, Sun, Kaufmann and Scaramuzza, "Performance, precision, and payloads: adaptive nonlinear MPC for
-    quadrotors", 2021: a predictor of v and ω, whose error gives the force and torque that the model lacks; of these
-    thrust and torques pass a low-pass filter and are taken off what the controller commands.
+    """L1 adaptive augmentation with a piecewise constant law and a predictor of v and ω (Hanover, Foehn, Sun, Kaufmann
+    and Scaramuzza, "Performance, precision, and payloads: adaptive nonlinear MPC for quadrotors", 2021).
     """
 
     field: AbstractVectorField
@@ -161,7 +158,7 @@ class L1(AbstractEstimator):
         return self._added(u, state[2])
 
     def _added(self, u, accelerations):
-        """The speeds that give these accelerations, along the thrust and about the three axes, beside those of u."""
+        """Add these accelerations, along the thrust and about the three axes, to the speeds u."""
         mixer = IRIS.mixer / np.array([IRIS.mass, *IRIS.inertia])[:, None]
         squares = jnp.square(u) + jnp.asarray(np.linalg.inv(mixer), u.dtype) @ accelerations
         return jnp.sqrt(jnp.clip(squares, 1.0, IRIS.max_rotor_speed**2))
@@ -170,7 +167,7 @@ class L1(AbstractEstimator):
 def fixed_model(
     field: AbstractVectorField, period: float, clock: float, bandwidth: float = 0.0, share: float = 0.0
 ) -> FixedModel:
-    """An agent that does not learn, or by an observer alone."""
+    """Return an agent that does not learn, or only by an observer."""
     numbers: list[Any] = [np.asarray(number, np.float32) for number in (bandwidth, share, clock)]
     return FixedModel(Observer(as_numpy(with_disturbance(field)), numbers[0], period), *numbers[1:])
 

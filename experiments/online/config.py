@@ -14,7 +14,7 @@ Agent = Literal["unadapted", "observer", "l1", "least_squares", "online", "oracl
 
 @dataclass(frozen=True)
 class OnlineConfig(Run):
-    """The simulated vehicle changes in the air. Every agent flies every reference through every change."""
+    """Change the simulated vehicle in the air, and fly every agent along every reference through every change."""
 
     seconds: Positive = 4.0
     """Length of a flight after the change [s]."""
@@ -53,7 +53,7 @@ class OnlineConfig(Run):
 
     @property
     def periods(self) -> int:
-        """Of a flight after the change, and of that before it, as both run the same program."""
+        """Periods of a flight before and after the change, equal since both run the same program."""
         return round(self.seconds / self.controller().period)
 
 

@@ -45,12 +45,11 @@ def indices(run: Run, **tags) -> list[int]:
 
 
 def whole(run: Run, i: int, name: str) -> np.ndarray:
-    """A quantity of a flight from its beginning on."""
+    """Return a quantity of a flight from its beginning on."""
     return np.concatenate([getattr(run.before[run.trials[i].start], name), getattr(run.after, name)[i]])
 
 
 def _panels(config: OnlineConfig):
-    """A figure with a panel for each change, over time."""
     rows = -(-len(config.changes) // 2)
     figure, panels = subplots((PAGE, 1.9 * rows + 0.9), rows, 2, sharex=True)
     for panel in panels.flat:
@@ -62,14 +61,14 @@ def _panels(config: OnlineConfig):
 
 
 def _times(config: OnlineConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Of each period after the change [s], and which of them are shown."""
+    """Return times after the change [s], and which of them are shown."""
     times = config.controller().period * (np.arange(2 * config.periods) + 1 - config.periods)
     return times, times > -BEFORE
 
 
 @mpl.rc_context(STYLE)
 def errors(run: Run, config: OnlineConfig, reference: str) -> Figure:
-    """Distance from the reference over time, the root mean square over seeds, a panel for each change."""
+    """Draw the RMS distance from the reference over seeds against time, a panel for each change."""
     figure, panels = _panels(config)
     for panel, change in zip(panels.flat, config.changes, strict=False):
         for agent in dict.fromkeys(trial.agent for trial in run.trials):
@@ -87,7 +86,7 @@ def errors(run: Run, config: OnlineConfig, reference: str) -> Figure:
 
 @mpl.rc_context(STYLE)
 def parameters(run: Run, config: OnlineConfig, reference: str) -> Figure:
-    """Estimates of one flight with their 95 % intervals, and the truth."""
+    """Draw estimates of one flight with their 95 % intervals, and the truth."""
     figure, panels = _panels(config)
     for panel, change in zip(panels.flat, config.changes, strict=False):
         i = indices(run, change=change, agent="online", reference=reference, seed=0)[0]

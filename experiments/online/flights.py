@@ -1,4 +1,4 @@
-"""Flights in which the vehicle changes in the air: one program for each kind of estimator, run before and after it."""
+"""Flights in which the vehicle changes in the air, with one program for each kind of estimator before and after it."""
 
 import math
 import time
@@ -54,7 +54,7 @@ class Segment(NamedTuple):
     """The part of a flight before or after the change.
 
     Attributes:
-        estimator: that adapts the controller's model.
+        estimator: adapts the controller's model.
         moment: the closed loop at its start.
         world: the true system.
         path: number in PATHS.
@@ -69,14 +69,14 @@ class Segment(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What is kept of a segment at each period.
+    """The record of a segment at each period.
 
     Attributes:
         error: distance from the reference [m].
         altitude: [m].
-        theta: estimated change of θ in the physics' own parametrisation; NaN if nothing is estimated.
+        theta: estimated change of θ in the physics' own parametrisation; NaN without an estimate.
         std: its standard deviation.
-        changes: how many were found so far.
+        changes: number of detected changes so far.
     """
 
     error: Float[Any, " t"]
@@ -93,8 +93,8 @@ class Run(NamedTuple):
         trials: in the order of `after`.
         after: records after the change, stacked.
         before: records before it, by `Trial.start`.
-        seconds: of all flights on the clock, without compiling.
-        processor_seconds: likewise on all cores.
+        seconds: wall-clock time of all flights, without compiling.
+        processor_seconds: the same on all cores.
     """
 
     trials: list[Trial]
@@ -105,7 +105,7 @@ class Run(NamedTuple):
 
 
 def simulate(config: OnlineConfig, segment: Segment, references: Float[Array, "k n 13"]):
-    """Fly a segment; returns the moment at its end and a `Record`."""
+    """Fly a segment; return the moment at its end and a `Record`."""
     loop = Loop(config.controller(), config.hardware(), segment.estimator)
     plant, reference = plant_of(segment.world, loop.controller.period), references[segment.path]
 
@@ -125,7 +125,6 @@ def simulate(config: OnlineConfig, segment: Segment, references: Float[Array, "k
 
 
 def before(config: OnlineConfig, agent: str, path: str, seed: int, key, references) -> Segment:
-    """The segment before the change."""
     clock: Any = np.float32(np.random.default_rng(seed).uniform(0, random_flight.CLOCK))
     controller, hardware, field = config.controller(), config.hardware(), agents.nominal()
     period = controller.period
@@ -142,7 +141,7 @@ def before(config: OnlineConfig, agent: str, path: str, seed: int, key, referenc
 
 
 def after(config: OnlineConfig, trial: Trial, first: Segment, moment: Any, fitted: Mapping[str, Any]) -> Segment:
-    """The segment after the change: another vehicle, and an estimator that may know more."""
+    """Return the segment after the change, with another vehicle and possibly an estimator with prior knowledge."""
     domain, clock, estimator = CHANGES[trial.change], float(first.world.clock), first.estimator
     period = config.controller().period
     if trial.agent == "oracle":
@@ -155,7 +154,7 @@ def after(config: OnlineConfig, trial: Trial, first: Segment, moment: Any, fitte
 
 
 def ground_fits(change: str, seeds: int, hardware: Hardware) -> AbstractVectorField:
-    """`nominal` with a disturbance, fitted to ten seconds of random flight after a change, stacked over seeds."""
+    """Fit `nominal` with a disturbance to ten seconds of random flight after a change, stacked over seeds."""
     flights = random_flight.random_flights(CHANGES[change], seeds, 10.0, jax.random.key(sum(map(ord, change))))
     noisy = jax.vmap(jax.vmap(hardware.measure))(
         jnp.asarray(flights.states, jnp.float32),
@@ -200,7 +199,7 @@ def fly_all(config: OnlineConfig, stages: Stages) -> Run:
     early: dict[tuple[str, str, int], Record] = {}
 
     def fly(kind: str) -> Record:
-        """Records of the trials after the change; those before it go into `early`."""
+        """Return the trials' records after the change, and store those before it in `early`."""
         moments, records = programs.fly(made[kind], kinds[kind], (references,))
         numbers = {start: i for i, start in enumerate(firsts[kind])}
         early.update({start: lane(records, i) for start, i in numbers.items()})

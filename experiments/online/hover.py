@@ -1,4 +1,4 @@
-"""Minutes of hover in two worlds, then a side wind: is adapting in the air ever worse than not to?
+"""Minutes of hover in two worlds, then a side wind: is adapting in the air ever worse than not adapting?
 
 python -m experiments.online.hover [SECONDS], by default 600.
 """
@@ -42,7 +42,7 @@ HYPOTHESES = (
 
 
 def _iris(integral, x: State, seen: State, push: Float[Array, "3"]):
-    """A period of the project's own simulator, under an acceleration [m/s²]."""
+    """Simulate a period of the project's own simulator, under an acceleration [m/s²]."""
     plan = pilot.Plan(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(()), jnp.zeros(4))
     integral, u = pilot.act(integral, seen, plan, parameters_of(IRIS), IRIS, pilot.scale_of(IRIS))
     truth = SOURCE.quadrotor()
@@ -51,7 +51,7 @@ def _iris(integral, x: State, seen: State, push: Float[Array, "3"]):
 
 
 def _hummingbird(speeds, x: State, seen: State, push: Float[Array, "3"]):
-    """A period of RotorPy's, in a wind that moves it about as much."""
+    """Simulate a period of RotorPy, in a wind with about the same effect."""
     still = Reference(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(()))
     command = jnp.clip(decide(HUMMINGBIRD, seen, still), 0.0, HUMMINGBIRD.fastest)
     (x, speeds), mean = advance(HUMMINGBIRD._replace(wind=1.5 * push), x, speeds, command, jnp.zeros(()))
@@ -65,15 +65,15 @@ WORLDS = {
 
 
 class Hovered(NamedTuple):
-    """What is kept of a flight at the end of each block of 0.1 s.
+    """The record of a flight at the end of each block of 0.1 s.
 
     Attributes:
-        errors: squared, of v and ω, of predictions over a block by the adapted and by the first model; with noise.
+        errors: squared prediction errors of v and ω over a block, of the adapted and the first model; with noise.
         theta: estimated change of Ix, Iy, k and of the disturbance.
-        deviation: of these.
+        deviation: standard deviation of theta.
         unexcited: flags.
         inconsistent: flag.
-        changes: how many were found.
+        changes: number of detected changes.
     """
 
     errors: Float[Any, "*n t 2 2"]
@@ -84,13 +84,13 @@ class Hovered(NamedTuple):
     changes: Float[Any, "*n t"]
 
     def ratios(self, first: int, last: int) -> Float[Any, "*n 2"]:
-        """RMS error of the adapted model over that of the first one in these blocks, of v and of ω."""
+        """RMS error of the adapted model over the first one's in these blocks, of v and of ω."""
         rms = np.sqrt(self.errors[..., first:last, :, :].mean(axis=-3))
         return rms[..., 0, :] / rms[..., 1, :]
 
 
 def adaptation_of(world: str, noise: float, named: bool = False) -> OnlineAdaptation:
-    """The filter that docs/howto/online.md builds, or that with hypotheses."""
+    """Return the filter of docs/howto/online.md, or one with hypotheses."""
     sizes = tuple(hardware(noise, 0, 0).sizes().tolist())
     options: Any = {"process": PROCESS, "hypotheses": HYPOTHESES if named else ()}
     return OnlineAdaptation(rigid_body(WORLDS[world][1]), DT, sizes, PRIOR, DISTURBANCE, **options)

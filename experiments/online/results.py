@@ -1,4 +1,4 @@
-"""The results of flights with a change in the air: a row for each flight, tables, and the claims on them."""
+"""Rows, tables and claims of flights with a change in the air."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ TAGS = ("change", "reference", "agent", "seed")
 
 @dataclass(frozen=True)
 class Evidence:
-    """All flights, and how long things took."""
+    """All flights, and their times."""
 
     rows: Results
     step_ms: float  # processor time of one step of the filter on one core
@@ -33,7 +33,7 @@ class Evidence:
 
 
 def results_of(run: Run) -> Results:
-    """A row for each flight. RMSE in m: of the first second after the change, and from SETTLED on."""
+    """Return a row for each flight, with RMSE [m] of the first second after the change, and from SETTLED on."""
     rows = []
     for i, trial in enumerate(run.trials):
         error, low = run.after.error[i], run.after.altitude[i].min()
@@ -51,7 +51,7 @@ def rms(values: Any) -> float:
 
 
 def _intervals(run: Run, i: int, change: str) -> Row:
-    """The share of the time from LEARNED on that each interval contains the true value; when it alarmed."""
+    """Return the share of time from LEARNED on with the true value inside each interval; and when it alarmed."""
     late = slice(round(LEARNED * RATE), None)
     theta, std = run.after.theta[i][late, :PARTS], run.after.std[i][late, :PARTS]
     inside = np.abs(theta - true_theta(CHANGES[change])) <= Z * std
@@ -62,12 +62,12 @@ def _intervals(run: Run, i: int, change: str) -> Row:
 
 
 def error(name: str):
-    """An error in cm, infinite for a crash."""
+    """Return an error in cm, infinite for a crash."""
     return lambda row: np.inf if row["crashed"] or row[name] is None else 100 * row[name]
 
 
 def tables(rows: Results) -> list[Table]:
-    """Errors after the change of each agent, by reference; when it was found; coverage."""
+    """Return tables of each agent's errors by reference, of detection times and of coverage."""
     made = []
     columns = {REFERENCES[name]: {"reference": name} for name in rows.unique("reference")}
     for change, group in rows.group("change").items():
@@ -108,7 +108,7 @@ def _coverage(rows: Results) -> list[Table]:
 
 
 def _compared(e: Evidence, change: str, other: str, factor: float) -> Iterator[Part]:
-    """On each reference, whether the error of online adaptation is at most a factor times that of another agent."""
+    """On each reference, whether online adaptation's error is at most a factor times another agent's."""
     for reference in e.rows.unique("reference"):
         own, others = (e.rows.where(change=change, agent=name, reference=reference) for name in ("online", other))
         if not len(own) or not len(others):

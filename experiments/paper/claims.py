@@ -1,8 +1,4 @@
-"""The paper's claims (Sec. 4.4 to 4.7); the text of each states how it is evaluated.
-
-A claim about means holds if the whole 95 % interval of the paired difference is on its side of the limit, and fails if
-it is all on the other; in between it is undecided.
-"""
+"""The paper's claims (Sec. 4.4 to 4.7), decided by the 95 % interval of a paired difference."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,7 +49,7 @@ class Evidence:
     def difference(
         self, first: tuple[Any, ...], second: tuple[Any, ...], times: float = 1.0, column: Column = "test_mse"
     ) -> Interval:
-        """The mean of the first cell's minus `times` the second's, paired by seed and draw."""
+        """Return the mean of the first cell minus `times` the second's, paired by seed and draw."""
         try:
             return self.rows(*first).interval(column, self.rows(*second), times)
         except ValueError as why:
@@ -64,10 +60,7 @@ Predicate = Callable[[Evidence], Iterator[Part]]
 
 
 def claims(rows: Results, experiment: str, truth: Mapping[str, float] | None, quick: bool = False) -> list[Verdict]:
-    """Evaluate the claims about one of DOMAINS_OF. An error that is not finite counts as infinite.
-
-    Of the rows of a quick preset only the claims in `QUICK` are judged.
-    """
+    """Evaluate the claims about one of DOMAINS_OF, for a quick preset only `QUICK`; errors not finite are infinite."""
     evidence = [Evidence(domain, cells(rows.where(domain=domain)), truth) for domain in DOMAINS_OF[experiment]]
     own = [id for id in CLAIMS if experiment in ONLY.get(id, ("param_shift", "external_force"))]
     judge = {id: _too_few if quick and id not in QUICK else partial(_in_each_domain, CLAIMS[id][1]) for id in own}
@@ -79,7 +72,7 @@ def _too_few(evidence: Sequence[Evidence]) -> Part:
 
 
 def _in_each_domain(predicate: Predicate, evidence: Sequence[Evidence]) -> Part:
-    """Whether a claim holds in each domain; it is not judged if one lacks data."""
+    """Whether a claim is true in each domain; it is not judged if one lacks data."""
 
     def part(e: Evidence) -> Part:
         place = f"{label(e.domain)}: " if len(evidence) > 1 else ""
@@ -116,7 +109,7 @@ def _less_spread(e: Evidence) -> Iterator[Part]:
 
 
 def _by_seed(rows: Results) -> dict[int, float]:
-    """The mean error of each seed over its draws."""
+    """Return the mean error of each seed over its draws."""
     return {seed: own.spread("test_mse").mean for seed, own in rows.group("seed").items()}
 
 
@@ -146,7 +139,7 @@ def _beats_source_only(e: Evidence) -> Iterator[Part]:
 
 
 def pretraining_helps(e: Evidence, few: int, large: Sequence[int], equally: bool = True) -> Iterator[Part]:
-    """Clearly with few windows, and not clearly with a large number; `equally`: nor the other way round."""
+    """Significantly with few windows, and not with a large number; `equally`: nor the other way round."""
     for n in (few, *large):
         alone, tuned = (HYBRID, n, TARGET_ONLY), (HYBRID, n)
         most, least = (e.difference(alone, tuned, times) for times in (CLEARLY, 1 / CLEARLY))
@@ -167,7 +160,7 @@ def few_are_enough(e: Evidence, few: int = FEW, many: int = MANY) -> Iterator[Pa
 
 
 def ratio(above: Spread, below: Spread) -> float:
-    """Of the means; NaN where both are zero or both are infinite."""
+    """Return the ratio of the means; NaN if both are zero or infinite."""
     if below.mean == 0 or above.mean == below.mean == math.inf:
         return math.nan if above.mean in (0, math.inf) else math.inf
     return above.mean / below.mean

@@ -43,7 +43,7 @@ def settings(config: Config) -> Settings:
 
 
 def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVectorField:
-    """The untrained models of all seeds, stacked. A seed gives all models the same physics and network."""
+    """Return untrained models of all seeds, stacked; a seed gives all models the same physics and network."""
     # In tenths of the hover speed, from hover: of the magnitude of the other inputs.
     hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
     network = {
@@ -78,7 +78,7 @@ def _fresh_hybrids(
 def pretraining(
     model: str, fields: AbstractVectorField, config: Config, factor: float = 1.0
 ) -> tuple[FitState, RunConfig]:
-    """One run per seed, from the seeds' fields, on all source trajectories, with all rates times a factor."""
+    """Return one run per seed, from the seeds' fields, on all source trajectories, with all rates times a factor."""
     patience = config.patience
     rule = patience.no_physics_pretraining if model == "no_physics" else patience.hybrid_pretraining
     rates = config.rates.physics, config.rates.pretraining
@@ -90,7 +90,7 @@ def pretraining(
 def adaptation(
     model: str, mode: str, fields: AbstractVectorField, config: Config, sizes: Sequence[int]
 ) -> tuple[FitState, RunConfig]:
-    """One run for each size, draw and seed, in this order, from the seeds' fields; the subsets of a seed are nested."""
+    """Return one run for each size, draw and seed, in this order; the subsets of a seed are nested."""
     one, drawn = lane(fields, 0), subsets(config)
 
     def plan(size: int, subset: np.ndarray) -> RunConfig:
@@ -108,7 +108,7 @@ def adaptation(
 def augmentation(
     experts: AbstractVectorField, past: Trajectories, encoding: Encoding, config: Config
 ) -> tuple[FitState, RunConfig]:
-    """One run per seed: the encoder of Expert Augmentation, which sees the past, the first part of source windows."""
+    """Return one run per seed of Expert Augmentation's encoder, which reads the first part of source windows."""
 
     def build(expert, seed):
         key = _key(seed, ENCODER)
@@ -122,7 +122,7 @@ def augmentation(
 
 
 def subsets(config: Config) -> Int[np.ndarray, "runs pool"]:
-    """For each draw and seed, in this order, the indices of target trajectories as they are taken from the pool."""
+    """Return the target trajectories' indices in the pool for each draw and seed, in this order."""
     if config.draw == "random":
         keys = [_key(seed, SUBSET) for seed in range(config.seeds)]
         keys = [jax.random.fold_in(key, draw) if draw else key for draw in range(config.draws) for key in keys]
@@ -131,13 +131,13 @@ def subsets(config: Config) -> Int[np.ndarray, "runs pool"]:
 
 
 def held_back(subset: Int[np.ndarray, "*runs n"]) -> tuple[Int[np.ndarray, "*runs m"], Int[np.ndarray, "*runs v"]]:
-    """The first of the target trajectories, to train on, and the last fifth of them, to stop by."""
+    """Split target trajectories for training and, the last fifth, for early stopping."""
     own = max(subset.shape[-1] // HELD_BACK, 1)
     return subset[..., :-own], subset[..., -own:]
 
 
 def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[tuple[float, float], Stopping]:
-    """The rates of θ_p and θ_d, and the stopping rule, of a size."""
+    """Return the rates of θ_p and θ_d, and the stopping rule, of a size."""
     rates, patience, i = config.rates, config.patience, column(size)
     if model == "no_physics":
         rate = rates.no_physics_target_only if mode == "target_only" else rates.no_physics[i]
@@ -155,7 +155,7 @@ def _plan(
 
 
 def _with_offset(plan: RunConfig, field: AbstractVectorField, config: Config) -> RunConfig:
-    """The plan with --rates.offset for v̇ and ω̇ in the output bias of the network, if it is given."""
+    """Return the plan with --rates.offset for v̇ and ω̇ in the network's output bias, if given."""
     offset = config.rates.offset
     if offset is None:
         return plan
@@ -200,7 +200,7 @@ class Noise:
 
 
 def measure(x: Float[Array, "*n 13"], noise: Noise, key: PRNGKeyArray) -> Float[Array, "*n 13"]:
-    """The states with white noise; quaternions are normalised again."""
+    """Add white noise to the states and normalise quaternions."""
     sizes = np.zeros(13)
     for group, size in zip((POSITION, QUATERNION, VELOCITY, BODY_RATES), asdict(noise).values(), strict=True):
         sizes[group] = size
@@ -209,7 +209,7 @@ def measure(x: Float[Array, "*n 13"], noise: Noise, key: PRNGKeyArray) -> Float[
 
 
 def measured(dataset: Dataset, level: float, seed: int) -> Dataset:
-    """The dataset with `level` times the typical noise on all but its test splits."""
+    """Add `level` times the typical noise to all but the test splits."""
     if not level:
         return dataset
     noise = Noise(**{name: level * size for name, size in asdict(Noise()).items()})

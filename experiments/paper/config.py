@@ -192,7 +192,7 @@ class Config(Run):
             raise ValueError(f"--sizes must each be at least {HELD_BACK} with --validation own, got {self.sizes}")
 
     def pooled(self) -> int:
-        """Target trajectories to draw from; with contiguous those of all draws."""
+        """Target trajectories to draw from; with contiguous for all draws."""
         if self.draw == "contiguous":
             return self.draws * self.flown_each() * self.windows_each()
         return max(self.sizes) if self.pool is None else self.pool
@@ -202,19 +202,16 @@ class Config(Run):
         return self.pooled() if self.draw == "random" else None
 
     def flown_each(self) -> int:
-        """Flights of a contiguous draw."""
         return -(-max(self.sizes) // FLIGHT)
 
     def windows_each(self) -> int:
-        """Trajectories of each flight of a contiguous draw."""
         return -(-max(self.sizes) // self.flown_each())
 
     def runs(self) -> int:
-        """Runs of each size."""
         return self.draws * self.seeds
 
     def validating(self) -> int:
-        """Validation trajectories of the source; of those of the paper, one to ten for training."""
+        """Validation trajectories of the source, in the paper's ratio of one to ten."""
         return max(self.source_train // 10, 1) if self.validation == "own" else self.validation
 
 
@@ -269,13 +266,13 @@ ONE_FLIGHT: dict[str, Any] = {"noise": 1.0, "noise_on": "target", "draw": "conti
 
 
 def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:
-    """A configuration with the shared options of another one, except sizes and pool, and the changes."""
+    """Return a configuration with another's shared options, except sizes and pool, and the changes."""
     shared = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
     return kind(**shared | changes)
 
 
 def column(size: int) -> int:
-    """The column of the paper's table that is nearest to a size, by ratio."""
+    """Return the column of the paper's table nearest to a size, by ratio."""
     return min(range(len(TABLE_SIZES)), key=lambda i: max(size / TABLE_SIZES[i], TABLE_SIZES[i] / size))
 
 

@@ -29,7 +29,7 @@ HOME, FLOOR = "hybrid before the change", "no model can do better"  # errors on 
 
 
 class _Curve(NamedTuple):
-    """At each N: mean and std of the finite values, the smallest; how many of how many are not finite."""
+    """At each N: mean and std of the finite values, the smallest, and the count of values that are not finite."""
 
     n: np.ndarray
     mean: np.ndarray
@@ -44,7 +44,7 @@ _Curves = dict[tuple[str, str], _Curve]  # by model and mode
 
 @mpl.rc_context(STYLE)
 def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
-    """Figs. 3 and 5: test error, above a floor that no model can get below, and ρ against N; mean ± std over seeds."""
+    """Figs. 3 and 5: test error, above the attainable floor, and ρ against N; mean ± std over seeds."""
     figure, ((left, right),) = subplots((PAGE, 3.9), 1, 2)
     errors, gains = _curves(rows, "test_mse"), _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain)
     _draw_errors(left, errors, floor)
@@ -79,10 +79,7 @@ def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
 
 
 def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProxyType({})) -> Figure:
-    """Table 2: the test errors of all seeds of every method, the smallest mean on top, a panel for each domain.
-
-    `floors` has for a domain the error that no model can get below.
-    """
+    """Table 2: test errors of all seeds of every method, the best on top; a panel and a floor for each domain."""
     several = len(adapted_sizes(rows)) > 1
 
     def line(cell: Cell, own: Results) -> Line:
@@ -95,7 +92,7 @@ def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProx
 
 
 def ablation(rows: Results, title: str, floors: Mapping[str, float]) -> Figure:
-    """The fine-tuned models of one choice, as in `ranking`: a line for each value and N."""
+    """Draw the fine-tuned models of one choice, as in `ranking`: a line for each value and N."""
     sizes = adapted_sizes(rows)
 
     def line(own: Results, n: int) -> Line:
@@ -152,14 +149,14 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
 
 
 def _band(axes: Axes, curve: _Curve) -> tuple[np.ndarray, np.ndarray]:
-    """One std about the mean. It may reach below 0, which a log axis has not; it then ends at the best seed."""
+    """Draw one std about the mean, cut at the best seed if it reaches below 0 on a log axis."""
     low = curve.mean - curve.std
     low = np.where(low > 0, low, curve.smallest) if axes.get_yscale() == "log" else low
     return low, curve.mean + curve.std
 
 
 def _draw(axes: Axes, curves: _Curves, bottom: float, top: float, lost_at_top: bool = True) -> None:
-    """Draw within [bottom, top], the spread as a band; mark what lies outside or is not finite."""
+    """Draw within [bottom, top], the spread as a band; mark values outside or not finite."""
     axes.set_ylim(bottom, top)
     for (model, mode), curve in curves.items():
         inside = (curve.mean >= bottom) & (curve.mean <= top)

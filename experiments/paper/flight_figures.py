@@ -1,4 +1,4 @@
-"""Figures of flights: how predictions part from the truth (Figs. 2 and 4), and an example of the data (Fig. 7)."""
+"""Figures of flights: predictions and the truth (Figs. 2 and 4), and an example of the data (Fig. 7)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -93,7 +93,7 @@ def _draw_growth(axes: Axes, models: Mapping[str, Flights], truth: Flights, dt: 
 
 
 def _draw_from_above(axes: Axes, truth: States, models: Mapping[str, States]) -> None:
-    """Paths in x and y, in a square around the truth; a prediction ends with × where it leaves it."""
+    """Draw paths in x and y, in a square around the truth; a prediction that leaves it ends with ×."""
     path = truth[:, POSITION][:, :2]
     centre, extent = (path.min(axis=0) + path.max(axis=0)) / 2, np.ptp(path, axis=0).max()
     half = max(MIN_HALF_WIDTH, VIEW_RATIO * extent / 2)

@@ -1,4 +1,4 @@
-"""How often the intervals of θ_p contain the truth where the vehicle is a known rigid body and no network is fitted."""
+"""How often the intervals of θ_p contain the truth for a known rigid body without a network."""
 
 import itertools
 
@@ -44,10 +44,9 @@ class Dragged(AbstractVectorField):
 
 
 def coverage(repeats: int, console: Console) -> Results:
-    """A row for each parameter in every case: exact physics and unknown drag, with noise on targets and on all.
+    """Return a row for each parameter with exact physics and with unknown drag, with noise on targets and on all.
 
-    The first says whether the intervals are honest, the second how far they mislead when the physics is wrong. Shares;
-    bias and half-width in % of the truth. A repeat, a recording with its own fit, that did not converge is a miss.
+    Shares; bias and half-width in % of the truth. A repeat that did not converge is a miss.
     """
     cases = list(itertools.product({"exact physics": 0.0, "unknown drag": DRAG}.items(), NOISE_ON))
     keys, rows = jax.random.split(jax.random.key(0), repeats), []
@@ -74,7 +73,7 @@ def coverage(repeats: int, console: Console) -> Results:
 
 
 def recording(start_is_measured: Bool[Array, ""], drag: Float[Array, ""], key: PRNGKeyArray) -> Trajectories:
-    """Windows of the true vehicle as they would be measured."""
+    """Return windows of the true vehicle with measurement noise."""
     start_key, input_key, x0_key, x_key = jax.random.split(key, 4)
     x0, noise = starts(start_key), Noise()
     u = IRIS.hover_speed + ROTOR_SPEED * jax.random.normal(input_key, (WINDOWS, STEPS, 4))
@@ -85,12 +84,7 @@ def recording(start_is_measured: Bool[Array, ""], drag: Float[Array, ""], key: P
 
 
 def starts(key: PRNGKeyArray) -> Float[Array, "n 13"]:
-    """Random states near hover.
-
-    In steady flight a vehicle leans into its velocity until thrust balances drag, by c v / (m g) [rad] horizontally.
-    Without this link between attitude and velocity the drag that the model does not know would be as often up as down
-    the thrust, and would average out.
-    """
+    """Draw random states near hover, leaning by c v / (m g) [rad] so that thrust balances drag, as in steady flight."""
     velocity_key, tilt_key, rates_key = jax.random.split(key, 3)
     v = jax.random.normal(velocity_key, (WINDOWS, 3)) * jnp.asarray(SPEED)
     lean = DRAG / (IRIS.mass * IRIS.gravity) * jnp.stack([-v[:, 1], v[:, 0]], axis=1)
@@ -102,7 +96,7 @@ def starts(key: PRNGKeyArray) -> Float[Array, "n 13"]:
 
 @jit_with(FASTEST_COMPILE)
 def _repeat(start_is_measured: Bool[Array, ""], drag: Float[Array, ""], key: PRNGKeyArray) -> dict[str, Array]:
-    """Errors in shares of the truth, and whether the 95 % intervals contain it."""
+    """Return relative errors, and whether the 95 % intervals contain the truth."""
     windows = recording(start_is_measured, drag, key)
     found = fit_least_squares(rigid_body(IRIS), windows)
     around = intervals(found.field, covariance_of(found.field, windows), 0.95)
@@ -114,7 +108,7 @@ def _repeat(start_is_measured: Bool[Array, ""], drag: Float[Array, ""], key: PRN
 
 
 def known_body_table(rows: Results) -> Table:
-    """A line for each parameter in every case of `coverage`."""
+    """Return a line for each parameter in every case of `coverage`."""
     columns = {
         "coverage [%]": lambda r: f"{100 * r[0]['coverage']:.1f} ± {100 * r[0]['standard_error']:.1f}",
         "bias [%]": lambda r: f"{r[0]['bias']:+.2f}",

@@ -38,7 +38,7 @@ Cell = tuple[str, str, int]  # model, mode, n_train
 
 
 class Fit(NamedTuple):
-    """Models after training, or adapted by a method that is solved instead: stacked, one for each size and seed.
+    """Models after training, or adapted in closed form: stacked, one for each size and seed.
 
     Attributes:
         val_mse: L_MSE of each on the validation windows.
@@ -52,7 +52,7 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True)
 class Lanes:
-    """The tested models of one kind in one mode, stacked, and the row of each in the table of results."""
+    """The tested models of one kind in one mode, stacked, and each one's row in the table of results."""
 
     model: str
     mode: str
@@ -75,11 +75,11 @@ def lanes_of(
     theta: Mapping[str, np.ndarray] | None = None,
     more: Mapping[str, np.ndarray] | None = None,
 ) -> Lanes:
-    """Models tested in a domain, one for each size, draw and seed, in this order.
+    """Return models tested in a domain, one for each size, draw and seed, in this order.
 
     Args:
         errors: L^T_MSE on the test flights.
-        theta: name → the value of each, instead of that in the models.
+        theta: name → the value of each, instead of the models' own.
         more: further columns, the number of each.
     """
     theta, runs = theta_of(fit.fields) if theta is None else theta, len(errors) // len(sizes)
@@ -107,7 +107,7 @@ def lanes_of(
 def by_altitude(
     column: str, windows: Trajectories, errors: Float[np.ndarray, "lanes windows"]
 ) -> dict[str, Float[np.ndarray, " lanes"]]:
-    """The mean error of each model over the windows of each band, by column; NaN for a band without windows."""
+    """Average each model's error over the windows of each band, by column; NaN for a band without windows."""
     band = bands(windows)
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = [errors[:, band == i].sum(axis=1) / np.float64(np.sum(band == i)) for i in range(len(BANDS))]
@@ -115,17 +115,17 @@ def by_altitude(
 
 
 def bands(windows: Trajectories) -> Int[np.ndarray, " windows"]:
-    """The index in BANDS of the lowest altitude of each window."""
+    """Return the index in BANDS of the lowest altitude of each window."""
     return np.digitize(np.minimum(windows.x0[:, 2], windows.x[..., 2].min(axis=1)), BAND_EDGES)
 
 
 def physics_in(field: Any) -> Any:
-    """The physics inside a field, also of nested hybrids."""
+    """Return the physics inside a field, also of nested hybrids."""
     return physics_in(field.physics) if isinstance(field, Hybrid) else field
 
 
 def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray]:
-    """θ_p of a model, or of stacked ones; empty for one without physics."""
+    """Return θ_p of a model, or of stacked ones; empty without physics."""
     return {name: np.asarray(value) for name, value in getattr(physics_in(field), "theta", dict)().items()}
 
 
@@ -134,7 +134,7 @@ def rows_of(groups: Sequence[Lanes]) -> Results:
 
 
 def with_rho(rows: Results) -> Results:
-    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9), L^S the same seed's source-only error; see `source_of`."""
+    """Add ρ = (L^S − L^T) / L^S (paper, Eq. 9), L^S the same seed's source-only error; see `source_of`."""
     source = {(row["domain"], row["model"], row["seed"]): row["test_mse"] for row in rows.where(mode=SOURCE_ONLY)}
 
     def rho(row: Row) -> float | None:
@@ -149,36 +149,35 @@ def with_rho(rows: Results) -> Results:
 
 
 def source_of(model: str) -> str:
-    """The model whose pre-training an adaptation starts from."""
+    """Return the model whose pre-training an adaptation starts from."""
     return HYBRID if model in BASELINES else model
 
 
 def gain(row: Row) -> float:
-    """ρ as it counts in a mean: −∞ if the test error is not finite; 1 if only the source-only error is not finite."""
+    """Return ρ for a mean: −∞ if the test error is not finite; 1 if only the source-only error is not finite."""
     if row["rho"] is not None:
         return row["rho"]
     return -math.inf if row["test_mse"] is None else 1.0
 
 
 def cells(rows: Results) -> dict[Cell, Results]:
-    """The rows of each model, mode and N, in the order of MODELS, MODES and N."""
+    """Group rows by model, mode and N, in the order of MODELS, MODES and N."""
     if len(domains := sorted(rows.unique("domain"))) > 1:
         raise ValueError(f"rows must be of one domain, got {', '.join(domains)}")
     return rows.sort(model=MODELS, mode=MODES, n_train=None).group(*CELL)
 
 
 def by_domain(rows: Results) -> dict[str, Results]:
-    """The rows of each domain, in the order of DOMAINS."""
+    """Group rows by domain, in the order of DOMAINS."""
     return rows.sort(domain=DOMAINS).group("domain")
 
 
 def adapted_sizes(rows: Results) -> list[int]:
-    """Each N of adapted models, ascending."""
     return sorted({*rows["n_train"]} - {0})
 
 
 def ranked(rows: Results) -> dict[Cell, Results]:
-    """`cells`, the smallest mean error first; among infinite means the smallest error first."""
+    """Return `cells`, the smallest mean error first; among infinite means the smallest error first."""
 
     def error(item: tuple[Cell, Results]) -> tuple[float, float]:
         values = item[1].spread("test_mse")
@@ -188,14 +187,14 @@ def ranked(rows: Results) -> dict[Cell, Results]:
 
 
 def method_label(cell: Cell) -> str:
-    """A cell as a method for readers, without its N: an adapted model needs no mode, nor does a baseline."""
+    """Label a cell as a method for readers, without N, and without the mode if that is clear."""
     model, mode, _ = cell
     plain = mode == names.FINE_TUNED or (mode == SOURCE_ONLY and model in BASELINES)
     return label(model) if plain else label(model, mode)
 
 
 def save_models(folder: Path, groups: Sequence[Lanes], rows: Results) -> None:
-    """Save every trained model, with what its row says about it; the rows as `rows_of` orders them."""
+    """Save every trained model with its row, in the order of `rows_of`."""
     models = [lane(lanes.fields, i) for lanes in groups for i in range(len(lanes.rows))]
     for model, row in zip(models, rows, strict=True):
         about = {name: row[name] for name in ("model", "mode", "n_train", "draw", "seed", "test_mse", "val_mse")}

@@ -33,7 +33,7 @@ else:
 
 @dataclass(frozen=True)
 class Case:
-    """The data and models that a method may use in one target domain.
+    """Data and models for the methods in one target domain.
 
     Attributes:
         pretrained: by model, one per seed.
@@ -52,7 +52,7 @@ class Case:
         return self.target.config["domain"]
 
     def tested(self, name: str, fields: Any) -> np.ndarray:
-        """L^T_MSE of stacked fields on the steps after the past."""
+        """Return L^T_MSE of stacked fields on the steps after the past."""
         _, future = split(self.target.splits["test_with_past"], PAST)
         return self.stages.timed(
             f"test {name} {self.name}", lambda: evaluate(fields, future, 1, settings(self.config)), "testing"
@@ -66,7 +66,7 @@ def source_only(case: Case, model: str) -> Lanes:
 
 
 def adapted(case: Case, method: Method) -> Lanes:
-    """The source models adapted by a method: fine-tuned by Adam, by an encoder, or by a method of the library."""
+    """Adapt the source models by a method: Adam, an encoder, or a method of the library."""
     if method == names.EXPERT_AUGMENTATION:
         return _augmented(case)
     config, mode, model = case.config, names.FINE_TUNED, source_of(method)
@@ -85,7 +85,7 @@ def adapted(case: Case, method: Method) -> Lanes:
 
 
 def _augmented(case: Case) -> Lanes:
-    """Expert Augmentation: the encoder estimates θ_p of each test window from its past; it uses no target data."""
+    """Expert Augmentation: the encoder estimates θ_p of each test window from its past, without target data."""
     name, experts, windows = names.EXPERT_AUGMENTATION, case.experts, case.target.splits["test_with_past"]
     assert experts is not None
 
@@ -97,7 +97,7 @@ def _augmented(case: Case) -> Lanes:
 
 @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
 def _encoded(experts, windows: Trajectories, solver):
-    """The test error of each model, and its physics with the mean of the estimates of θ_p."""
+    """Return the test error of each model, and its physics with the mean estimate of θ_p."""
     past, _ = split(windows, PAST)
 
     def one(model):

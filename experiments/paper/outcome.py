@@ -1,4 +1,4 @@
-"""What an experiment leaves in its folder: the report with its introduction, the figures and the models."""
+"""The output of an experiment: the report with its introduction, the figures and the models."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -94,7 +94,7 @@ def paper_report(
     floor: float = 0.0,
     extra: Mapping[str, Any] | None = None,
 ) -> Report:
-    """The report of an experiment of the paper; `truth`: the true θ_p, by domain where there are several."""
+    """Build an experiment's report; `truth`: the true θ_p, by domain if there are several."""
     verdicts = claims(rows, experiment, truth, quick=config.preset == "quick")
     headline = ranking if experiment == COMPARISON else by_size
     altitude = altitudes(rows) if experiment != COMPARISON else []
@@ -135,7 +135,7 @@ def introduction(experiment: str, rows: Results) -> str:
 
 
 def draw(domain: Domain, config: AdaptationConfig, found: Study, floor: float) -> dict[str, tuple[Figure, str]]:
-    """Figs. 2/4, 3/5 and 7, with captions, by name."""
+    """Draw Figs. 2/4, 3/5 and 7, with captions, by name."""
     title = label(domain.name).capitalize()
     flight = random_flights(domain, 1, FLIGHT_SECONDS, jax.random.key(config.data_seed))
     example = example_flight(np.asarray(flight.states[0]), np.asarray(flight.inputs[0]), DT)
@@ -150,7 +150,7 @@ def draw(domain: Domain, config: AdaptationConfig, found: Study, floor: float) -
 
 
 def paths(title: str, found: Study) -> Figure:
-    """Test flights as every fine-tuned model of the first seed predicts them; from above that of the first's median."""
+    """Draw test flights as predicted by the first seed's fine-tuned models; from above the flight of median error."""
     tuned = [lanes for lanes in found.lanes if lanes.mode == FINE_TUNED and lanes.model != PHYSICS_ONLY]
     test = found.target.splits["test"][:DRAWN_FLIGHTS]
     sizes = {row["n_train"] for row in tuned[0].rows}

@@ -1,4 +1,4 @@
-"""What the method that the windows choose costs, against the best candidate in hindsight."""
+"""The error of `auto` against the best candidate in hindsight."""
 
 from collections.abc import Sequence
 
@@ -31,13 +31,13 @@ CHANGES = {
 
 
 def of_each_case(rows: Results, name: str) -> np.ndarray:
-    """The test error of a candidate, a method or `AUTO`, for each domain, draw and seed."""
+    """Return the test error of a candidate, a method or `AUTO`, for each domain, draw and seed."""
     own = rows.where(taken=True) if name == AUTO else rows.where(candidate=name)
     return np.array([case.numbers("test_mse")[0] for case in own.group("domain", "draw", "seed").values()])
 
 
 def best_of_each_case(rows: Results) -> np.ndarray:
-    """The smallest test error of all candidates, for each domain, draw and seed."""
+    """Return the smallest test error of all candidates, for each domain, draw and seed."""
     candidates = rows.where(lambda row: row["candidate"] not in COMPARED)
     return np.array([case.spread("test_mse").smallest for case in candidates.group("domain", "draw", "seed").values()])
 
@@ -47,7 +47,7 @@ def regret(rows: Results) -> np.ndarray:
 
 
 def over(rows: Results, name: str) -> np.ndarray:
-    """The error of the candidate that was taken over that of another one, or of a method, in each case."""
+    """Return the chosen candidate's error over another's, or a method's, in each case."""
     return of_each_case(rows, AUTO) / of_each_case(rows, name)
 
 
@@ -103,7 +103,7 @@ CLAIMS: Sequence[Claim[Results]] = (
 
 
 def conclusion(rows: Results) -> list[str]:
-    """One sentence: the share of the source's error that is gone, and what fine-tuning does."""
+    """Summarise the removed share of the source's error, and fine-tuning, in one sentence."""
     gains = {domain: 1 - over(own, "source").mean() for domain, own in rows.group("domain").items()}
     sentence = (
         f"`adapt` removes {min(gains.values()):.0%} to {max(gains.values()):.0%} of the source's error, by change"
@@ -118,7 +118,7 @@ def conclusion(rows: Results) -> list[str]:
 
 
 def regret_table(rows: Results) -> Table:
-    """A line per domain: regret, ρ, and how often each candidate was taken."""
+    """Return a line per domain: regret, ρ, and how often each candidate was chosen."""
     lines = []
     for domain, own in rows.group("domain").items():
         found, rho = regret(own), 1 - over(own, "source")
@@ -132,7 +132,7 @@ def regret_table(rows: Results) -> Table:
 
 
 def error_table(rows: Results) -> Table:
-    """Mean test errors: a line per candidate and method, a column per domain."""
+    """Return mean test errors: a line per candidate and method, a column per domain."""
     groups = rows.group("domain")
 
     def text(own: Results, name: str) -> str:
@@ -144,7 +144,7 @@ def error_table(rows: Results) -> Table:
 
 @mpl.rc_context(STYLE)
 def error_figure(rows: Results) -> Figure:
-    """The error of each change as a percentage of that without adaptation; lines reach from the least to the most."""
+    """Draw each change's error as a percentage of the unadapted one; lines reach from the least to the most."""
     groups = rows.group("domain")
     figure, ((axes,),) = subplots((6.4, 1.4 + 0.36 * len(groups)), 1, 1)
     axes.axvline(100, color=METHODS["not adapted"], label="not adapted")

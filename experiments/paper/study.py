@@ -68,7 +68,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
 
 
 def protocol(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, stages: Stages) -> list[Stage]:
-    """Fly in the source and in the target; pre-train each model, adapt it to the target, and test what came of it."""
+    """Fly in the source and in the target; pre-train each model, adapt it to the target, and test it."""
     flying = partial(flown, config=config, stages=stages)
     source = Stage(("flights", SOURCE.name), partial(flying, SOURCE, source_splits(config), file=config.source_flights))
     target = Stage(("flights", domain.name), partial(flying, domain, target_splits(config), file=config.target_flights))
@@ -97,7 +97,7 @@ def protocol(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, stages:
 def _adapted(
     model: str, mode: str, vehicle: Vehicle, config: Config, stages: Stages, learned: Fit, target: Dataset
 ) -> Fit:
-    """A model after adaptation from its source model, or, target-only, from a fresh start."""
+    """Adapt a model from its source model or, target-only, from a fresh start."""
     if model in SOLVED:
         name = f"{mode} {model} {target.config['domain']}"
         return solved(name, SOLVED[model], learned.fields, config, stages, target)
@@ -106,7 +106,7 @@ def _adapted(
 
 
 def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> Fit:
-    """A model after pre-training on source flight, one run per seed."""
+    """Pre-train a model on source flight, one run per seed."""
     shared, name = (settings(config), source, capacity(config)), f"pre-training {model}"
     found = stages.sweep(name, *pretraining(model, fresh_fields(model, vehicle, config), config), *shared)
     for factor in config.rates.decay:
@@ -118,7 +118,7 @@ def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, sou
 def adapted(
     model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset, name: str = ""
 ) -> Fit:
-    """A model after training on target flight, one run for each size, draw and seed, in this order."""
+    """Train a model on target flight, one run for each size, draw and seed, in this order."""
     name = f"{mode} {name or model} {target.config['domain']}"
     if config.validation != "own":
         lanes = adaptation(model, mode, fields, config, config.sizes)
@@ -137,7 +137,7 @@ def adapted(
 def solved(
     name: str, method: Method, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
 ) -> Fit:
-    """Each seed's field adapted to its target windows by a method, for each of the sizes, as the stage `name`."""
+    """Adapt each seed's field to its target windows by a method, for each size, as the stage `name`."""
 
     def of_size(size: int) -> Fit:
         return jax.device_get(_solved(*solving(method, fields, size, config), target.splits))
@@ -147,7 +147,7 @@ def solved(
 
 
 def solving(method: Method, fields: AbstractVectorField, size: int, config: Config) -> tuple[Method, Settings, Any]:
-    """The arguments of `_solved` for a size, but for the flights."""
+    """Return the arguments of `_solved` for a size, except the flights."""
     starts = lane(fields, np.tile(np.arange(config.seeds), config.draws))
     return method, settings(config), (starts, *windows_of(method, size, config))
 
@@ -167,7 +167,7 @@ def _solved(method: Method, shared: Settings, lanes: Any, splits: Mapping[str, T
 
 
 def windows_of(method: Method, size: int, config: Config) -> tuple[np.ndarray, np.ndarray | None]:
-    """Of each run the windows to fit, in the order of time, and those of them to choose by, or None for others."""
+    """Return each run's windows to fit, in time order, and its validation windows among them, or None."""
     subset = subsets(config)[:, :size]
     subset = np.sort(subset) if config.draw == "contiguous" else subset
     if config.validation != "own":
@@ -178,7 +178,7 @@ def windows_of(method: Method, size: int, config: Config) -> tuple[np.ndarray, n
 def assess(
     model: str, mode: str, config: Config, stages: Stages, fit: Fit, target: Dataset, home: Dataset | None = None
 ) -> Lanes:
-    """The models with their L^T_MSE on the test flights, also by altitude; and on those of the source, their floor."""
+    """Return the models with their L^T_MSE on the test flights, also by altitude; and on the source's, their floor."""
     errors, more = np.empty(0), {}
     for column, flown_in in {"source_mse": home, "test_mse": target}.items():
         if flown_in is not None:
@@ -194,7 +194,7 @@ def assess(
 def flown(
     domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages, file: Path | None = None
 ) -> Dataset:
-    """The flights of a domain with the configured measurement noise: of a file, or from the cache or the simulator.
+    """Return a domain's flights with measurement noise from a file, the cache or the simulator.
 
     Process 0 reads or flies them; the others receive the same bits and need no file.
     """
@@ -219,12 +219,12 @@ def source_splits(config: Config) -> dict[str, SplitSpec]:
 
 
 def target_splits(config: Config) -> dict[str, SplitSpec]:
-    """The splits of the target; every seed draws from the train split."""
+    """Return the splits of the target; every seed draws from the train split."""
     return drawn_splits(config) | {"test": SplitSpec(config.test, 100)}
 
 
 def drawn_splits(config: Config) -> dict[str, SplitSpec]:
-    """The pool and, if other trajectories than those drawn from it stop the training, these."""
+    """Return the pool and, if needed, separate trajectories for early stopping."""
     flights = config.draws * config.flown_each() if config.draw == "contiguous" else 0
     others = {} if config.validation == "own" else {"validation": SplitSpec(config.validation, 10)}
     return {"train": SplitSpec(config.pooled(), 10, flights), **others}
@@ -236,7 +236,7 @@ def capacity(config: Config) -> tuple[int, int]:
 
 
 def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
-    """Compile all programs that training and testing a model will run; they depend on shapes only."""
+    """Compile all programs for training and testing a model; they depend only on shapes."""
     shared, fresh = settings(config), fresh_fields(model, vehicle, config)
     source, target = (
         {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
@@ -252,7 +252,7 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
 
 
 def _compile_solved(model: str, vehicle: Vehicle, config: Config) -> None:
-    """The same for a model that is not trained."""
+    """Compile the programs of a model that is not trained."""
     fields = pretraining(source_of(model), fresh_fields(source_of(model), vehicle, config), config)[0].best
     target = {name: placeholder(spec) for name, spec in target_splits(config).items()}
     for size in config.sizes:
@@ -261,7 +261,7 @@ def _compile_solved(model: str, vehicle: Vehicle, config: Config) -> None:
 
 
 def placeholder(spec: SplitSpec) -> Trajectories:
-    """Windows at rest with the shapes of a split that is not yet simulated."""
+    """Return windows at rest with the shapes of a split that is not yet simulated."""
     x = np.zeros((spec.windows, spec.steps, STATE_SIZE), np.float32)
     x[..., QUATERNION] = [1, 0, 0, 0]
     return Trajectories(x[:, 0], np.zeros((*x.shape[:2], INPUT_SIZE), np.float32), x, dt=DT)

@@ -1,4 +1,4 @@
-"""The tables of the paper's experiments: errors and ρ by N, the ranking with Table 2, θ_p, ablations; notes."""
+"""Tables of the paper's experiments: errors and ρ by N, the ranking with Table 2, θ_p, ablations; notes."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ PAPER: Mapping[str, Mapping[tuple[str, str, int], tuple[float, float | None]]] =
 
 
 def error_text(rows: Results) -> str:
-    """0.0123 ± 0.0004, or ∞ with the count of seeds that make it so and the median of all; a star marks capped runs."""
+    """0.0123 ± 0.0004, or ∞ with the count of infinite seeds and the median of all; a star marks capped runs."""
     return spread_text(rows.spread("test_mse")) + " *" * ("capped" in rows.unique("status"))
 
 
@@ -44,7 +44,7 @@ def rho_text(rows: Results) -> str:
 
 
 def by_size(rows: Results) -> list[Table]:
-    """Test error and ρ in each domain: a line per N, a column per model and mode."""
+    """Return test error and ρ in each domain: a line per N, a column per model and mode."""
     tables = []
     for place, group in _places(rows):
         trained, of = group.where(mode=(FINE_TUNED, TARGET_ONLY)), mean_over_seeds(group)
@@ -69,7 +69,7 @@ def by_size(rows: Results) -> list[Table]:
 
 
 def conclusion(rows: Results) -> list[str]:
-    """Of each domain the method with the smallest mean error at the smallest N, against the source's model."""
+    """Summarise each domain's best method at the smallest N, against the source's model."""
     sentences = []
     for place, group in _places(rows):
         n = min(adapted_sizes(group), default=0)
@@ -88,7 +88,7 @@ def conclusion(rows: Results) -> list[str]:
 
 
 def meaning(verdicts: Sequence[Verdict]) -> list[str]:
-    """What the verdicts on C1, C2 and C6 say to a reader, in one sentence."""
+    """Explain the verdicts on C1, C2 and C6 in one sentence."""
     sentences = {
         True: "A model with physics in it, adapted to a little flight, predicts better than before the change and "
         "better than a network without physics: what the paper claims holds (C1, C2, C6).",
@@ -100,8 +100,7 @@ def meaning(verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def altitudes(rows: Results) -> list[Table]:
-    """Test error by the windows' lowest altitude, at the smallest and the largest N; and that of the source models on
-    flights of the source, which adaptation can hardly get below. No table for rows without these columns."""
+    """Return test errors by lowest altitude, at the smallest and largest N, and of the source models, if recorded."""
     own, sizes = rows.where(lambda row: "test_mse_low" in row), adapted_sizes(rows)
     if not len(own):
         return []
@@ -124,7 +123,7 @@ def altitudes(rows: Results) -> list[Table]:
 
 
 def ranking(rows: Results) -> list[Table]:
-    """A table per domain: a line per method, the smallest mean error first.
+    """Return a table per domain: a line per method, the smallest mean error first.
 
     A ratio is the paper's: the mean of the fine-tuned hybrid, the smallest error of any other method, over the smallest
     of fine-tuned physics-only (at the smallest N, if there are several).
@@ -156,7 +155,7 @@ def _ratio(above: float, below: float, kind: str) -> str:
 
 
 def parameters(rows: Results, truth: Mapping[str, Any] | None) -> list[Table]:
-    """θ_p of each cell that has it, mean ± std over seeds, and the truth (or that by domain): a table per domain."""
+    """θ_p of each cell, mean ± std over seeds, and the truth (or that by domain): a table per domain."""
     tables = []
     for place, group in _places(rows.where(lambda row: row["theta"] is not None)):
         true = truth if truth is None or set(truth) == set(THETA) else truth.get(group[0]["domain"])
@@ -176,7 +175,7 @@ def _theta_text(rows: Results, name: str) -> str:
 
 
 def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> list[Table]:
-    """A table for each choice, a line for each value, domain and N: errors and biases of θ_p, mean ± std over seeds.
+    """Return for each choice errors and biases of θ_p, mean ± std over seeds: a line for each value, domain and N.
 
     The rows have the tags choice, value and default; `truth` is the true θ_p by domain.
     """
@@ -209,7 +208,7 @@ def value_label(row: Row) -> str:
 
 
 def run_notes(rows: Results) -> list[str]:
-    """A sentence on runs that reached the cap on epochs, one on those that diverged, one on errors not finite."""
+    """Return sentences on runs that reached the cap on epochs, that diverged, and with errors not finite."""
     diverged, several = rows.where(status="diverged"), len(rows.group("domain")) > 1
     epochs = ", ".join(map(str, sorted({*diverged["epochs"]})))
     when = f", in epoch {epochs}," if epochs else ""
@@ -233,6 +232,6 @@ def run_notes(rows: Results) -> list[str]:
 
 
 def _places(rows: Results) -> list[tuple[str, Results]]:
-    """The rows of each domain, with its part of a title: empty where there is only one."""
+    """Return each domain's rows with its part of a title, empty if there is only one."""
     groups = by_domain(rows)
     return [(f", {label(domain)}" if len(groups) > 1 else "", group) for domain, group in groups.items()]

@@ -20,7 +20,7 @@ Shown = Arrays
 
 
 def draw(rows: Results, shown: Shown, patterns: Shown, dt: float) -> dict[str, tuple[Figure, str]]:
-    """The figures and their captions, by name."""
+    """Return the figures and their captions, by name."""
     found = {}
     known = [name for name in (POINTWISE, LOCAL) if name in shown]
     if known:
@@ -37,7 +37,7 @@ def draw(rows: Results, shown: Shown, patterns: Shown, dt: float) -> dict[str, t
 
 @mpl.rc_context(STYLE)
 def fields(shown: Shown, name: str, at: tuple[int, ...], dt: float, component: int = 0) -> Figure:
-    """Truth, forecast and error of one component at some steps."""
+    """Draw truth, forecast and error of one component at some steps."""
     truth, forecast = (_component(shown[each], component) for each in ("truth", name))
     error = forecast - truth
     figure, axes = subplots((PAGE * 0.8, PAGE * 0.8 * 3 / len(at) * 0.98), 3, len(at))
@@ -57,7 +57,7 @@ def fields(shown: Shown, name: str, at: tuple[int, ...], dt: float, component: i
 
 @mpl.rc_context(STYLE)
 def scores(rows: Results) -> Figure:
-    """Median error of each way of learning, a panel for each change; a dot is a seed."""
+    """Draw the median error of each method, a panel for each change; a dot is a seed."""
     groups = rows.group("shift")
     figure, axes = subplots((PAGE, 3.2), 1, len(groups), sharey=True)
     for panel, (shift, own) in zip(axes[0], groups.items(), strict=True):
@@ -84,6 +84,6 @@ def scores(rows: Results) -> Figure:
 
 
 def _component(states: np.ndarray, component: int) -> np.ndarray:
-    """One of two components of the states (t, d) of the first trajectory, as squares (t, side, side)."""
+    """Return one of two components of the first trajectory's states (t, d), as squares (t, side, side)."""
     side = round((states.shape[-1] / 2) ** 0.5)
     return states[0].reshape(-1, 2, side, side)[:, component]

@@ -1,4 +1,4 @@
-"""The first study: learn FitzHugh–Nagumo of which physics knows that there is diffusion, as APHYNITY does."""
+"""The first study: learn FitzHugh–Nagumo when physics contains only diffusion, as APHYNITY does."""
 
 from functools import partial
 from typing import Any
@@ -24,13 +24,13 @@ KEPT = 2  # test trajectories whose forecasts are drawn
 
 
 def scaling(kernel: int) -> ChannelScaling:
-    """Of what a network reads: the same for all seeds, so that one program serves them. States lie in −0.7 … 1."""
+    """Return the network's input scaling, equal for all seeds so that one program serves; states are in −0.7 … 1."""
     read = 2 * kernel**2
     return ChannelScaling((0.25,) * read, (0.35,) * read)
 
 
 def untrained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
-    """Before training; the seed is that of the network's weights."""
+    """Return the model before training; the seed is for the network's weights."""
     grid, key = plane(config.points), jax.random.key(seed)
     if case.physics == "complete":
         return fitzhugh_nagumo(grid, *GUESS, k=0.0)
@@ -43,10 +43,9 @@ def untrained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
 
 
 def trained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
-    """One interval at a time from a few places of each trajectory first, then whole trajectories.
+    """Train several models on single intervals of a few places, then the best on whole trajectories.
 
-    Some networks end in a poor local minimum, which their training loss soon shows. So several begin, and after a few
-    steps the best goes on.
+    Several begin because some networks end in a poor local minimum, which their training loss soon shows.
     """
     truth = fitzhugh_nagumo(plane(config.points))
     data = reacting(truth, 1, (TRAIN, seed), case.noise)
@@ -64,7 +63,7 @@ def trained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
 
 
 def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]:
-    """A row for each case and seed, and forecasts to draw: of the truth, and of models by the name of their case."""
+    """Return a row for each case and seed, and forecasts to draw by the name of their case, with the truth."""
     truth = fitzhugh_nagumo(plane(config.points))
     test = reacting(truth, config.test, (TEST, 0))
     drawn = test[: min(KEPT, config.test)]
@@ -84,7 +83,7 @@ def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]
 
 
 def _found(model: Any) -> dict[str, float | None]:
-    """a and b, and the mean of their relative errors [%]; None without physics."""
+    """Return a and b, and the mean of their relative errors [%]; None without physics."""
     physics = model.physics if isinstance(model, hj.Hybrid) else model
     if (theta := getattr(physics, "theta", None)) is None:
         return {"a": None, "b": None, "parameter_error": None}

@@ -33,14 +33,14 @@ SOLVED = "adapted"
 
 
 def trained(start: Any, data: hj.Trajectories, steps: int, held: bool) -> Found:
-    """The weights after Gauss–Newton; `held`: of the network alone."""
+    """Return the weights after Gauss–Newton; `held`: for the network only."""
     field = hj.Hybrid(hj.Frozen(start.physics), start.residual) if held else start
     found: Any = hj.fit_gauss_newton(field, data, max_steps=steps, solver=SCOTT_COARSE).field
     return [], {"weights": weights(hj.Hybrid(start.physics, found.residual) if held else found)}
 
 
 def source_model(config: Config, kept: Kept) -> Any:
-    """A hybrid trained on one trajectory in each of the four environments, with F and k of each."""
+    """Train a hybrid on one trajectory in each of the four environments, with F and k of each."""
     parts = [patterns(gray_scott(TRAINED_IN, True, config.points), e, 1, (TRAIN, e)) for e in range(len(TRAINED_IN))]
     physics = gray_scott([GUESS] * len(TRAINED_IN), False, config.points)
     data = joined([pieces(part, EVERY) for part in parts])
@@ -58,7 +58,7 @@ def source_model(config: Config, kept: Kept) -> Any:
 
 
 def study(config: Config, kept: Kept) -> tuple[list[Row], Arrays]:
-    """A row for each new environment, in which F and k alone are adapted to one trajectory; and a forecast of one."""
+    """Adapt only F and k to one trajectory of each new environment: a row each, and one forecast."""
     source = source_model(config, kept)
 
     def adapt(index: int, environment: tuple[float, float]) -> Found:

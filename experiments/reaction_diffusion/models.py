@@ -1,4 +1,4 @@
-"""What the studies share: weights as a vector, forecasts and their error, and windows cut from trajectories."""
+"""Shared by the studies: weights as a vector, forecasts and their error, and windows from trajectories."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from hybrid_jax.dynamics.base import ravel_learned
 
 
 def weights(model: hj.AbstractVectorField) -> np.ndarray:
-    """All parameters of a model as a vector."""
+    """Return all parameters of a model as a vector."""
     return np.asarray(ravel_learned(model)[0])
 
 
@@ -23,19 +23,19 @@ def with_weights(model: Any, vector: np.ndarray) -> Any:
 
 @eqx.filter_jit
 def predicted(model, data: hj.Trajectories, solver) -> jax.Array:
-    """Forecasts of all windows, a few at a time."""
+    """Forecast all windows, a few at a time."""
     one = lambda pair: hj.rollout(model, pair[0], pair[1], data.dt, solver)  # noqa: E731
     return jax.lax.map(one, (jnp.asarray(data.x0), jnp.asarray(data.u)), batch_size=4)
 
 
 def error(model, data: hj.Trajectories, solver) -> float:
-    """Mean squared error over all numbers of all states after the first; inf if a forecast is not finite."""
+    """Mean squared error over all states after the first; inf if a forecast is not finite."""
     value = float(np.mean(np.square(np.asarray(predicted(model, data, solver), float) - data.x)))
     return value if np.isfinite(value) else float("inf")
 
 
 def pieces(data: hj.Trajectories, every: int, steps: int = 1, first: int = 0) -> hj.Trajectories:
-    """Windows of `steps` intervals from each trajectory in turn, at every so many intervals from the `first`."""
+    """Return windows of `steps` intervals from each trajectory in turn, every so many intervals from the `first`."""
     states = np.concatenate([data.x0[:, None], data.x], axis=1)
     starts = range(first, data.horizon - steps + 1, every)
 

@@ -108,7 +108,7 @@ def claims(rows: Results) -> list[Claim[Results]]:
 
 
 def _under(shift: str, parts: Callable[[Evidence], Iterable[Part]]) -> Callable[[Results], Part]:
-    """A claim about one change, of the paper's models and modes, by the names of columns that the paper's rows have."""
+    """Return a claim about one change, of the paper's models and modes, by the columns of the paper's rows."""
 
     def judged(rows: Results) -> Part:
         own = rows.where(shift=shift, model=(HYBRID, NO_PHYSICS), mode=(FINE_TUNED, TARGET_ONLY))
@@ -135,7 +135,7 @@ def _scott(rows: Results) -> Part:
 
 
 def _ends(e: Evidence) -> tuple[int, int]:
-    """The smallest and the largest N."""
+    """Return the smallest and the largest N."""
     if len(sizes := e.sizes()) < 2:
         raise Undecided("needs two sizes N")
     return sizes[0], sizes[-1]

@@ -1,4 +1,4 @@
-"""The second study: the equations change, and a few trajectories show how: the paper's Figs. 3 and 5 for a PDE."""
+"""The second study: adapt to changed equations from a few trajectories, as in the paper's Figs. 3 and 5."""
 
 from functools import cache, partial
 from itertools import product
@@ -39,7 +39,7 @@ def learned(field, data: hj.Trajectories, steps: int) -> hj.AbstractVectorField:
 
 
 def by_parameters(field, data: hj.Trajectories, method: str) -> tuple[hj.AbstractVectorField, str | None]:
-    """Adapted by a method that leaves the network alone, or may; and what `auto` chose."""
+    """Adapt by a method that does not train the network, or may; also return the choice of `auto`."""
     # The same number of windows for every N, as they are dear. Each trajectory's begin a window later than those of the
     # one before it: of eight trajectories they would all be beginnings, which say little of what comes after.
     every, each = WINDOW * len(data), range(len(data))
@@ -49,7 +49,7 @@ def by_parameters(field, data: hj.Trajectories, method: str) -> tuple[hj.Abstrac
 
 
 def study(config: Config, kept: Kept) -> list[Row]:
-    """A row for each shift, model, way of learning, number of trajectories and seed."""
+    """Return a row for each shift, model, method, number of trajectories and seed."""
     trained = sources(config, kept)
     rows = [row for shift in config.shifts for row in before(config, trained, shift)]
     of_source = {(row["shift"], row["model"], row["seed"]): row["mse"] for row in rows}
@@ -61,7 +61,7 @@ def study(config: Config, kept: Kept) -> list[Row]:
 
 
 def sources(config: Config, kept: Kept) -> dict[tuple[str, int], hj.AbstractVectorField]:
-    """Models of the equations before the change, by name and seed."""
+    """Return models of the equations before the change, by name and seed."""
 
     def train(model: str, seed: int) -> Found:
         data = reacting(fitzhugh_nagumo(plane(config.points)), SOURCES, (SOURCE, seed))
@@ -76,7 +76,7 @@ def sources(config: Config, kept: Kept) -> dict[tuple[str, int], hj.AbstractVect
 
 
 def before(config: Config, trained, shift: str) -> list[Row]:
-    """The rows of the sources as they are, after a shift."""
+    """Return the rows of the unadapted sources after a shift."""
     test = tested(config, shift)
     return [
         _tags(shift, model, seed) | {"mode": SOURCE_ONLY, "n": 0, "mse": error(source, test, COARSE), "rho": 0.0}
@@ -95,7 +95,7 @@ def targets(config: Config, shift: str, seed: int) -> hj.Trajectories:
 
 
 def adapted(config: Config, source, error_before: float, shift: str, model: str, n: int, seed: int) -> Found:
-    """The rows of a source that is adapted to N trajectories in each way."""
+    """Return the rows of a source adapted to N trajectories by each method."""
     data, test = targets(config, shift, seed)[:n], tested(config, shift)
     chosen = dict[str, str | None]()
     fields = {

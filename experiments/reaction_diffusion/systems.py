@@ -1,4 +1,4 @@
-"""The equations, on a periodic grid, and trajectories of them.
+"""The equations, on a periodic grid, and their trajectories.
 
 FitzHugh–Nagumo as in APHYNITY (Yin, Le Guen, Dona et al., ICLR 2021): u, v uniform in [0, 1] at every point of 32 × 32
 points on [−1, 1]². Gray–Scott as in Neural Context Flows (Nzoyem, Barton, Deakin, ICLR 2025): three squares of u = 0,
@@ -52,12 +52,12 @@ def fitzhugh_nagumo(grid: hj.Grid, a: float = A, b: float = B, k: float = K, cou
 
 
 def plane(points: int) -> hj.Grid:
-    """The grid of FitzHugh–Nagumo on [−1, 1]²."""
+    """Return the grid of FitzHugh–Nagumo on [−1, 1]²."""
     return hj.Grid((points, points), 2 / points, 2)
 
 
 def trajectories(field, x0: Float[np.ndarray, "n d"], dt: float, steps: int, solver, inputs=None) -> hj.Trajectories:
-    """The states of a field from each x0, a few trajectories at a time, without inputs or with the same in all."""
+    """Simulate a field from each x0, a few trajectories at a time, without inputs or with the same in all."""
     u = np.zeros((len(x0), steps, 0), np.float32) if inputs is None else np.tile(inputs, (len(x0), steps, 1))
 
     @eqx.filter_jit
@@ -69,7 +69,7 @@ def trajectories(field, x0: Float[np.ndarray, "n d"], dt: float, steps: int, sol
 
 
 def reacting(field: FitzHughNagumo, count: int, seed: tuple[int, ...], noise: float = 0.0) -> hj.Trajectories:
-    """`count` trajectories of 2.5 s; of another seed, others. White noise is added to all states, the first too."""
+    """Simulate `count` trajectories of 2.5 s, with white noise on all states, the first too."""
     rng = np.random.default_rng(seed)
     x0 = rng.random((count, field.grid.size)).astype(np.float32)
     found = trajectories(field, x0, DT, STEPS, FINE)
@@ -131,12 +131,12 @@ class Conversion(hj.AbstractVectorField):
 
 
 def gray_scott(environments, reacts: bool, points: int = 32) -> GrayScott:
-    """Of (F, k) of each environment."""
+    """Return the field with (F, k) of each environment."""
     return GrayScott(jnp.log(jnp.asarray(environments)), reacts, hj.Grid((points, points), 1.0, 2))
 
 
 def patterns(field: GrayScott, environment: int, count: int, seed: tuple[int, ...]) -> hj.Trajectories:
-    """`count` trajectories of an environment from t = 0 to 360 s, sampled every 40 s."""
+    """Simulate `count` trajectories of an environment from t = 0 to 360 s, sampled every 40 s."""
     rng, points = np.random.default_rng(seed), field.grid.shape[0]
     x0 = np.tile(np.array([0.95, 0.05], np.float32)[:, None, None], (count, 1, points, points))
     side = max(points // 10, 1)

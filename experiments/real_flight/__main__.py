@@ -35,7 +35,7 @@ LISTS = ("--horizon", "--n", "--polynomial", "--motor-order", "--topics", "--lea
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the experiment; without any flights, print how to get some and exit with code 2."""
+    """Run the experiment; without any flights, explain how to get some and exit with code 2."""
     given = split_lists(sys.argv[1:] if arguments is None else arguments, LISTS)
     if not any(word.startswith(("--simulated", "--source", "--vehicle")) for word in given):
         command.check(NAME, ABOUT, given, PRESETS)  # a wrong option is named before flights are asked for
@@ -53,7 +53,7 @@ def run(config: RealFlightConfig, console: Console) -> None:
 
 
 def prepare(config: RealFlightConfig) -> tuple[VehicleModel, dict[str, Flights]]:
-    """The vehicle, and the flights of each folder, read as `fit` and `adapt` read them."""
+    """Return the vehicle, and the flights of each folder, read like `fit` and `adapt` read them."""
     path, named = config.vehicle, {name: getattr(config, name) for name in ("source", "target", "test")}
     folders = {name: folder for name, folder in named.items() if folder is not None}
     if config.simulated:

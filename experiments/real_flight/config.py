@@ -13,10 +13,9 @@ PATHS = ("source", "target", "test", "vehicle", "columns")
 
 @dataclass(frozen=True)
 class RealFlightConfig(FlightOptions, Run):
-    """Learn from the flights in --source, adapt to N windows of those in --target, test on flights held out.
+    """Learn from the flights in --source, adapt to N windows of --target, test on held-out flights.
 
-    What learns, adapts and reads logs is what `hybrid-jax fit` and `adapt` call, so the scores are those of the tool.
-
+    Learning, adaptation and log readers are those of `hybrid-jax fit` and `adapt`, so you get the scores of the tool.
     Without --test, the target's flights are held out in turn (--folds). Without --target, nothing is adapted and the
     source's models are tested. No data? Try --simulated.
 
@@ -59,7 +58,7 @@ class RealFlightConfig(FlightOptions, Run):
             raise ValueError(f"--simulated makes its own logs: leave out {', '.join(f'--{name}' for name in PATHS)}")
 
     def described(self) -> dict[str, Any]:
-        """All that fixes the results; of folders and files only the name, since flights are described by content."""
+        """Return all inputs of the results; folders and files by name only, since flights are described by content."""
         options = Run.described(self)
         return options | {name: None if options[name] is None else options[name].name for name in PATHS}
 

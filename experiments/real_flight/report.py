@@ -54,7 +54,7 @@ def write(
     curves: Mapping[str, np.ndarray],
     stages: Stages,
 ) -> None:
-    """Write the report into the folder of the run, and print its tables."""
+    """Write the report into the run's folder, and print its tables."""
     out, found = config.out / NAME, cells(rows)
     best = max((cell for cell in found if cell[0] in (ADAPTED, LEARNED)), key=lambda cell: cell[1])
     drawn = [(names.HOLD, 0), (names.THRUST, 0), (names.PHYSICS_ONLY, 0), *dict.fromkeys([(LEARNED, 0), best])]
@@ -84,7 +84,7 @@ def write(
 
 
 def cells(rows: Results) -> dict[Cell, Results]:
-    """Rows over flights and seeds, in the order of MODELS."""
+    """Group rows over flights and seeds, in the order of MODELS."""
     return rows.sort(model=MODELS, n_train=None, seed=None).group("model", "n_train")
 
 
@@ -93,13 +93,13 @@ def label(model: str, n: int) -> str:
 
 
 def pooled(rows: Results, horizon: str, quantity: str) -> np.ndarray:
-    """The RMSE of each seed over the test flights."""
+    """Return the RMSE of each seed over the test flights."""
     groups = rows.sort(seed=None).group("seed").values()
     return np.array([np.sqrt(np.mean(own.numbers(f"scores.{horizon}.{quantity}") ** 2)) for own in groups])
 
 
 def conclusion(found: Mapping[Cell, Results], best: Cell, dt: float) -> list[str]:
-    """How much better the tool's model is than the best baseline, by velocity after the longest horizon."""
+    """Summarise the tool's improvement over the best baseline, by velocity after the longest horizon."""
     horizon = max(found[best][0]["scores"], key=int)
     errs = {cell: pooled(rows, horizon, "velocity").mean() for cell, rows in found.items()}
     simple = min((cell for cell in errs if cell[0] in BASELINES), key=errs.__getitem__)
@@ -108,7 +108,7 @@ def conclusion(found: Mapping[Cell, Results], best: Cell, dt: float) -> list[str
 
 
 def expected_table(found: Mapping[Cell, Results]) -> Table:
-    """The errors that the tool expected on a flight not seen, what came out, and how many lie in the interval."""
+    """Return the expected errors on unseen flights, the actual ones, and how many are in the interval."""
     lines = []
     for cell, rows in found.items():
         known = rows.where(lambda row: row["expected"] is not None)
@@ -128,7 +128,7 @@ def expected_table(found: Mapping[Cell, Results]) -> Table:
 
 
 def score_tables(rows: Results, found: Mapping[Cell, Results], dt: float) -> list[Table]:
-    """A table for each horizon, a line for each model and N."""
+    """Return a table for each horizon, a line for each model and N."""
 
     def text(horizon: str, name: str, rows: Results) -> str:
         return spread_text(spread(pooled(rows, horizon, name)), ".4g", ".2g")
@@ -145,7 +145,7 @@ def score_tables(rows: Results, found: Mapping[Cell, Results], dt: float) -> lis
 
 
 def by_flight_table(found: Mapping[Cell, Results], best: Cell, horizon: int) -> Table:
-    """The error of the best model on each flight over that of thrust with frozen rates, mean over seeds."""
+    """Return the best model's error on each flight over that with frozen rates, mean over seeds."""
     frozen = found[names.THRUST, 0].group("flight")
     lines = []
     for flight, own in found[best].group("flight").items():
@@ -159,7 +159,7 @@ def by_flight_table(found: Mapping[Cell, Results], best: Cell, horizon: int) -> 
 
 
 def parameter_table(found: Mapping[Cell, Results]) -> Table:
-    """θ_p: mean ± std over folds and seeds, and mean ends of the 95 % intervals."""
+    """Return θ_p: mean ± std over folds and seeds, and mean ends of the 95 % intervals."""
     told = {cell: rows for cell, rows in found.items() if rows[0]["theta"]}
     every_name = dict.fromkeys(name for rows in told.values() for row in rows for name in row["theta"])
     lines = []

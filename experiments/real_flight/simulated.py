@@ -1,4 +1,4 @@
-"""Simulated flights as logs, and their vehicle file: what `--simulated` learns from."""
+"""Simulated flights as logs, and their vehicle file, for `--simulated`."""
 
 import gzip
 import io
@@ -35,12 +35,12 @@ def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
 
 
 def vehicle_toml(vehicle: Vehicle) -> str:
-    """The text of a vehicle file; the numbers, names and lists of JSON are those of TOML as well."""
+    """Return the text of a vehicle file; the numbers, names and lists of JSON are also valid TOML."""
     return "[vehicle]\n" + "".join(f"{name} = {json.dumps(value)}\n" for name, value in asdict(vehicle).items())
 
 
 def csv_of(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> bytes:
-    """A log as CSV in gzip; the same numbers give the same bytes."""
+    """Return a log as CSV in gzip; the same numbers give the same bytes."""
     text = io.StringIO()
     np.savetxt(text, np.column_stack([t, x, u]), "%.9g", ",", header=",".join(COLUMNS), comments="")
     return gzip.compress(text.getvalue().encode(), mtime=0)

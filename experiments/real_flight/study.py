@@ -1,4 +1,4 @@
-"""Learn, adapt and test in every fold: rows of errors on flights that were held out."""
+"""Learn, adapt and test in every fold: rows of errors on held-out flights."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ OF_ADAPT = {"rotation": "attitude", "body_rates": "body rates"}  # what `adapt` 
 
 @dataclass(frozen=True)
 class Fold:
-    """Flights to train on, and disjoint from them flights to test on; `name` lists these."""
+    """Disjoint flights for training and testing; `name` lists the latter."""
 
     name: str
     train: list[FlightLog]
@@ -63,7 +63,7 @@ def make_folds(train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, c
 def run_folds(
     config: RealFlightConfig, model: VehicleModel, sets: Mapping[str, Flights], stages: Stages
 ) -> tuple[list[Fold], Results, dict[str, np.ndarray]]:
-    """The folds, a row of each model on each test flight, and its errors after each interval, by `key_of` its row."""
+    """Return the folds, a row of each model on each test flight, and its errors by interval and `key_of` its row."""
     adapts = "target" in sets
     tested = sets["test"].logs if "test" in sets else None
     made = make_folds(sets.get("target", sets["source"]).logs, tested, config)
@@ -98,7 +98,7 @@ def run_folds(
 def of_fold(
     config: RealFlightConfig, model: VehicleModel, fold: Fold, source: Learned, seed: int, adapts: bool
 ) -> Found:
-    """Rows and curves of one fold and seed: of baselines in the first seed alone."""
+    """Return rows and curves of one fold and seed; baselines only in the first seed."""
     train, test = lagged(fold.train, source.lag), lagged(fold.test, source.lag)
     physics, rigid = model.physics(), rigid_body(model.vehicle, (), model.terms)
     rows, curves = [], {}
@@ -136,7 +136,7 @@ def key_of(row: Mapping[str, Any]) -> str:
 
 
 def expected_of(learned: np.ndarray | None, found: Adaptation | None, curve: np.ndarray) -> dict[str, Any]:
-    """What error was expected after a window, and whether what came out is inside of its 80 % interval."""
+    """Return the expected error after a window, and whether the actual one is inside its 80 % interval."""
     if learned is not None:
         ends = {name: each.tolist() for name, each in zip(errors.UNITS, learned.T, strict=True)}
     elif found is not None and found.expected:
@@ -150,7 +150,7 @@ def expected_of(learned: np.ndarray | None, found: Adaptation | None, curve: np.
 
 
 def parameters_of(found: Adaptation | None) -> dict[str, Any]:
-    """θ_p in SI units, and its 95 % intervals."""
+    """Return θ_p in SI units, and its 95 % intervals."""
     if found is None:
         return {"theta": None, "theta_interval": None}
     theta = {name: one.value for name, one in found.parameters.items()}

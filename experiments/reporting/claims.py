@@ -1,4 +1,4 @@
-"""Hypotheses about results as data: each is evaluated to holds, fails or undecided, with the numbers behind it."""
+"""Hypotheses about results as data, evaluated to true, false or undecided, with the numbers behind it."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ OUTCOMES = {True: "✓ holds", False: "✗ fails", None: "– undecided"}
 
 
 class Undecided(Exception):
-    """The results lack what a claim needs; the message says what."""
+    """The results lack data for a claim; the message says which."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Claim(Generic[Evidence]):
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a claim: `holds` is None if it is undecided; `measured` says why, or what data are lacking."""
+    """The outcome of a claim: `holds` is None if it is undecided; `measured` says why, or which data are missing."""
 
     id: str
     text: str
@@ -43,7 +43,7 @@ def every(outcomes: Iterable[bool | None]) -> bool | None:
 
 
 def all_of(parts: Iterable[Part]) -> Part:
-    """Whether all parts of a hypothesis hold, see `every`, and their numbers."""
+    """Whether all parts of a hypothesis are true, see `every`, and their numbers."""
     holds, measured = zip(*parts, strict=True)
     return every(holds), "; ".join(measured)
 
@@ -66,12 +66,12 @@ def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
 
 
 def decided(table: Table) -> Table:
-    """A `verdict_table` without the hypotheses that are undecided."""
+    """Return a `verdict_table` without undecided hypotheses."""
     return table._replace(lines=[line for line in table.lines if OUTCOMES[None] not in line])
 
 
 def summary(verdicts: Sequence[Verdict]) -> list[str]:
-    """One sentence: how many hypotheses hold, fail and are undecided, of those that the results can judge."""
+    """Count the hypotheses that are true, false and undecided in one sentence."""
     judged = [each for each in verdicts if not each.lacks_data]
     if not judged:
         return []
@@ -81,7 +81,7 @@ def summary(verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def to_json(verdicts: Sequence[Verdict]) -> dict[str, list[dict[str, Any]]]:
-    """The keys of report.json: `claims` with their outcome, and `not_judged` for those that lack data."""
+    """Return the keys of report.json: `claims` with their outcome, and `not_judged` for those that lack data."""
     return {
         "claims": [
             {"id": v.id, "text": v.text, "holds": v.holds, "measured": v.measured} for v in verdicts if not v.lacks_data

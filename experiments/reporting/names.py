@@ -33,5 +33,5 @@ LABELS = {
 
 
 def label(*keys: str) -> str:
-    """The labels of keys, separated by commas; a key without a label stands for itself."""
+    """Join the labels of keys by commas; a key without a label is its own label."""
     return ", ".join(LABELS.get(key, key) for key in keys)

@@ -1,4 +1,4 @@
-"""The style of all figures, their legend and their files, and panels of test errors: a dot per seed, a bar per mean."""
+"""The style of all figures, their legend and files, and panels of test errors: a dot per seed, a bar per mean."""
 
 import io
 import math
@@ -58,14 +58,13 @@ def colour(model: str) -> str:
 
 
 def subplots(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, np.ndarray]:
-    """A figure [inches] and its panels, (rows, columns)."""
+    """Create a figure [inches] and its panels, (rows, columns)."""
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
 def save_figures(out: Path, figures: Mapping[str, tuple[Figure, str]]) -> dict[str, str]:
-    """Write figures, given with their captions by name, the same bytes for the same figure, in few colours, which look
-    the same and take a third of the bytes; returns the captions by file, as a report takes them."""
+    """Write figures, given with captions by name, as reproducible bytes in few colours; return the captions by file."""
     for name, (figure, _) in figures.items():
         drawn, content = io.BytesIO(), io.BytesIO()
         with mpl.rc_context(STYLE):
@@ -79,7 +78,7 @@ def save_figures(out: Path, figures: Mapping[str, tuple[Figure, str]]) -> dict[s
 def legend_below(
     figure: Figure, title: str = "", meaning: str = "", columns: int = 3, entries: Mapping[str, Artist] | None = None
 ) -> Figure:
-    """Title above all panels, and below them one legend of all their labels after `entries`, headed `meaning`."""
+    """Draw a title above all panels, and below them one legend of all labels after `entries`, headed `meaning`."""
     shown = dict(entries or {})
     for axes in figure.axes:
         shown |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
@@ -90,9 +89,9 @@ def legend_below(
 
 
 def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.0, beside: Sequence[Line] = ()) -> None:
-    """Draw the lines, the first on top, and the error that no model can get below (`floor`), if it is not 0.
+    """Draw the lines, the first on top, and the attainable error (`floor`), if it is not 0.
 
-    `beside`: the lines of panels above and below, which share the limits; notes then stay inside of the panel.
+    `beside`: the lines of panels above and below, which share the limits; notes are then inside the panel.
     """
     limits = _limits([line.errors for line in [*lines, *beside]], floor)
     axes.set(xscale="log", xlim=limits, title=title)
@@ -108,7 +107,7 @@ def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.
 
 
 def error_legend(figure: Figure, title: str, failed: bool) -> Figure:
-    """The title and legend of error panels; `failed`: whether a mean leaves out an error that is not finite."""
+    """Draw title and legend of error panels; `failed`: whether a mean omits an error that is not finite."""
     bar = {"color": "0.3", "marker": "|", "markersize": 12, "markeredgewidth": 2.2, "linestyle": ""}
     entries = {
         "a run": Line2D([], [], color="0.3", alpha=0.55, marker="o", markersize=4, linestyle=""),
@@ -118,18 +117,18 @@ def error_legend(figure: Figure, title: str, failed: bool) -> Figure:
 
 
 def name_lines(axes: Axes, names: Sequence[str]) -> None:
-    """A line for each name, the first on top, at y = 0, 1, …"""
+    """Label a line for each name, the first on top, at y = 0, 1, …"""
     axes.set(ylim=(len(names) - 0.4, -0.6))
     axes.set_yticks(range(len(names)), names)
 
 
 def note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[float, float], **style: Any) -> None:
-    """Small words beside a point, also outside the axes; the offset is in points."""
+    """Draw small words beside a point, also outside the axes; the offset is in points."""
     axes.annotate(words, at, offset, textcoords="offset points", annotation_clip=False, **{"fontsize": 6, **style})
 
 
 def tick_errors(axis: Axis, low: float, high: float, room: float = 0.0) -> None:
-    """Ticks of a log axis: decades, of at most `room` decades 1, 2 and 5 as well, of a short one round steps."""
+    """Set ticks of a log axis: decades, of at most `room` decades 1, 2 and 5 as well, of a short one round steps."""
     decades = math.log10(high / low)
     room = room or (2.2 if low > LONG_NUMBER else 1.5)
     subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if decades < 0.8 else (1.0, 2.0, 5.0) if decades < room else (1.0,)
@@ -139,7 +138,7 @@ def tick_errors(axis: Axis, low: float, high: float, room: float = 0.0) -> None:
 
 
 def _limits(errors: Iterable[np.ndarray], floor: float) -> tuple[float, float]:
-    """Around all errors within LARGEST_RATIO of the smallest mean, so that one failed run does not flatten the rest."""
+    """Return limits around all errors within LARGEST_RATIO of the smallest mean, so that failed runs do not matter."""
     drawn = [values[(values > 1 / DRAWABLE) & (values < DRAWABLE)] for values in errors]
     means = [values.mean() for values in drawn if len(values)]
     if not means:
@@ -150,7 +149,7 @@ def _limits(errors: Iterable[np.ndarray], floor: float) -> tuple[float, float]:
 
 
 def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[float, float], inside: bool) -> float:
-    """A dot for each seed and a bar for the mean of the finite ones, which is returned; errors outside are marked."""
+    """Draw a dot for each seed and a bar for the mean of the finite ones, which is returned; mark errors outside."""
     low, high = limits
     finite = values < DRAWABLE
     near = finite & (values >= low) & (values <= high)

@@ -1,16 +1,16 @@
-"""What a reader of a report wants first: the question as its title, one table, one figure, and what they mean."""
+"""Each report's question as its title, with its main table, main figure, and what they mean."""
 
 from typing import NamedTuple
 
 
 class Asked(NamedTuple):
-    """Of an experiment.
+    """The question of an experiment.
 
     Attributes:
         question: the title of the report.
-        meaning: sentences on what the result means for a reader.
-        table: a part of the title of the one table that is not folded; by default the first without verdicts.
-        figure: the name of the one figure that is not folded; by default the first.
+        meaning: sentences on what the result means for you.
+        table: a part of the title of the unfolded table; by default the first without verdicts.
+        figure: the name of the unfolded figure; by default the first.
     """
 
     question: str

@@ -1,4 +1,4 @@
-"""What an experiment leaves in its folder, report.html, report.md, report.json and rows.csv, and in a terminal."""
+"""The output of an experiment, report.html, report.md, report.json and rows.csv, and in a terminal."""
 
 import json
 import re
@@ -26,7 +26,7 @@ MEANINGLESS = "The smoke preset only shows that everything works: its numbers me
 
 @dataclass(frozen=True)
 class Report:
-    """What a report holds, whatever it is written as.
+    """The content of a report in any format.
 
     Attributes:
         figures: path relative to the report → caption.
@@ -35,7 +35,7 @@ class Report:
         head: title and introduction of the page, Markdown.
         tables: of the page and the terminal.
         conclusion: sentences before that on hypotheses.
-        warnings: what a reader must know before any number.
+        warnings: sentences before any number.
     """
 
     experiment: str
@@ -64,15 +64,15 @@ class Report:
         return sorted(self.figures.items(), key=lambda figure: figure[0] != self.asked.figure)
 
     def conclusions(self) -> list[str]:
-        """What the page begins with."""
+        """The first sentences of the page."""
         return [MEANINGLESS] if self.meaningless else [*self.conclusion, *claims.summary(self.claims)]
 
     def shown(self) -> list[Table]:
-        """The tables of the page; numbers that mean nothing have no verdicts."""
+        """The tables of the page; a smoke run has no verdicts."""
         return [table for table in self.tables if not (self.meaningless and table.verdicts)]
 
     def page(self, folder: Path) -> Page:
-        """Question, answer, one figure, one table of few columns and what they mean; the rest is folded."""
+        """Lay out question, answer, one figure, one small table and their meaning; the rest is folded."""
         asked, (_, _, introduction) = self.asked, self.head.partition("\n")
         said = [" ".join(re.sub(r"[*`]", "", each).split()) for each in re.split(r"\n\s*\n|\n- ", introduction)]
         plainly = [table for table in self.shown() if not (table.verdicts or table.folded)]
@@ -98,8 +98,7 @@ class Report:
 def write_report(out: str | Path, report: Report, console: Console | None = None) -> None:
     """Write report.html, report.md, rows.csv and report.json into the folder `out`, each atomically, report.json last.
 
-    The tables, the notes and where the report is are printed to the console, if any: of the hypotheses of a quick run
-    those alone that it decides.
+    Tables, notes and the report's path are printed to the console, if any; for a quick run only decided hypotheses.
     """
     out, record = Path(out), lines_of(to_json(report))
     page = report.page(out)
@@ -141,7 +140,7 @@ def _cells(table: Table) -> Cells:
 
 
 def markdown_page(page: Page, report: Report) -> str:
-    """report.md: the same page; what is folded opens on a click, in a site and in a forge."""
+    """report.md: the same page; folded parts open on a click, in a site and in a forge."""
     figures = [f"![{plain(caption)}]({path})\n\n*{plain(caption)}*" for path, caption in report.ordered()]
     more = {table.title: markdown(table) for table in page.details}
     more |= {"More figures": "\n\n".join(figures[1:]), "Notes": _bullets(page.notes)}

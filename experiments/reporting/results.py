@@ -1,4 +1,4 @@
-"""A table of results, whose rows have tags that say what was run, and the numbers that it gave."""
+"""A table of results: rows with tags that describe the run, and numbers."""
 
 import csv
 import io
@@ -51,14 +51,14 @@ class Results:
     @overload
     def __getitem__(self, item: str) -> list[Any]: ...
     def __getitem__(self, item):
-        """One row by its index, or all values of a column by its name."""
+        """Return one row by its index, or all values of a column by its name."""
         return self.rows[item] if isinstance(item, int) else [row.get(item) for row in self.rows]
 
     def __add__(self, other: "Results") -> "Results":
         return Results((*self.rows, *other.rows), self.tags or other.tags)
 
     def where(self, keep: Callable[[Row], bool] | None = None, **tags: Any) -> "Results":
-        """The rows with these values, for which `keep` holds; a tuple, list or set allows any of its values."""
+        """Select the rows with these values and with `keep` true; a tuple, list or set allows any of its values."""
 
         def kept(row: Row) -> bool:
             same = (row.get(t) in v if isinstance(v, tuple | list | set) else row.get(t) == v for t, v in tags.items())
@@ -67,7 +67,7 @@ class Results:
         return self._with(row for row in self.rows if kept(row))
 
     def group(self, *columns: str) -> dict[Any, "Results"]:
-        """The rows of each value of a column, or of each tuple of values of several, in order of appearance."""
+        """Group rows by a column, or by a tuple of columns, in order of appearance."""
         found: dict[Any, list[Row]] = {}
         for row in self.rows:
             key = tuple(row[column] for column in columns)
@@ -86,15 +86,12 @@ class Results:
         return list(dict.fromkeys(self[column]))
 
     def tagged(self, **tags: Any) -> "Results":
-        """The rows with further tags, or other values of these."""
+        """Return the rows with further tags, or other values of these."""
         rows = tuple({**tags, **{name: row[name] for name in row if name not in tags}} for row in self.rows)
         return Results(rows, (*tags, *(tag for tag in self.tags if tag not in tags)))
 
     def numbers(self, column: Column, missing: float = math.inf) -> np.ndarray:
-        """The numbers of a column or of a function of a row; what was not finite counts as `missing`.
-
-        A nested column has a dotted path: "theta.Ix".
-        """
+        """Return the numbers of a column ("theta.Ix" if nested) or of a function of a row; `missing` if not finite."""
 
         def read(row: Any) -> Any:
             for name in column.split(".") if isinstance(column, str) else ():
@@ -108,10 +105,7 @@ class Results:
         return spread(self.numbers(column, missing))
 
     def paired(self, other: "Results", column: Column) -> tuple[np.ndarray, np.ndarray]:
-        """The numbers of a column here, and of the rows with the same seeds and draws in another table.
-
-        A table of one row, such as that of a model that was not trained, is paired with every seed.
-        """
+        """Pair a column with another table's by seed and draw; a single row is paired with every seed."""
         theirs = dict(zip(other._runs(), other.numbers(column), strict=True))
         if len(other) == 1:
             return self.numbers(column), np.full(len(self), *theirs.values())
@@ -123,7 +117,7 @@ class Results:
         return self.numbers(column), np.array([theirs[run] for run in self._runs()])
 
     def interval(self, column: Column, minus: "Results | None" = None, times: float = 1.0) -> Interval:
-        """The mean of a column, or of its difference from `times` that of another table's paired rows."""
+        """The mean of a column, or of its difference from `times` another table's paired rows."""
         first, second = (self.numbers(column), 0.0) if minus is None else self.paired(minus, column)
         with np.errstate(invalid="ignore"):  # ∞ − ∞ says nothing
             return mean_interval(first - np.multiply(times, second), self["seed"], [str(d) for d in self["draw"]])
@@ -132,7 +126,7 @@ class Results:
         return list(zip(self["seed"], self["draw"], strict=True))
 
     def to_csv(self) -> str:
-        """CSV; a nested column becomes one per entry, as theta.Ix, and a cell is empty where a row has no number."""
+        """CSV; a nested column becomes one per entry, for example theta.Ix, and a missing number an empty cell."""
         lines = [dict(leaves(row, ".")) for row in self.rows]
         text = io.StringIO()
         writer = csv.DictWriter(text, dict.fromkeys(name for line in lines for name in line), lineterminator="\n")
@@ -141,7 +135,7 @@ class Results:
         return text.getvalue()
 
     def _with(self, rows: Iterable[Row]) -> "Results":
-        """Some of these rows, which need no check."""
+        """Return some of these rows, without checks."""
         found = object.__new__(Results)
         object.__setattr__(found, "rows", tuple(rows))
         object.__setattr__(found, "tags", self.tags)
@@ -149,7 +143,7 @@ class Results:
 
 
 def leaves(tree: Mapping[str, Any], between: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The values of nested mappings, by their names joined with `between`."""
+    """Flatten nested mappings, with names joined by `between`."""
     for name, value in tree.items():
         if isinstance(value, Mapping):
             yield from leaves(value, between, f"{prefix}{name}{between}")

@@ -24,14 +24,14 @@ class Spread(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """An estimate and the ends of its confidence interval, NaN where the seeds cannot bound it."""
+    """An estimate and the ends of its confidence interval, NaN if the seeds cannot bound it."""
 
     value: float = math.nan
     low: float = math.nan
     high: float = math.nan
 
     def below(self, limit: float) -> bool | None:
-        """Whether the whole interval is below the limit; False if it is all above, None if it does not tell."""
+        """Whether the whole interval is below the limit; False if it is all above, None if it is not significant."""
         return True if self.high < limit else False if self.low > limit else None
 
     def above(self, limit: float) -> bool | None:
@@ -55,10 +55,9 @@ def spread(values: Values) -> Spread:
 def mean_interval(values: Values, seeds: Labels, draws: Labels | None = None) -> Interval:
     """The mean of the values of runs, with a confidence interval over seeds and draws of flights.
 
-    Runs of the same seed are related, and so are runs of the same draw. The variance is clustered both ways, V_seed +
-    V_draw − V_both (Cameron, Gelbach, Miller, "Robust inference with multiway clustering", 2011), but not below V_seed
-    or V_draw. With one draw the interval is Student's. An infinite value makes the mean infinite, for certain; one
-    seed bounds nothing.
+    The variance is clustered by seed and by draw, V_seed + V_draw − V_both (Cameron, Gelbach, Miller, "Robust inference
+    with multiway clustering", 2011), but not below V_seed or V_draw; with one draw the interval is Student's. An
+    infinite value makes the mean infinite; one seed bounds nothing.
     """
     array = np.asarray(values, float)
     with np.errstate(invalid="ignore"):
@@ -81,8 +80,7 @@ def mean_interval(values: Values, seeds: Labels, draws: Labels | None = None) ->
 
 
 def ratio_of_stds(first: Values, second: Values) -> Interval:
-    """The standard deviation of first over that of second, of the same seeds, with the interval of the test of Pitman
-    and Morgan (1939). An infinite value makes a standard deviation infinite."""
+    """The ratio of paired standard deviations, with the interval of Pitman and Morgan's test (1939)."""
     above, below = spread(first).std, spread(second).std
     if math.isnan(above + below) or (above == below and above in (0.0, math.inf)):
         return Interval()
@@ -100,9 +98,9 @@ def ratio_of_stds(first: Values, second: Values) -> Interval:
 def share_of_gap(before: Values, after: Values, reachable: Values, level: float = LEVEL) -> Interval:
     """(before − after) / (before − reachable), of the means over the seeds where all three are finite.
 
-    1 closes the gap between before and what is reachable, 0 none of it. The interval is Fieller's ("Some problems in
-    interval estimation", 1954): all shares s for which a paired t test does not reject (before − after) =
-    s (before − reachable). It has no ends if the gap is not significant, and no value if there is no gap.
+    The interval is Fieller's ("Some problems in interval estimation", 1954): all shares s for which a paired t test
+    does not reject (before − after) = s (before − reachable). It is unbounded if the gap is not significant, and NaN
+    without a gap.
     """
     start, end, best = _finite(before, after, reachable)
     closed, gap = start - end, start - best
@@ -123,7 +121,7 @@ def share_of_gap(before: Values, after: Values, reachable: Values, level: float 
 
 
 def _finite(*samples: Values) -> list[np.ndarray]:
-    """The samples at the seeds where all are finite."""
+    """Return the samples at the seeds where all are finite."""
     arrays = [np.asarray(sample, float) for sample in samples]
     if len({array.shape for array in arrays}) > 1:
         raise ValueError(f"the samples must be of the same seeds, got {', '.join(str(a.shape) for a in arrays)}")

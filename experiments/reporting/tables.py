@@ -25,9 +25,9 @@ class Table(NamedTuple):
     """Header and lines of cells, all text, under a title.
 
     Attributes:
-        labels: columns that say what a line is of.
+        labels: columns that label a line.
         verdicts: whether these are verdicts, which a smoke run must not show.
-        folded: whether a page shows it on a click alone.
+        folded: whether a page shows it only on a click.
     """
 
     title: str
@@ -41,10 +41,7 @@ class Table(NamedTuple):
 def tabulate(
     title: str, groups: Mapping[Any, Results], columns: Mapping[str, Cell], header: Sequence[str] = ("model",)
 ) -> Table:
-    """A line per group of rows, by its label or tuple of labels; a column per function of a group, by its title.
-
-    `header` has the titles of the labels' columns.
-    """
+    """Return a line per group of rows, by its label or labels (titled `header`); a column per function of a group."""
     lines = [
         (*(label if isinstance(label, tuple) else (label,)), *(text(rows) for text in columns.values()))
         for label, rows in groups.items()
@@ -59,7 +56,7 @@ def cross_table(
     text: Cell,
     corner: str = "model",
 ) -> Table:
-    """A line per group of rows, by its label; a column per selection by tags, by its title; a cell for each pair."""
+    """Return a line per group of rows, by its label; a column per selection by tags, by its title."""
 
     def cell(rows: Results, tags: Mapping[str, Any]) -> str:
         own = rows.where(**tags)
@@ -69,7 +66,7 @@ def cross_table(
 
 
 def spread_text(values: Spread, form: str = "", std_form: str = "", what: str = "not finite") -> str:
-    """Mean ± standard deviation; with values that are not finite, their number, `what` they are, and the median of all.
+    """Mean ± standard deviation; values that are not finite are counted as `what`, with the median of all.
 
     The formats are by default those of `measured`; `std_form` is by default `form`.
     """
@@ -83,7 +80,7 @@ def spread_text(values: Spread, form: str = "", std_form: str = "", what: str = 
 
 
 def measured(mean: float, std: float) -> str:
-    """0.067 ± 0.009: the mean to the last digit that the standard deviation leaves, as (3.2 ± 0.2)e-04 if it is small.
+    """0.067 ± 0.009: the mean to the last significant digit of the deviation, or (3.2 ± 0.2)e-04 if it is small.
 
     The deviation has one digit, or two if the first is a 1. Without one (NaN or 0) the mean has three digits.
     """
@@ -98,30 +95,29 @@ def measured(mean: float, std: float) -> str:
 
 
 def over_seeds(results: Results) -> str:
-    """How many seeds the rows are of."""
+    """Count the seeds of the rows."""
     seeds = len(set(results["seed"]))
     return f"{seeds} seeds" if seeds > 1 else "one seed"
 
 
 def mean_over_seeds(results: Results) -> str:
-    """What the numbers of `spread_text` are, for a title."""
+    """Describe the numbers of `spread_text`, for a title."""
     seeds = over_seeds(results)
     return seeds if seeds == "one seed" else f"mean ± std over {seeds}"
 
 
 def narrowed(table: Table) -> Table:
-    """The table with its first columns alone, at most FEW."""
+    """Return only the table's first columns, at most FEW."""
     return table._replace(header=table.header[:FEW], lines=[line[:FEW] for line in table.lines])
 
 
 def markdown(table: Any) -> str:
-    """The header and lines of a table of texts."""
     lines = [table.header, ["---"] * len(table.header), *table.lines]
     return "\n".join(f"| {' | '.join(plain(cell) for cell in line)} |" for line in lines)
 
 
 def print_tables(console: Console, tables: Sequence[Table]) -> None:
-    """Print tables so that no word is broken; one that is too wide comes in parts, each with the labels."""
+    """Print tables without broken words; a wide one is printed in parts, each with the labels."""
     for table in tables:
         columns = list(zip(table.header, *table.lines, strict=True))
         least = [max(len(word) for cell in column for word in [*cell.split(), ""]) for column in columns]
@@ -143,7 +139,7 @@ def print_tables(console: Console, tables: Sequence[Table]) -> None:
 
 
 def columns_of_parts(least: Sequence[int], labels: int, width: int) -> list[list[int]]:
-    """The columns of each part of a table, each with those of the labels, such that the least widths fit."""
+    """Return the columns of each part of a table, with the labels, such that the least widths fit."""
     parts: list[list[int]] = [[]]
     for i in range(labels, len(least)):
         if parts[-1] and sum(least[:labels]) + sum(least[j] for j in [*parts[-1], i]) > width:
@@ -153,5 +149,5 @@ def columns_of_parts(least: Sequence[int], labels: int, width: int) -> list[list
 
 
 def plain(text: str) -> str:
-    """Text that ends neither a table's cell nor a line of Markdown."""
+    """Escape text for a cell and a line of Markdown."""
     return " ".join(text.replace("|", "\\|").split())

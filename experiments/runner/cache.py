@@ -1,4 +1,4 @@
-"""The cache of experiments: the result of each finished stage in one archive, found again by what determines it."""
+"""The cache of experiments: each finished stage's result in one archive, found by its inputs."""
 
 import hashlib
 import re
@@ -27,9 +27,9 @@ class Cache:
     """A folder of finished stages.
 
     Attributes:
-        folder: where the archives are.
+        folder: of the archives.
         say: prints a line about what is moved aside.
-        fresh: whether results of other versions, and unfinished ones, are moved aside and made anew.
+        fresh: whether results of other versions, and unfinished ones, are moved aside and computed again.
     """
 
     folder: Path
@@ -37,15 +37,15 @@ class Cache:
     fresh: bool = False
 
     def path(self, name: str, identity: str) -> Path:
-        """The archive of a stage, whether it exists or not; `identity` is of `identity_of` or `sweep_identity`."""
+        """Return the archive of a stage, which may not exist; `identity` is of `identity_of` or `sweep_identity`."""
         return self.folder / f"{_stem(name)}-{identity[:16]}.npz"
 
     def knows(self, name: str) -> bool:
-        """Whether a stage of this name, with whatever identity, is finished or begun."""
+        """Whether a stage of this name, with any identity, is finished or begun."""
         return any(self.folder.glob(f"{_stem(name)}-*"))
 
     def load(self, path: Path) -> tuple[Any, Arrays] | None:
-        """What `save` was given, if the stage is finished; ValueError that names the file if it is damaged."""
+        """Return a finished stage's result; ValueError that names the file if it is damaged."""
         if not path.exists():
             return None
         about, arrays = load_archive(path, FORMAT)
@@ -54,7 +54,7 @@ class Cache:
         return about, arrays
 
     def save(self, path: Path, about: dict[str, Any], arrays: Arrays) -> None:
-        """Keep a result: JSON values, of which "seconds" is the time that it took, and arrays."""
+        """Save a result: JSON values, of which "seconds" is its time, and arrays."""
         path.parent.mkdir(parents=True, exist_ok=True)
         save_archive(path, FORMAT, about | {"versions": versions(*FINISHED_BY)}, arrays)
 
@@ -63,10 +63,7 @@ class Cache:
 
 
 def identity_of(*inputs: Any) -> str:
-    """What determines a stage's results, given as JSON, datasets and fields, and the code of these packages.
-
-    Inputs do not say what is done with them, so any edit makes the stage anew.
-    """
+    """Return a stage's identity: JSON, datasets and fields, and the code of these packages, so that any edit counts."""
     sources = [source_digest(package) for package in ("hybrid_jax", "experiments")]
     fixed: list[Any] = [*sources, versions(*FINISHED_BY)]
     arrays: dict[str, Any] = {}
@@ -83,7 +80,7 @@ def identity_of(*inputs: Any) -> str:
 
 
 def sweep_identity(states: FitState, plans: RunConfig, settings: Settings, data: Dataset) -> str:
-    """The same for a sweep, whatever the code: training takes too long to be repeated after every edit; see RECIPE."""
+    """Return a sweep's identity without the code: training is too slow to be repeated after every edit; see RECIPE."""
     regulariser = None if settings.regulariser is None else settings.regulariser.__name__
     shared = [settings.batch_size, regulariser, type(settings.solver).__name__]
     objective: Any = settings.objective
@@ -96,7 +93,7 @@ def sweep_identity(states: FitState, plans: RunConfig, settings: Settings, data:
 
 @cache
 def source_digest(package: str) -> str:
-    """The digest of all Python files of a package."""
+    """Return the digest of all Python files of a package."""
     spec = find_spec(package)
     digest = hashlib.sha256()
     for root in sorted(spec.submodule_search_locations or ()) if spec else ():

@@ -1,4 +1,4 @@
-"""Checkpoints of an unfinished sweep: numbered archives, saved between blocks of epochs, until which signals wait."""
+"""Checkpoints of an unfinished sweep: numbered archives, saved between blocks of epochs; signals wait for them."""
 
 import signal
 import time
@@ -28,10 +28,7 @@ class Checkpoints:
         self._folder = folder
 
     def save(self, about: Any, arrays: Arrays) -> None:
-        """Write the next checkpoint (`about`: JSON values), then delete all but the last two.
-
-        Raises OSError if it cannot be written, as on a full disk; earlier checkpoints are intact.
-        """
+        """Write the next checkpoint (`about`: JSON values), then delete all but the last two; OSError if it fails."""
         paths = self._paths()
         number = 1 + max((int(path.stem) for path in paths), default=0)
         save_archive(self._folder / f"{number:06d}.npz", FORMAT, about, arrays)
@@ -39,10 +36,7 @@ class Checkpoints:
             path.unlink()
 
     def load(self, say: Callable[[str], None]) -> tuple[Any, dict[str, np.ndarray]] | None:
-        """`about` and the arrays of the newest intact checkpoint, if there is one.
-
-        A damaged one is renamed, not deleted, with a line to `say`.
-        """
+        """Return the newest intact checkpoint, if any; rename a damaged one with a line to `say`."""
         for path in reversed(self._paths()):
             try:
                 return load_archive(path, FORMAT)
@@ -99,7 +93,7 @@ class DeferredSignals(AbstractContextManager):
 class Autosave:
     """Save a sweep between blocks, within its share of the time, and whenever a signal is pending.
 
-    `spent` are the seconds that earlier runs spent on the sweep.
+    `spent`: seconds of earlier runs.
     """
 
     def __init__(self, checkpoints: Checkpoints, signals: DeferredSignals, name: str, spent: float, share: float):
@@ -110,7 +104,7 @@ class Autosave:
         self.saving = 0.0  # s spent on saving
 
     def seconds(self) -> float:
-        """Time spent on the sweep so far, earlier runs included."""
+        """Time spent on the sweep so far, including earlier runs."""
         return self._spent + time.perf_counter() - self._began
 
     def after_block(self, states: FitState) -> None:
@@ -122,7 +116,7 @@ class Autosave:
         self._signals.raise_pending()
 
     def save_last_block(self) -> None:
-        """Save the last block, unless it is saved already."""
+        """Save the last block, unless it is already saved."""
         if self._unsaved is None or not hosts.is_main_process():
             return
         began = time.perf_counter()

@@ -76,7 +76,7 @@ def run(
 
 
 def check(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> None:
-    """End the process, as `run` does, if the command line is not one of this experiment."""
+    """End the process, like `run`, if the command line does not fit this experiment."""
     with exit_codes(name, name, "interrupted"):
         read(name, about, arguments, presets)
 
@@ -90,7 +90,7 @@ def call(
 
 
 def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> Run:
-    """The configuration given by a command line: a preset, changed by the other options."""
+    """Return the configuration of a command line: a preset, changed by the other options."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset", nargs="?", default=Run.preset, const="")
     chosen = parser.parse_known_args(arguments)[0].preset

@@ -15,7 +15,7 @@ FIRST, SECOND, INTERVAL = 1.0, 5.0, 30.0  # s before the first and the second li
 
 
 class Line(AbstractContextManager):
-    """One line about a stage: what is being done, the time since it began and, where it is known, the time left.
+    """One line about a stage: the current work, the elapsed time and, if known, the remaining time.
 
     A terminal shows it at once, with a running clock. A file gets it after a second, so that short stages add no line.
     """
@@ -50,23 +50,23 @@ class Line(AbstractContextManager):
             self._live.stop()
 
     def say(self, doing: str) -> None:
-        """Show what is being done; in a file at most once per INTERVAL."""
+        """Show the current work; in a file at most once per INTERVAL."""
         self._doing = doing
         if self._live is None and time.perf_counter() > self._due:
             self._due = time.perf_counter() + INTERVAL
             self._print()
 
     def show_share(self, doing: str, share: float) -> None:
-        """Show the finished share of the work, 0 … 1, and the time left if the rest is as fast."""
+        """Show the finished share of the work, 0 … 1, and the remaining time at this rate."""
         left = f", {clock(self._elapsed() * (1 - share) / share)} left" if share > 0 else ""
         self.say(f"{doing} {share:.0%}{left}")
 
     def show_parts(self, done: int, parts: int) -> None:
-        """Show the number of finished parts and the time left, if the others take as long."""
+        """Show the number of finished parts and the remaining time at this rate."""
         self.show_share(f"{done} of {parts} parts,", done / parts)
 
     def show_sweep(self, progress: Progress) -> None:
-        """Show active runs, best loss, and bounds of the time left."""
+        """Show active runs, best loss, and bounds of the remaining time."""
         share = progress.active / progress.lanes  # stopped runs cost nothing
         epoch = share * progress.seconds / max(progress.epochs, 1)
         self.say(

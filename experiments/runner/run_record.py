@@ -1,4 +1,4 @@
-"""What a run was: its environment, and run.json with its configuration, so that only the same run can resume."""
+"""A run's environment, and run.json with its configuration, so that only the same run can resume."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
@@ -23,7 +23,7 @@ MACHINE = ("machine",)  # where these are not, it says so
 
 
 def environment(stages: Mapping[str, float]) -> dict[str, Any]:
-    """Versions, hardware, seconds of each stage and the date (UTC, ISO 8601), as JSON values."""
+    """Return versions, hardware, seconds of each stage and the date (UTC, ISO 8601), as JSON values."""
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": versions(*PACKAGES),
@@ -38,9 +38,7 @@ class OtherRun(Explained):
 
 @contextmanager
 def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[None]:
-    """Record that a run began in a folder, and at the end that it finished.
-
-    Bad input and failed checks begin nothing: they restore the previous record, so that a mended run may follow.
+    """Record the beginning and the end of a run in a folder; bad input and failed checks restore the previous record.
 
     Raises:
         OtherRun: an unfinished run there has another configuration, other flights or other versions.
@@ -72,7 +70,7 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
 
 
 def describe(config: Run) -> dict[str, Any]:
-    """Everything that determines the results, as JSON values, and the time [UTC, ISO 8601]."""
+    """Return all inputs of the results, as JSON values, and the time [UTC, ISO 8601]."""
     options = config.described()
     given = {name: value for name, value in options.items() if isinstance(value, Path)}
     return {
@@ -99,7 +97,7 @@ def _differences(old: Mapping[str, Any], new: Mapping[str, Any], parts: tuple[st
 
 
 def _move_aside(folder: Path, say: Callable[[str], None]) -> None:
-    """Move the contents of a results folder to a backup beside it, the record last, so that a kill loses nothing."""
+    """Move a results folder's contents to a backup beside it, the record last, so that a kill loses nothing."""
     left = [path for path in folder.iterdir() if path.name != ".lock"]
     if left:
         elsewhere = backup_path(folder, "before")

@@ -1,4 +1,4 @@
-"""The stages of an experiment: what is finished is found in the cache, what was interrupted goes on, the rest runs."""
+"""The stages of an experiment: finished ones are read from the cache, interrupted ones resume, the rest runs."""
 
 import json
 import time
@@ -36,13 +36,13 @@ Kept = Callable[[str, Mapping[str, Job]], dict[str, Found]]  # `Stages.kept` of 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A stage of an experiment, which `Stages.run` runs after those that it needs.
+    """A stage of an experiment, which `Stages.run` runs after the stages in `needs`.
 
     Attributes:
-        words: what is done, and to what; together they name the stage.
-        work: makes the result, from the results of `needs`.
+        words: the work and its object; together they name the stage.
+        work: computes the result, from the results of `needs`.
         needs: the stages before it.
-        compile: compiles the programs that `work` will run, if their shapes are known before `needs` are done.
+        compile: compiles the programs of `work`, if their shapes are known before `needs` are done.
     """
 
     words: tuple[str, ...]
@@ -52,12 +52,12 @@ class Stage:
 
     @property
     def name(self) -> str:
-        """The words, as the console, the report and the cache show them."""
+        """The words, as shown by console, report and cache."""
         return " ".join(self.words)
 
 
 class Stages:
-    """Runs the stages of an experiment, keeps their results in a folder, and measures the time that each took.
+    """Runs the stages of an experiment, caches their results, and measures their times.
 
     `saving` is as in `Run`, `fresh` as in `Cache`.
     """
@@ -69,7 +69,7 @@ class Stages:
         self._ran = self._saving = 0.0
 
     def run(self, protocol: Sequence[Stage]) -> dict[Stage, Any]:
-        """The results of stages, run in their order; meanwhile other threads compile what later ones will run.
+        """Run stages in their order and return their results; meanwhile other threads compile later ones.
 
         Several processes of one run must compile in the same order, so there each stage compiles when it runs.
         """
@@ -94,13 +94,11 @@ class Stages:
         data: Dataset,
         min_capacity: tuple[int, int] = (0, 0),
     ) -> FitState:
-        """The final states of a sweep on the train and validation splits of a dataset; see `sweep`.
-
-        Two processes with one cache do not train the same sweep: the second waits for the first.
+        """Return the final states of a sweep on a dataset; a second process with the same cache waits for the first.
 
         Raises:
             OtherRun: the sweep was begun by other versions of the libraries.
-            ValueError: the cached result is damaged; the message names the file, so that it can be deleted.
+            ValueError: the cached result is damaged; the message names the file, so that you can delete it.
             OSError: the state cannot be saved.
         """
         finished = self._cache.path(name, sweep_identity(states, plans, settings, data))
@@ -152,7 +150,7 @@ class Stages:
         return states
 
     def timed(self, name: str, work: Callable[[], Result], doing: str = "") -> Result:
-        """The result of `work()`; its time is added to that of the stage `name`. `doing` is shown meanwhile."""
+        """Return the result of `work()` and add its time to the stage `name`; `doing` is shown meanwhile."""
         began = time.perf_counter()
         with Line(name, self._console, doing) if doing else nullcontext():
             result = work()
@@ -160,7 +158,7 @@ class Stages:
         return result
 
     def parts(self, name: str, jobs: Sequence[Callable[[], Result]]) -> list[Result]:
-        """The results of jobs run one after the other, with progress, as one timed stage."""
+        """Run jobs in sequence, with progress, as one timed stage."""
         results: list[Result] = []
         with Line(name, self._console, "compiling and solving") as line:
             for job in jobs:
@@ -169,10 +167,7 @@ class Stages:
         return results
 
     def kept(self, name: str, jobs: Mapping[str, Job], identity: str) -> dict[str, Found]:
-        """Rows and arrays of each job, as by `parts`; they are kept in the cache, and so run once.
-
-        `identity` says what determines them, besides their names; see `identity_of`.
-        """
+        """Return rows and arrays of each job, run by `parts` or cached by name and `identity` (see `identity_of`)."""
         found, missing = dict[str, Found](), dict[str, Job]()
         for job, work in jobs.items():
             path = self._cache.path(f"{name} {job}", identity)
@@ -189,14 +184,14 @@ class Stages:
         return {job: found[job] for job in jobs}
 
     def notes(self) -> list[str]:
-        """Remarks on the times in `seconds`."""
+        """Return remarks on the times in `seconds`."""
         reused = f"Taken from the cache, with the seconds of the run that made them: {', '.join(self.reused)}."
         saved = f"Saving checkpoints took {self._saving / (self._ran or 1):.2%} of the sweeps' time."
         return [reused] * bool(self.reused) + [saved] * bool(self._ran)
 
     @contextmanager
     def _alone(self, name: str, path: Path) -> Iterator[None]:
-        """Hold the lock file of a sweep; wait while another process does."""
+        """Lock a sweep's file, or wait while another process has it."""
         if not hosts.is_main_process():  # it alone reads and writes
             yield
             return
@@ -226,12 +221,12 @@ class Stages:
 
 
 def rows_of(found: Mapping[str, Found]) -> list[Row]:
-    """The rows of all jobs, in their order."""
+    """Return the rows of all jobs, in their order."""
     return [row for rows, _ in found.values() for row in rows]
 
 
 def stages_of(config: Run, console: Console) -> Stages:
-    """The stages of an experiment, kept in its cache folder."""
+    """Return the stages of an experiment, with its cache folder."""
     return Stages(config.cache / "stages", console, config.saving, config.fresh)
 
 

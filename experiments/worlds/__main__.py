@@ -1,4 +1,4 @@
-"""Is an adapted model ever worse than its source, in worlds that we wrote and others: python -m experiments.worlds"""
+"""Is an adapted model ever worse than its source, in our own worlds and others: python -m experiments.worlds"""
 
 from dataclasses import replace
 from functools import partial

@@ -1,4 +1,4 @@
-"""Cases of adaptation: a world, a change and a flight to adapt to; from these to a row for each source and flight."""
+"""Cases of adaptation: a world, a change and a flight to adapt to; with a row for each source and flight."""
 
 import itertools
 import time
@@ -45,8 +45,8 @@ class Flight(NamedTuple):
     Attributes:
         kind: one of `world.KINDS`.
         seconds: its length [s].
-        noise: of its sensors, over that of other flights.
-        burst: whether some of its samples are wild.
+        noise: of its sensors, over the usual noise.
+        burst: whether some of its samples are outliers.
     """
 
     kind: str = "moving"
@@ -90,7 +90,7 @@ class WorldsConfig(OneFlight):
         distinct("--learn-from", self.learn_from)
 
     def cases(self) -> Iterator[tuple[ChangeName, FlightName]]:
-        """A change and a flight to adapt to."""
+        """Return pairs of a change and a flight to adapt to."""
         for change in self.changes:
             for flight in self.learn_from:
                 if flight == USUAL or change == NOTHING:
@@ -98,13 +98,13 @@ class WorldsConfig(OneFlight):
 
 
 def key_of(world: World, config: WorldsConfig, purpose: int, draw: int = 0) -> PRNGKeyArray:
-    """For everything random of this purpose."""
+    """Return the random key of this purpose."""
     key = jax.random.fold_in(jax.random.key(config.data_seed), [*WORLDS].index(world.name))
     return jax.random.fold_in(jax.random.fold_in(key, purpose), draw)
 
 
 def source_flights(world: World, config: WorldsConfig) -> Dataset:
-    """The windows to train sources on, and others to stop by."""
+    """Return the windows to train sources on, and others for early stopping."""
     numbers = {"train": config.source_train, "validation": config.validating()}
     each = round(LEARNING / STEPS * 100)
     flights = {name: -(-number // each) for name, number in numbers.items()}
@@ -117,7 +117,7 @@ def source_flights(world: World, config: WorldsConfig) -> Dataset:
 
 
 def flown_after(world: World, change: str, flight: str, draw: int, config: WorldsConfig) -> hj.Trajectories:
-    """The windows to adapt to, of one flight."""
+    """Return the windows of one flight to adapt to."""
     kind, seconds, noise, burst = FLIGHTS[flight]
     flown = world.fly(change, kind, 1, seconds, key_of(world, config, TARGET, draw))
     key, averaged = key_of(world, config, NOISE, 1 + draw), config.rotor_speeds == "averaged"
@@ -125,14 +125,14 @@ def flown_after(world: World, change: str, flight: str, draw: int, config: World
 
 
 class Tests(NamedTuple):
-    """Usual flights after a change: all without noise, and each as it would be logged."""
+    """Usual flights after a change: all without noise, and each as logged."""
 
     exact: hj.Trajectories
     logged: list[hj.Trajectories]
 
 
 def tests_after(world: World, change: str, config: WorldsConfig) -> Tests:
-    """The flights that tell how good a model is."""
+    """Return the test flights."""
     flown = world.fly(change, USUAL, config.test_flights, TESTING, key_of(world, config, TEST))
     key, averaged = key_of(world, config, TEST), config.rotor_speeds == "averaged"
     noisy = logged(flown, key, LONG, noise=config.noise, averaged=averaged)
@@ -142,7 +142,7 @@ def tests_after(world: World, change: str, config: WorldsConfig) -> Tests:
 
 
 def many_after(world: World, change: str, config: WorldsConfig) -> tuple[hj.Trajectories, hj.Trajectories]:
-    """Windows of many flights to train on, and others to stop by, without noise."""
+    """Return windows of many flights for training, and others for early stopping, without noise."""
     flown = world.fly(change, USUAL, MANY + 1, LEARNING, key_of(world, config, TRAINING))
     averaged = config.rotor_speeds == "averaged"
     windows = logged(flown, key_of(world, config, NOISE), STEPS, noise=0.0, averaged=averaged)
@@ -151,7 +151,7 @@ def many_after(world: World, change: str, config: WorldsConfig) -> tuple[hj.Traj
 
 
 def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
-    """The rows of a world: for each case, draw, source and method what becomes of the error on usual flights."""
+    """Return a world's rows: for each case, draw, source and method the change of the error on usual flights."""
     flown = source_flights(world, config)
     fields = pretrained(HYBRID, world.vehicle, config, stages, flown).fields
 
@@ -173,7 +173,7 @@ def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
 
 
 def row_of(method: str, task: Task, change: str, test: Tests) -> dict[str, Any]:
-    """What a method makes of a task, and how well that does on the tests."""
+    """Apply a method to a task and test the result."""
     begun = time.process_time()
     model = METHODS[method](task)
     seconds = time.process_time() - begun

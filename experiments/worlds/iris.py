@@ -22,7 +22,7 @@ AT_ONCE = 1e-9  # s
 
 
 def domain_of(change: str) -> Domain:
-    """The true system after one of `CHANGES`; motors change beside it."""
+    """Return the true system after one of `CHANGES`, except motors."""
     return DOMAINS.get(change, SOURCE)
 
 
@@ -31,7 +31,7 @@ class Iris:
     """The Iris of `hybrid_jax.sim`, whose inputs are held over each interval; see `World`.
 
     Attributes:
-        name: what reports call it.
+        name: label in reports.
         vehicle: its constants before a change.
     """
 
@@ -64,7 +64,7 @@ def _fly(
     steps: int,
     keys: PRNGKeyArray,
 ):
-    """States, and twice the rotor speeds, of flights; in an interval rotors keep a share of their speed."""
+    """Return states, and twice the rotor speeds, of flights; in an interval rotors retain a share of their speed."""
     scale = pilot.scale_of(IRIS)
 
     def one(key: PRNGKeyArray):

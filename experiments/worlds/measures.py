@@ -1,4 +1,4 @@
-"""What a row says of an adapted model: its error, its parameters and their intervals, the errors that it expected."""
+"""The numbers of a row about an adapted model: its error, parameters, intervals, and expected errors."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -27,9 +27,9 @@ def error_of(field: hj.AbstractVectorField, test: hj.Trajectories):
 
 
 def parameters_of(world: World, change: str, found: Mapping[str, Parameter]) -> dict[str, Any]:
-    """Of each of θ_p its error, half-width and whether its 95 % interval holds the truth; None where there is none.
+    """Return error, half-width and coverage of the 95 % interval for each of θ_p; None without a true value.
 
-    A weak rotor has no k of its own, and the model keeps the mass, so that with another one its θ_p are others, too.
+    A weak rotor has no k of its own, and since the model's mass is fixed, another mass changes θ_p.
     """
     vehicle, truth = world.changed(change), nominal(world.changed(change))
     other_mass = vehicle.mass != world.vehicle.mass
@@ -48,7 +48,7 @@ def parameters_of(world: World, change: str, found: Mapping[str, Parameter]) -> 
 
 @jit_with(FAST_COMPILE)
 def _ends(field: hj.AbstractVectorField, windows: hj.Trajectories):
-    """Errors at the ends of pieces of these lengths, one after the other: a flight has more of the shorter ones."""
+    """Return errors at the ends of consecutive pieces of these lengths."""
 
     def after(steps: int):
         starts = jnp.concatenate([windows.x0[:, None], windows.x[:, steps - 1 : -1 : steps]], axis=1)
@@ -62,7 +62,7 @@ def _ends(field: hj.AbstractVectorField, windows: hj.Trajectories):
 def expected_inside(
     field: hj.AbstractVectorField, expected: Expected, flights: list[hj.Trajectories]
 ) -> dict[str, Any]:
-    """By horizon the share of flights and quantities whose RMSE is in the 80 % interval; None without intervals."""
+    """Return by horizon the share of flights and quantities inside the 80 % interval; None without intervals."""
     inside: dict[str, list[bool]] = {name: [] for name in HORIZONS}
     for windows in flights:
         for horizon, away in zip(HORIZONS, _ends(field, windows), strict=True):

@@ -1,4 +1,4 @@
-"""What people use to adapt a model of a vehicle to ten seconds of flight, beside `hj.adapt`."""
+"""Common methods of adapting a vehicle's model to ten seconds of flight, beside `hj.adapt`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -21,15 +21,16 @@ CHANGING = 1.0  # m/s² and rad/s²: the filter's prior of a disturbance
 
 
 class Task(NamedTuple):
-    """What a method may use.
+    """The inputs of a method.
 
     Attributes:
-        world: whose vehicle, before the change, is known.
+        world: with the known vehicle before the change.
         source: the hybrid that was trained before the change.
-        learned: what it learned from.
+        learned: its training windows.
         windows: of the flight to adapt to.
         noise: of that flight; 1 is typical.
-        many: windows of many flights without noise, to train on and to stop by, as in the paper; None if not needed.
+        many: windows of many flights without noise, for training and early stopping, as in the paper; None if not
+            needed.
     """
 
     world: World
@@ -41,7 +42,7 @@ class Task(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What a method gives: a field, its parameters, and what `hj.adapt` says beyond that."""
+    """The result of a method: a field, its parameters, and further results of `hj.adapt`."""
 
     field: hj.AbstractVectorField
     parameters: Mapping[str, Parameter]
@@ -49,24 +50,24 @@ class Model(NamedTuple):
 
 
 def adapted(method: Method | str, task: Task) -> Model:
-    """By `hj.adapt`, of the one flight; where a method needs some, its last fifth tells when to stop."""
+    """Run `hj.adapt` on the one flight; its last fifth is for early stopping if the method needs that."""
     learned = task.learned if method == AUTO else None
     return _of(hj.adapt(task.source, task.windows, method=method, learned_from=learned))
 
 
 def as_in_the_paper(task: Task) -> Model:
-    """By Adam on windows of many flights, with others to stop by, all without noise."""
+    """Train by Adam on windows of many flights, with others for early stopping, all without noise."""
     assert task.many is not None
     return _of(hj.adapt(task.source, task.many[0], method=FineTune(), validation=task.many[1]))
 
 
 def white_box(task: Task) -> Model:
-    """Least squares on physics without a network, from nominal values: no source is needed."""
+    """Fit physics without a network by least squares, from nominal values, without a source."""
     return _of(hj.adapt(hj.rigid_body(task.world.vehicle, WHITE_BOX), task.windows, method="least_squares"))
 
 
 def kalman_filter(task: Task) -> Model:
-    """An extended Kalman filter of the same parameters, sample by sample."""
+    """Estimate the same parameters by an extended Kalman filter, sample by sample."""
     noise = task.noise * np.repeat([*asdict(Noise()).values()], [3, 4, 3, 3])
     physics = hj.rigid_body(task.world.vehicle, WHITE_BOX)
     online = hj.OnlineAdaptation(physics, DT, tuple(noise.tolist()), disturbance=CHANGING)

@@ -33,25 +33,25 @@ Vector = Float[Array, "3"]
 
 
 class Constants(NamedTuple):
-    """Of a vehicle and of what acts on it, body frame x forward, y left, z up; SI units.
+    """Constants of a vehicle and its environment, body frame x forward, y left, z up; SI units.
 
     Attributes:
         mass: [kg].
         inertia: principal moments [kg m²].
-        rotors: places of the four rotors [m] (4, 3).
+        rotors: positions of the four rotors [m] (4, 3).
         spin: signs of their reaction torques.
-        efficiency: share of thrust and reaction torque that each rotor gives.
+        efficiency: each rotor's share of thrust and reaction torque.
         thrust: [N/(rad/s)²].
         torque: [N m/(rad/s)²].
         rotor_drag: of a rotor at its hub, along x, y (H-force) and z (inflow), per its speed [kg/rad].
-        lift: of translation, of a rotor [kg/m].
-        flapping: moment of a rotor per its speed and that of the air [kg m/rad].
+        lift: translational, of a rotor [kg/m].
+        flapping: moment of a rotor per its speed and the air's [kg m/rad].
         parasitic: drag of the frame [kg/m].
         lag: of the motors [s].
         fastest: rotor speed [rad/s].
         stiffness: of the attitude controller [1/s²].
         damping: of the attitude controller [1/s].
-        reached: share of the commanded speed that a motor runs up to.
+        reached: share of the commanded speed that a motor reaches.
         wind: mean [m/s, world].
         gust: amplitude of a sine in each direction [m/s].
     """
@@ -77,7 +77,7 @@ class Constants(NamedTuple):
 
 
 def _square(arm: float) -> np.ndarray:
-    """The places of four rotors on the diagonals: front left, front right, back right, back left."""
+    """Return four rotors on the diagonals: front left, front right, back right, back left."""
     return arm / np.sqrt(2) * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
 
 
@@ -95,7 +95,7 @@ CRAZYFLIE = Constants(
 def derivative(
     c: Constants, x: Float[Array, "13"], speeds: Float[Array, "4"], command: Float[Array, "4"], wind: Vector
 ) -> tuple[Float[Array, "13"], Float[Array, "4"]]:
-    """The derivatives of state and rotor speeds, for commanded speeds [rad/s] and a wind [m/s, world]."""
+    """Return derivatives of state and rotor speeds, for commanded speeds [rad/s] and a wind [m/s, world]."""
     q, rates, inertia, rotors = x[QUATERNION], x[BODY_RATES], jnp.asarray(c.inertia), jnp.asarray(c.rotors)
     air = rotation.rotate(rotation.conjugate(q), x[VELOCITY] - wind)
     hubs = air + jnp.cross(rates, rotors)
@@ -111,7 +111,7 @@ def derivative(
 
 
 def decide(c: Constants, x: Float[Array, "13"], now: Reference) -> Float[Array, "4"]:
-    """The rotor speeds that the controller asks for, of a vehicle with these constants [rad/s]."""
+    """Return the controller's commanded rotor speeds, for a vehicle with these constants [rad/s]."""
     wanted = POSITION_GAIN * (now.position - x[POSITION]) + VELOCITY_GAIN * (now.velocity - x[VELOCITY])
     lift = c.mass * (wanted + now.acceleration + G * UP)
     attitude = jnp.array(rotation.matrix(x[QUATERNION]))
@@ -129,7 +129,7 @@ def decide(c: Constants, x: Float[Array, "13"], now: Reference) -> Float[Array, 
 
 
 def advance(c: Constants, x, speeds, command, t: Scalar):
-    """State and rotor speeds after an interval with the command held, by classical RK4, and the mean speeds in it."""
+    """Return state and rotor speeds after an interval with the command held (RK4), and the mean speeds in it."""
     h = DT / SUBSTEPS
 
     def slope(state, t):
@@ -156,7 +156,7 @@ class RotorPy:
     """A vehicle of RotorPy; see `World`.
 
     Attributes:
-        name: what reports call it.
+        name: label in reports.
         nominal: its constants before a change.
     """
 
@@ -171,7 +171,7 @@ class RotorPy:
         return _vehicle(self.name, self.truth(change))
 
     def truth(self, change: str) -> Constants:
-        """The constants after one of `CHANGES`."""
+        """Return the constants after one of `CHANGES`."""
         c, (ix, iy, iz) = self.nominal, self.nominal.inertia
         arm = float(np.abs(c.rotors).max())
         load = loaded(self.vehicle, 0.2 * c.mass, (0.2 * arm, 0.15 * arm, -0.25 * arm))
@@ -209,7 +209,7 @@ ROTORPY = (RotorPy("hummingbird", HUMMINGBIRD), RotorPy("crazyflie", CRAZYFLIE))
 
 @jit_with(FAST_COMPILE)
 def _fly(truth: Constants, nominal: Constants, kind: Kind, steps: int, keys: PRNGKeyArray):
-    """States, and rotor speeds at the start of each interval and in its mean, of a flight for each key."""
+    """Return states, and rotor speeds at the start of each interval and on average, of a flight for each key."""
 
     def one(key: PRNGKeyArray):
         reference = draw_reference(key, kind, steps)

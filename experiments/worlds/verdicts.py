@@ -1,4 +1,4 @@
-"""What the rows of worlds say: never worse than the source, intervals that hold, and what other methods do."""
+"""Tables and claims about worlds: never worse than the source, coverage, and other methods."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ CASE = "world", "change", "flight"
 
 
 def _cases(rows: Results) -> dict[tuple, Results]:
-    """Those of `hj.adapt`, the worst first."""
+    """Return the cases of `hj.adapt`, the worst first."""
     cases = rows.where(method=AUTO).group(*CASE)
     return dict(sorted(cases.items(), key=lambda case: -case[1].numbers("ratio").max()))
 
@@ -26,7 +26,7 @@ def _sound(own: Results) -> bool:
 
 
 def ratio_table(rows: Results) -> Table:
-    """A line for each case, the worst first."""
+    """Return a line for each case, the worst first."""
     lines = []
     for case, own in _cases(rows).items():
         ratio, taken = own.numbers("ratio"), [row["chosen"] for row in own]
@@ -38,7 +38,7 @@ def ratio_table(rows: Results) -> Table:
 
 
 def conclusion(rows: Results) -> list[str]:
-    """How often the law holds, and where it fails most."""
+    """Summarise how often the law is true, and its worst case."""
     cases = _cases(rows)
     worst, own = next(iter(cases.items()))
     return [
@@ -49,12 +49,12 @@ def conclusion(rows: Results) -> list[str]:
 
 
 def known(rows: Results, column: str) -> np.ndarray:
-    """The numbers of a column where it has some."""
+    """Return the available numbers of a column."""
     return np.array([row[column] for row in rows if row[column] is not None], float)
 
 
 def coverage_table(rows: Results) -> Table:
-    """A line for each world, method and parameter: how many 95 % intervals hold the truth, error, half-width."""
+    """Return a line for each world, method and parameter: coverage of 95 % intervals, error, half-width."""
     lines = []
     for (world, method), own in rows.where(flight="moving").group("world", "method").items():
         for name in LEARNED:
@@ -67,14 +67,14 @@ def coverage_table(rows: Results) -> Table:
 
 
 def expectation_table(rows: Results) -> Table:
-    """A line for each world: the share of other flights whose error is in the interval that was expected."""
+    """Return a line for each world: the share of other flights with an error in the expected interval."""
     columns = {name.split(" ", 1)[1]: lambda own, name=name: f"{known(own, name).mean():.0%}" for name in HORIZONS}
     title = "Do 80 % intervals of the errors to expect hold those of other flights?"
     return tabulate(title, _expecting(rows), columns, ("world",))
 
 
 def method_table(rows: Results) -> Table:
-    """A line for each world, change and method: error, the same over the source's, processor time."""
+    """Return a line for each world, change and method: error, its ratio to the source's, processor time."""
     lines = []
     for own in rows.where(flight="moving").group("world", "change").values():
         for key, each in own.group("world", "change", "method").items() if len(own.unique("method")) > 1 else ():

@@ -1,4 +1,4 @@
-"""What a world is, how it is asked to fly, and the log that a vehicle would write of it."""
+"""The interface of a world, its references, and the logs of its vehicle."""
 
 from collections.abc import Callable
 from dataclasses import asdict
@@ -58,7 +58,7 @@ KINDS = {
 
 
 class Reference(NamedTuple):
-    """What a flight is to follow at each decision, in the world frame; SI units."""
+    """The reference at each decision, in the world frame; SI units."""
 
     position: Float[Array, "*t 3"]
     velocity: Float[Array, "*t 3"]
@@ -80,25 +80,25 @@ class World(Protocol):
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """The label in reports."""
         ...
 
     @property
     def vehicle(self) -> Vehicle:
-        """Its constants before a change, as a user knows them."""
+        """The user's known constants before a change."""
         ...
 
     def changed(self, change: str) -> Vehicle:
-        """Its constants after one of `CHANGES`."""
+        """The constants after one of `CHANGES`."""
         ...
 
     def fly(self, change: str, kind: str, flights: int, seconds: float, key: PRNGKeyArray) -> Flown:
-        """Flights of one of `KINDS` after one of `CHANGES`; the pilot knows the vehicle before it."""
+        """Fly one of `KINDS` after one of `CHANGES`; the pilot uses the vehicle before it."""
         ...
 
 
 def draw_reference(key: PRNGKeyArray, kind: Kind, steps: int) -> Reference:
-    """A reference of so many decisions."""
+    """Draw a reference of so many decisions."""
     shares = jax.random.uniform(key, (2, TONES, 4))
     omega = 2 * jnp.pi * (kind.slowest + (kind.fastest - kind.slowest) * shares[0])
     size = np.sqrt(2 / TONES) * kind.acceleration * np.array([1.0, 1.0, 0.5, 0.0]) / omega**2
@@ -112,13 +112,13 @@ def draw_reference(key: PRNGKeyArray, kind: Kind, steps: int) -> Reference:
 
 
 def starting_state(reference: Reference) -> Float[Array, "13"]:
-    """On the reference, level."""
+    """Start on the reference, level."""
     level = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), reference.heading[0])
     return jnp.concatenate([reference.position[0], level, reference.velocity[0], jnp.zeros(3)])
 
 
 def flown(fly: Callable[[Kind, int, PRNGKeyArray], Any], kind: str, flights: int, seconds: float, key) -> Flown:
-    """What `fly(kind, steps, keys)` gives for a key of each flight, in float64, after the flights have settled."""
+    """Run `fly(kind, steps, keys)` with a key for each flight, in float64, after the flights have settled."""
     settling = round(SETTLING / DT)
     with jax.enable_x64(True):
         parts = fly(
@@ -130,7 +130,7 @@ def flown(fly: Callable[[Kind, int, PRNGKeyArray], Any], kind: str, flights: int
 def logged(
     flights: Flown, key: PRNGKeyArray, steps: int, *, noise: float = 1.0, averaged: bool = True, burst: bool = False
 ) -> Trajectories:
-    """Windows of `steps` intervals of the logs of all flights, one after the other.
+    """Return consecutive windows of `steps` intervals of the logs of all flights.
 
     Args:
         flights: the truth.
@@ -138,7 +138,7 @@ def logged(
         steps: intervals of a window.
         noise: of the sensors, 1 is typical; 0 gives the truth.
         averaged: whether rotor speeds are means over an interval, or sampled at its start.
-        burst: whether some samples of each flight are wild.
+        burst: whether some samples of each flight are outliers.
     """
 
     def with_noise(states: np.ndarray, level: float, key: PRNGKeyArray) -> np.ndarray:
