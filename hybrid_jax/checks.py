@@ -99,7 +99,6 @@ def number(name: str, value: Any, what: str = "a finite number", least: float = 
 
 
 def positive(name: str, value: Any, what: str = "a positive finite number") -> None:
-    """Require a positive number that is finite in single precision."""
     number(name, value, what, SMALLEST)
 
 
@@ -119,7 +118,6 @@ def count(name: str, value: Any, least: int = 1) -> None:
 
 
 def instance(name: str, value: Any, kind: type) -> None:
-    """Require an object of a class."""
     if not isinstance(value, kind):
         raise ValueError(f"{name} must be a {kind.__name__}, got {short_repr(value)}")
 
@@ -161,7 +159,6 @@ def writable_folder(name: str, folder: Path) -> None:
 
 
 def short_repr(value: Any) -> str:
-    """The beginning of `repr(value)`, in one line."""
     return " ".join(repr(value)[:80].split())
 
 

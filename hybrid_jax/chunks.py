@@ -8,10 +8,7 @@ import jax.numpy as jnp
 
 
 def in_chunks(function: Callable[[Any], Any], values: Any, size: int) -> Any:
-    """`function` on stacked values, at most `size` at a time.
-
-    All chunks have equal length, padded with the last value: a shorter one would be compiled as its own program.
-    """
+    """`function` on stacked values, `size` at a time, the last chunk padded to the same length to compile once."""
     n = len(jax.tree.leaves(values)[0])
     chunks = -(-n // size)
     length = -(-n // chunks)

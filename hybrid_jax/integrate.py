@@ -96,10 +96,9 @@ def integrate(
     substeps=1,
     project: Callable[[Array], Array] = lambda x: x,
 ) -> Float[Array, "t d *b"]:
-    """The states at the end of each of t intervals of length dt [s], each in solver steps of dt / substeps.
+    """The states at the end of each of t intervals of length dt [s], after each of which `project` is applied.
 
-    Each interval is a separate solver step with its input as `args`: in a single solve that looks up the input by
-    time, a stage at the end of a step would read the next input. `project` maps the state after each interval.
+    Each interval is a separate solve with its input as `args`: a single one would read the next input at its end.
     """
     solver = _prepared(solver, jnp.result_type(x0))
     term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))

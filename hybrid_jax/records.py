@@ -141,19 +141,9 @@ def on_grid(
     between: Between = "held",
     begin: float | None = None,
 ) -> Gridded:
-    """A record on intervals of length dt, over the samples of its outputs for which the inputs are known.
+    """A record on intervals of length dt [s] from `begin` [s], over the outputs' samples with known inputs.
 
-    Args:
-        record: the measured signals.
-        inputs: names of the signals that make up u, in this order.
-        outputs: names of the signals that are compared.
-        dt: length of an interval [s].
-        between: the inputs between samples: "held" until the next, "linear" interpolation, or "averaged" over the time
-            since the previous one.
-        begin: the first time [s], by default the time of the first sample.
-
-    Raises:
-        ValueError: a signal is missing, or the signals do not overlap in time.
+    Inputs, which make up u, are "held" until the next sample, interpolated ("linear"), or "averaged" since the last.
     """
     for name in (*inputs, *outputs):
         if name not in record.signals or len(record.signals[name]) == 0:
@@ -195,13 +185,7 @@ def _span(record: Record, inputs, outputs, between: Between) -> tuple[float, flo
 
 
 def integral(signal: Signal, t: Float[np.ndarray, " n"], between: Between) -> Float[np.ndarray, "n k"]:
-    """The integral of a signal up to each time; its first and last values continue beyond its ends.
-
-    Args:
-        signal: what is integrated.
-        t: the times [s].
-        between: interpolation between samples, see `on_grid`.
-    """
+    """The integral of a signal up to each time [s]; its first and last values continue beyond its ends."""
     edges, values = signal.t, signal.values
     step = np.diff(edges)[:, None]
     parts = {"held": values[:-1], "averaged": values[1:], "linear": (values[1:] + values[:-1]) / 2}[between] * step

@@ -14,7 +14,6 @@ Rows = tuple[Float[Array, " *b"], ...]  # the entries of a vector, of one sample
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """The Hamilton product a ⊗ b."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return jnp.stack(
@@ -82,10 +81,7 @@ def from_rotation_vector(v: Vector) -> Quaternion:
 
 
 def rotation_vector(q: Quaternion) -> Vector:
-    """Rotation vector [rad] of q, at most π long and equal for q and −q; q need not have length 1.
-
-    The sine of the angle would be simpler but vanishes at half a turn, where a controller that minimises it gets stuck.
-    """
+    """Rotation vector [rad], at most π long, equal for q and −q, of a q of any length; unlike its sine nonzero at π."""
     w, v = jnp.where(q[0] < 0, -q[0], q[0]), jnp.where(q[0] < 0, -q[1:], q[1:])
     square = v @ v
     small = square < 1e-8 * w * w  # there the next term of the series is below single precision

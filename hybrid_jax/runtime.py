@@ -88,11 +88,7 @@ def configure(folder: Path | None = None) -> None:
 
 @cache
 def load_lapack() -> None:
-    """Load SciPy's LAPACK, which JAX uses, with one thread, unless it is loaded already or the user set a number.
-
-    With small matrices its threads mostly wait for each other: a QR decomposition of 13 000 × 16 took 0.6 ms with one
-    thread, and up to 80 ms with two on a busy machine.
-    """
+    """Load SciPy's LAPACK, which JAX uses, with one thread by default: two can slow a small QR down 100 times."""
     alone = THREADS not in os.environ
     os.environ.setdefault(THREADS, "1")
     lapack.prepare_lapack_call("potrf_ffi", np.dtype("f4"))
@@ -101,10 +97,7 @@ def load_lapack() -> None:
 
 
 def entry(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator of public functions that compute: NumPy promotion, and an error in a process forked after JAX started.
-
-    In such a process XLA's threads are missing, and a call would never return.
-    """
+    """Decorator of public functions: NumPy promotion, and an error in a process forked after JAX started."""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:

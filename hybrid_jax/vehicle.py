@@ -163,7 +163,6 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
 
 
 def require_known(where: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
-    """Raise ValueError if the table has other keys."""
     if unknown := sorted(repr(key) for key in table.keys() - set(known)):
         raise ValueError(f"{where}: {', '.join(unknown)}: must be one of {', '.join(known)}")
 

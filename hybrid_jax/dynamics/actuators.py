@@ -255,10 +255,7 @@ def rotor_speeds(
 
 
 def held_means(t: Numbers, values: Numbers, edges: Numbers, delay: Array | float = 0.0) -> Float[Array, "k-1 m"]:
-    """The mean over each interval between `edges` (k) [s] of values (n, m) held from times t (n), `delay` [s] later.
-
-    The first value also applies before the first time. The derivative by the delay is exact between jumps.
-    """
+    """The mean between `edges` (k) [s] of values (n, m) held from times t (n) + `delay` [s], the first also before."""
     area = jnp.concatenate([jnp.zeros((1, values.shape[1])), jnp.cumsum(values[:-1] * jnp.diff(t)[:, None], axis=0)])
     at = edges - delay
     i = jnp.clip(jnp.searchsorted(t, at, side="right") - 1, 0, len(t) - 1)

@@ -108,29 +108,13 @@ def _fields_inside(tree) -> list[AbstractVectorField]:
 
 
 def state_space(field: AbstractVectorField, d: int | None = None) -> StateSpace:
-    """The state space of a field, or of the first field inside another callable.
-
-    Args:
-        field: any field.
-        d: size of a state; the numbers that the field does not describe become quantities of their own.
-    """
+    """The state space of a field, or of the first field inside another callable, padded to d numbers."""
     own = as_field(field).state_space
     return own if d is None else own.padded(d)
 
 
 def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> Trajectories:
-    """The windows without jumps between representations of a state, in double precision if the parameters are.
-
-    An angle within one turn, or the sign of a quaternion, may jump where the state does not. Traced ones are unchanged.
-
-    Args:
-        field: determines the state space and the precision.
-        windows: of any system.
-        name: what messages call them.
-
-    Raises:
-        ValueError: malformed windows, or states that are invalid in the state space.
-    """
+    """The checked windows, without jumps between representations of a state, in the parameters' precision if double."""
     check(windows, name)
     space = state_space(field, windows.x0.shape[-1])
     for part, states in (("x0", windows.x0), ("x", windows.x)):

@@ -58,10 +58,7 @@ def batch_norms(tree: PyTree) -> list[AbstractBatchNorm]:
 
 
 def like(tree: PyTree, leader: Float[Array, "..."]) -> PyTree:
-    """The tree unchanged, but batched under `vmap` where the leader is: for the initial carry of a scan.
-
-    JAX traces the body of a scan again when part of its carry becomes batched, which doubles at every level of nesting.
-    """
+    """The tree, batched under `vmap` if the leader is: with such an initial carry, JAX traces a scan's body once."""
     number = jnp.ravel(leader)[0]
     return jax.tree.map(lambda leaf: jnp.where(number > 0, leaf, leaf), tree)
 
@@ -72,7 +69,6 @@ def _unseen(tree: PyTree) -> list[Moments]:
 
 
 def training_mode(tree: PyTree, seen: list[Moments] | None = None) -> PyTree:
-    """The tree with each `AbstractBatchNorm` in training mode, for use inside `over_samples`."""
     seen = _unseen(tree) if seen is None else seen
     return _replaced(tree, [norm.training_mode(one) for norm, one in zip(batch_norms(tree), seen, strict=True)])
 
@@ -88,10 +84,7 @@ def moments_of(field, x, u) -> list[Moments]:
 
 
 def with_moved_stats(field, x: Batch, u: Float[Array, "m b"]):
-    """The field with running statistics moved by a minibatch; unchanged without batch normalisation.
-
-    A layer that is evaluated several times per sample uses the mean of the moments; one that is not evaluated stays.
-    """
+    """The field with running statistics moved by a minibatch, or by the mean of several evaluations of a layer."""
     if not (norms := batch_norms(field)):
         return field
 

@@ -169,11 +169,7 @@ def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
 def check_batch_norm(
     field: AbstractVectorField, x: Float[Array | np.ndarray, "d b"], u: Float[Array | np.ndarray, "m b"]
 ) -> None:
-    """Reject a field with batch normalisation that would be trained but whose running statistics could not be updated.
-
-    Raises:
-        ValueError: a `BatchNorm` in the field is not evaluated at x and u, or is hidden from differentiation.
-    """
+    """Raise ValueError for a BatchNorm that is not evaluated at x and u, or is hidden from differentiation."""
     if _is_wrapped(field) and not all(all(count.tolist()) for count, *_ in moments_of(field, x, u)):
         raise ValueError(
             f"field: {type(field).__name__} holds a BatchNorm whose minibatch statistics cannot be recorded, as under "

@@ -100,7 +100,6 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
 
 
 def without_disturbance(field: AbstractVectorField) -> AbstractVectorField:
-    """The field without the constant disturbance of its physics."""
     physics = physics_of(field)
     return with_physics(field, physics.physics) if isinstance(physics, Hybrid) else field
 
@@ -121,7 +120,6 @@ def physics_of(field: AbstractVectorField) -> AbstractVectorField:
 
 
 def with_physics(field: AbstractVectorField, physics: AbstractVectorField) -> AbstractVectorField:
-    """The field with `physics_of(field)` replaced."""
     return eqx.tree_at(physics_of, field, physics)
 
 

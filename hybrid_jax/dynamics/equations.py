@@ -109,11 +109,7 @@ def is_present(term, absent: float = 0.0) -> bool:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def evaluate_columns(of_rows: Callable, theta: PyTree, x: Float[Array, "13 b"], u: Float[Array, "rotors b"]):
-    """`of_rows(theta, x, u)` on a minibatch, for scalar parameters.
-
-    Autodiff would store some thirty rows of each evaluation and sum each parameter's derivative over the minibatch once
-    per occurrence. Here x and u are stored, and each parameter is summed once.
-    """
+    """`of_rows(theta, x, u)` on a minibatch for scalar parameters; its derivative sums over it once per parameter."""
     return of_rows(theta, tuple(x), tuple(u))
 
 

@@ -15,11 +15,7 @@ MEASURED = (*STATES, "body_velocity", "specific_force", "rotor_speed")
 def measure(
     quantity: str, field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], gravity: float = 9.81
 ) -> Float[Array, " k"]:
-    """h(x, u) of one of `MEASURED`, with axes as in `flights.recording.AXES`.
-
-    The specific force [m/s², body frame] is the reading of an accelerometer at the centre of mass: Rᵀ (v̇ + g e_z),
-    with v̇ of the field.
-    """
+    """h(x, u) of one of `MEASURED`, with `flights.recording.AXES`; the specific force is Rᵀ (v̇ + g e_z) [m/s²]."""
     if quantity in STATES:
         return x[STATES[quantity]]
     if quantity == "rotor_speed":

@@ -111,14 +111,12 @@ def array_type(array: Any) -> dict[str, str]:
 
 
 def to_numpy(array: Any) -> np.ndarray:
-    """An array in a type that the .npy format supports."""
     kind = array_type(array)
     stored = np.asarray(jax.random.key_data(array) if "key" in kind else array)
     return stored.view(f"u{stored.itemsize}") if "dtype" in kind else stored
 
 
 def from_numpy(array: np.ndarray, kind: Mapping[str, str]) -> Any:
-    """The inverse of `to_numpy`, with `kind` from `array_type`."""
     if "key" in kind:
         return jax.random.wrap_key_data(jnp.asarray(array), impl=kind["key"])
     return array.view(EXTENDED[kind["dtype"]]) if "dtype" in kind else array
@@ -141,7 +139,6 @@ def _read_entries(path: Path) -> dict[str, bytes]:
 
 
 def _read_array(name: str, entry: bytes) -> np.ndarray:
-    """The numeric array in a .npy."""
     try:
         array = np.lib.format.read_array(io.BytesIO(entry), allow_pickle=False)
     except Exception as error:  # NumPy parses the header as Python, which fails in many ways

@@ -18,11 +18,7 @@ from hybrid_jax.checks import content_of, first_line
 
 
 def write_atomic(path: str | Path, content: str | bytes) -> None:
-    """Write a new file beside `path`, text as UTF-8, then rename it; OSError leaves an earlier file unchanged.
-
-    The new file has a random name and is never an existing one, for example a link. Those that a killed process left an
-    hour ago are deleted.
-    """
+    """Write a new file beside `path`, text as UTF-8, then rename it; OSError leaves an earlier file unchanged."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{secrets.token_hex(8)}.part")
@@ -50,7 +46,6 @@ def backup_path(path: Path, reason: str) -> Path:
 
 
 def json_text(value: Any) -> str:
-    """`json_value(value)` as indented JSON that ends in a newline."""
     return json.dumps(json_value(value), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 

@@ -128,7 +128,6 @@ def _not_finite(field: eqx.Module) -> str:
 
 
 def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
-    """`like` with the arrays of a file."""
     dynamic = {key: array for key, array in arrays.items() if not key.startswith("static/")}
     filled, saved = with_leaves({"field": like}, dynamic)["field"], static_values(tree)
     for key, value in static_values(Structure(like).tree).items():

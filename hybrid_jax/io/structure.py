@@ -149,12 +149,7 @@ class Structure:
 
 
 def decode(value: Any, arrays: Arrays) -> Any:
-    """The object that a structure describes.
-
-    Raises:
-        ValueError: an unknown class or function, or fields that do not fit the class.
-        KeyError, TypeError, AttributeError, RecursionError, OverflowError: the structure is malformed.
-    """
+    """The object that a structure describes; ValueError for unknown or unfit classes, or Python's own if malformed."""
     match value:
         case None | bool() | int() | float() | str():
             return value

@@ -74,7 +74,6 @@ class FusedNetwork(AbstractVectorField):
         return (function_of(self.activation)(hidden).T @ self.weight_out).T + linear
 
     def layer(self, z: Float[Array, " m *b"]) -> tuple[Float[Array, " h *b"], Float[Array, " d *b"]]:
-        """W₁ z + c and A z + b."""
         both = product(self.weight_in.T, z) if len(z) <= UNROLLED_INPUTS else (z.T @ self.weight_in).T
         return jnp.split(both + expand_trailing(self.bias, both), [len(self.weight_out)])  # pyright: ignore[reportReturnType]
 

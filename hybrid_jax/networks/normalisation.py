@@ -215,13 +215,11 @@ class Bias(AbstractAffineNorm):
 
 
 def affine(weight: Float[Array, "d h"], bias: Float[Array, " d"], z: Float[Array, " h *b"]) -> Float[Array, " d *b"]:
-    """W z + b of each sample."""
     out = weight @ z
     return out + expand_trailing(bias, out)
 
 
 def product(weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
-    """W z of each sample."""
     if len(z) > UNROLLED_INPUTS:
         return weight @ z
     return reduce(jnp.add, (expand_trailing(column, z) * row for column, row in zip(weight.T, z, strict=True)))

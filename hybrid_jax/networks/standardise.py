@@ -46,12 +46,7 @@ class _Probe(AbstractBatchNorm, AbstractScaling):
 
 
 def with_motion(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
-    """The field with some of its training windows stored in the scaling of each network, for `hj.adapt`.
-
-    Args:
-        field: a field that contains networks; one without is returned unchanged.
-        windows: the training windows.
-    """
+    """The field with some of its training windows stored in the scaling of each network, for `hj.adapt`."""
     places = np.linspace(0, len(windows) - 1, min(len(windows), max(1, KEPT // windows[0].x.size), MOST)).astype(int)
     if not (networks := _networks(field)):
         return field

@@ -10,10 +10,7 @@ from hybrid_jax.vehicle import IRIS, Vehicle
 
 
 def loaded(vehicle: Vehicle, mass: float, place: tuple[float, float, float]) -> Vehicle:
-    """The vehicle with a point mass [kg] at a place in the body frame [m]; the new centre of mass becomes the origin.
-
-    Moments of inertia follow from the parallel axis theorem; products of inertia, small for a small load, are left out.
-    """
+    """The vehicle with a point mass [kg] at a place [m, body frame]; products of inertia are neglected."""
     total, at = vehicle.mass + mass, np.asarray(place)
     centre = mass / total * at
 

@@ -258,7 +258,6 @@ def survey(windows: Trajectories) -> dict[str, float]:
 
 
 def configuration(domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> dict[str, Any]:
-    """Everything that determines the windows, as JSON values."""
     return domain.describe() | {
         "recipe": RECIPE,
         "splits": {name: asdict(spec) for name, spec in splits.items()},

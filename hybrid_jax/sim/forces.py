@@ -50,7 +50,6 @@ class Parameters(eqx.Module):
 
 
 def parameters_of(vehicle: Vehicle, drag_coefficient: float = DRAG_COEFFICIENT) -> Parameters:
-    """The parameters of a vehicle, in the current precision."""
     numbers = asdict(vehicle) | {
         "rotor_positions": [(x, y, 0.0) for x, y in vehicle.rotor_positions],
         "drag_coefficient": drag_coefficient,
@@ -103,10 +102,7 @@ def ground_effect(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wren
 
 
 def thrust_gain(altitude: Float[Array, "*rotors"], rotor_radius: Scalar) -> Float[Array, "*rotors"]:
-    """T/T∞ = 1 / (1 − (R / 4h)²) (Cheeseman and Bennett 1955) of rotors at altitude h [m] over level ground.
-
-    h is floored at R/2, where the gain is 4/3: the formula is valid for h > R/2 and diverges at R/4.
-    """
+    """T/T∞ = 1 / (1 − (R / 4h)²) of rotors at altitude h [m] (Cheeseman and Bennett 1955), with h at least R/2."""
     height = jnp.maximum(altitude, rotor_radius / 2)
     return 1 / (1 - (rotor_radius / (4 * height)) ** 2)
 

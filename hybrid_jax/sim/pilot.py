@@ -79,7 +79,6 @@ class Plan(NamedTuple):
 
 
 def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
-    """A random plan of `steps` decisions."""
     key_targets, key_dither = jax.random.split(key)
     target, limit = _draw_waypoints(key_targets, steps, scale)
     hardest = jnp.array(ACCELERATION) * np.array([*[scale.acceleration] * 3, 1 / scale.time**2])
@@ -134,11 +133,7 @@ def _draw_dither(key: PRNGKeyArray, steps: int, scale: Scale) -> Float[Array, "t
 def act(
     integral: Vector, x: State, plan: Plan, nominal: Parameters, vehicle: Vehicle, scale: Scale
 ) -> tuple[Vector, Input]:
-    """One decision: feasible rotor speeds [rad/s] for the current entry of the plan.
-
-    `nominal` are the parameters of `vehicle`, which the pilot is tuned for. `integral` is the integrated position error
-    [m/s², world frame], passed in and returned.
-    """
+    """Feasible rotor speeds [rad/s] for the current entry of the plan, and the new integral [m/s², world frame]."""
     # Raise the reference to a safe altitude if wind has blown the vehicle far away.
     far, place = jnp.linalg.norm(x[POSITION][:2]) > ASTRAY * scale.length, plan.position
     place = place.at[2].set(jnp.where(far, jnp.maximum(place[2], SAFE_ALTITUDE * scale.length), place[2]))

@@ -142,7 +142,6 @@ def _padded(plans: RunConfig, shared: tuple[PyTree, PyTree], windows: int) -> tu
 
 
 def _shapes(*trees: PyTree) -> tuple:
-    """Shapes, types and structure, for which a program is compiled."""
     leaves = [leaf for leaf in jax.tree.leaves(trees) if eqx.is_array(leaf)]
     return (*((leaf.shape, leaf.dtype) for leaf in leaves), jax.tree.structure(trees))
 
@@ -171,7 +170,6 @@ def _errors(
 
 
 def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:
-    """All states, with those of the active lanes replaced."""
 
     def put(old, new):
         old = np.array(old)

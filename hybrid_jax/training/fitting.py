@@ -153,7 +153,6 @@ def _shuffled(plan: RunConfig, key: PRNGKeyArray) -> Int[Array, " n"]:
 
 
 def _updated(state, plan, field, adam, key, train_loss, error) -> FitState:
-    """The state after an epoch, with the best epoch and early stopping."""
     finished = state.epoch + 1
     finite = jnp.isfinite(train_loss) & jnp.isfinite(error)
     better = finite & (error < state.best_mse)

@@ -64,10 +64,7 @@ def trajectory_correlation(field: Hybrid, predicted, window: Trajectories, solve
 
 
 def neighbour_weights(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """The weights of a `GridNetwork` for all points except the centre, which vanish if f_d is a reaction.
-
-    Unlike the norm of f_d, this distinguishes a reaction from diffusion, which may cancel each other.
-    """
+    """The weights of a `GridNetwork` for all points except the centre: zero for a reaction, and not for diffusion."""
     networks = [n for n in jax.tree.leaves(field, is_leaf=_is_grid) if _is_grid(n)]
     return jnp.concatenate([jnp.zeros(0), *(network.neighbour_weights().ravel() for network in networks)])
 
@@ -170,7 +167,6 @@ class _Problem(eqx.Module):
     def linearised(
         self, theta: Float[Array, " p"], window: Trajectories
     ) -> tuple[Float[Array, "p r"], Float[Array, " r"]]:
-        """Jᵀ and r of a window."""
         x0, u = jnp.asarray(window.x0), jnp.asarray(window.u)
         predicted, columns = with_sensitivities(self.field(theta), x0, u, window.dt, self.solver)
 
