@@ -75,6 +75,17 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
     return trajectories
 
 
+def overflows(trajectories: Trajectories) -> bool:
+    """Whether squares of its states are too large for their type, as of 1e30 in float32: then no loss is finite.
+
+    Args:
+        trajectories: windows of any system.
+    """
+    states = np.asarray(trajectories.x0), np.asarray(trajectories.x)
+    most = np.finfo(jax.dtypes.canonicalize_dtype(states[0].dtype)).max / states[0].shape[-1]
+    return max(max(part.max(), -part.min()) for part in states) > most**0.5
+
+
 def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> None:
     """Raise ValueError for states of 13 numbers (state.py) whose quaternions are not of norm 1."""
     if trajectories.x0.shape[-1] == STATE_SIZE:

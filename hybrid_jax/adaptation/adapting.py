@@ -41,13 +41,13 @@ from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.objective import Settings
-from hybrid_jax.trajectories import Trajectories, check_like
+from hybrid_jax.trajectories import Trajectories, check_like, overflows
 
 HELD_OUT = 5  # one in so many windows validates
 SHOWN = 0.01  # less probable candidates are not reported
 NAMED = 50  # physics with more parameters is a network, and its weights are not listed
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
-NOT_FINITE = "the fit diverged; are dt and all units right?"
+NOT_FINITE = "the fit diverged; check dt and all units"
 NOT_FITTED = "no parameter was fitted"
 NO_MOTION = "field: its training windows are unknown, so all its errors count as changes; pass learned_from="
 FEW = "windows: {} do not determine {} parameters; the others stay at the source's values"
@@ -251,7 +251,8 @@ def adapt(
     if motion and len(windows) <= size:
         warnings.warn(FEW.format(len(windows), size), stacklevel=3)
     load_lapack()
-    solution = method.solve(field, train, held_out, settings, **motion)
+    diverged = Solution(field, status=Status.DIVERGED) if overflows(windows) or overflows(held_out) else None
+    solution = diverged or method.solve(field, train, held_out, settings, **motion)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
     mse = partial(_mse, solver=compact(settings.solver))

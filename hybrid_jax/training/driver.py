@@ -25,7 +25,7 @@ from hybrid_jax.status import Status
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, FitState, Optimiser, RunConfig, make_run_config
 from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
-from hybrid_jax.trajectories import Trajectories, check, check_like
+from hybrid_jax.trajectories import Trajectories, check, check_like, overflows
 
 WEIGHT = 1e-3  # λ, where none is given
 RATE = 1e-2
@@ -197,6 +197,8 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     # Weakly typed numbers would come back typed, and the second block be compiled anew.
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype) if eqx.is_array(leaf) else leaf, state)
     losses, most, empty, interrupt = [np.zeros((0, 2))], 1, jnp.zeros((BLOCK, 2)), None
+    if settings.objective == TrajectoryLoss() and any(map(overflows, (data, validated_on))):
+        state = replace(state, status=jnp.full_like(state.status, Status.DIVERGED))  # nothing need be compiled
     # The default is not an argument: an optimiser holds closures, with which a program is not kept.
     chosen = {} if optimiser is fitting.ADAM else {"optimiser": optimiser}
     train = _train_by_kernels if compiler_options(state.field, data, settings) else _train

@@ -25,7 +25,7 @@ from hybrid_jax.status import Status
 from hybrid_jax.training.driver import ready
 from hybrid_jax.training.loss import correlation_rows
 from hybrid_jax.training.sensitivities import with_sensitivities
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, overflows
 
 MOST = 1000  # parameters: the cost of a step grows with their square
 FIRST = 1e-2  # μ at the start
@@ -127,6 +127,8 @@ def fit_gauss_newton(
         scale = checks.floating("scale", scale)
         if scale.shape != windows.x0.shape[1:] or not (scale > 0).all():
             raise ValueError(f"scale must be {windows.x0.shape[1:]} positive numbers, got shape {scale.shape}")
+    if scale is None and overflows(windows):
+        return GaussNewtonFit(field, np.inf, 0, Status.DIVERGED)
     problem = _Problem(learned, rest, jnp.asarray(weight, float), scale, rows, RK4() if solver is None else solver)
     return _descend(problem, jax.tree.map(jnp.asarray, windows), max_steps)
 

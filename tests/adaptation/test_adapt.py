@@ -6,7 +6,7 @@ import re
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from hybrid_jax.adaptation import METHODS, Adaptation, FineTune, LeastSquares, M
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, disturbed, physics_of
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.status import Status
 
 PUSH = jnp.array([0.0, 1.5])
 
@@ -121,6 +122,25 @@ def test_every_entry_of_a_result_is_json_and_none_where_it_is_not_finite():
     found = json.loads(json.dumps(spoiled.to_dict(), allow_nan=False))
     assert found["parameters"]["log_length"]["high"] is found["mse_after"] is None
     assert found["covariance"] == [[None]]
+
+
+HOPELESS = {
+    "fit": lambda field, windows: hj.fit(field, windows, windows, jax.random.key(0)),
+    "fit_gauss_newton": hj.fit_gauss_newton,
+    **{method: partial(adapt, method=method) for method in ("auto", "least_squares", "fine_tune")},
+}
+
+
+@pytest.mark.parametrize("fit", HOPELESS.values(), ids=HOPELESS)
+def test_windows_whose_squares_overflow_diverge_before_a_step(fit):
+    windows = swings(20)
+    windows = replace(windows, x=np.full_like(windows.x, 1e30))  # finite itself
+    result = fit(pendulum(), windows)
+    assert result.status == Status.DIVERGED
+    assert (result.epochs if hasattr(result, "epochs") else result.steps) == 0
+    if isinstance(result, Adaptation):
+        assert "diverged" in result.report()
+        json.dumps(result.to_dict(), allow_nan=False)
 
 
 class Leak(AbstractVectorField):
