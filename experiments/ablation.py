@@ -119,7 +119,6 @@ def experiment(config: AblationConfig, console: Console) -> None:
 
 
 def run(config: AblationConfig, stages: Stages) -> Results:
-    """Return the rows of the hybrid, pre-trained and fine-tuned, in a configuration."""
     learned = pretrained(HYBRID, IRIS, config, stages, flown(SOURCE, source_splits(config), config, stages))
     rows = Results()
     for domain in DOMAINS:
@@ -130,7 +129,6 @@ def run(config: AblationConfig, stages: Stages) -> Results:
 
 
 def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> None:
-    """Write each choice's figure and the report of all rows so far."""
     out, drawn = config.out / NAME, {}
     for choice, group in rows.group("choice").items():
         title = f"{choice.capitalize()}: test error over 1 s after fine-tuning"
@@ -169,7 +167,6 @@ def effects(rows: Results) -> dict[tuple[str, str], dict[str, Interval]]:
 
 
 def conclusion(rows: Results) -> list[str]:
-    """Summarise which choices help in every domain, which have no effect, which harm, and by how much."""
     found = effects(rows)
     largest = {key: max(ratio.value for ratio in ratios.values()) for key, ratios in found.items()}
     better = [key for key, ratios in found.items() if all(ratio.below(1) for ratio in ratios.values())]

@@ -128,7 +128,6 @@ def experiment(config: ChangesConfig, console: Console) -> None:
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
-    """Return the figures and their captions, by name."""
     errors = (
         "Prediction error by change, % of that without adaptation; bands reach from the least to the most of all cases"
     )
@@ -163,7 +162,6 @@ def adapted(
 
 
 def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages, target: Dataset) -> list[Row]:
-    """Return the rows of the methods that are not candidates."""
     tuned = partial(study.adapted, HYBRID, FINE_TUNED, fields)
     offset = replace(config, rates=replace(config.rates, offset=OFFSET))
     fits = {
@@ -183,16 +181,7 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
 
 
 class Tested(eqx.Module):
-    """The candidates of each seed, and the chosen one.
-
-    Attributes:
-        names: of the candidates.
-        probability: probability of each change; the network's is relative to the one chosen before it (s, c).
-        test_mse: their test errors (s, c).
-        taken: index of the chosen candidate (s,).
-        ends: its errors of left-out blocks, as in `BlockErrors` (s, b, 2, d).
-        flown: the same errors of each flight (s, f, 2, d).
-    """
+    """The candidates of each seed: `ends` has errors of left-out blocks, `flown` of each flight, see `BlockErrors`."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     probability: Array
@@ -206,7 +195,6 @@ class Tested(eqx.Module):
 def _candidates(
     fields: Any, windows: Trajectories, flights: Trajectories, test: Trajectories, shared: Settings, known: Trajectories
 ):
-    """Return each seed's candidates on its windows."""
     places = blocks_of(windows.x0.shape[1], BLOCKS)
 
     def one(run) -> Tested:

@@ -95,7 +95,6 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
 
 
 def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, Fit], Fit | None]:
-    """Pre-train a model for each method that starts from one, and the experts."""
     source = flown(SOURCE, source_splits(config), config, stages)
     models = dict.fromkeys([HYBRID, *map(source_of, config.methods)])
     learned = {model: pretrained(model, IRIS, config, stages, source) for model in models}

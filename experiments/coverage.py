@@ -183,8 +183,6 @@ def _compared(logs: np.ndarray, stds: np.ndarray, true: float) -> Row:
 
 
 def pooled_table(rows: Results) -> Table:
-    """Return a line for each change, noise and parameter."""
-
     def text(column: str, scale: float, form: str, statistic=np.mean):
         def of(own: Results) -> str:
             known = [row[column] for row in own if row["inside"] is not None]
@@ -204,7 +202,6 @@ def pooled_table(rows: Results) -> Table:
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
-    """Return the figure and its caption, by name."""
     return {"coverage": (coverage_figure(rows), "Share of flights whose 95 % interval contains the true value")}
 
 
@@ -234,7 +231,6 @@ def coverage_figure(rows: Results) -> Figure:
 
 
 def conclusion(rows: Results) -> list[str]:
-    """Summarise the share of intervals that contain the true value, its minimum, and the effect of pooling."""
     fitted = rows.where(lambda row: row["inside"] is not None)
     if not len(fitted):
         return ["No parameter was fitted, so there are no intervals."]

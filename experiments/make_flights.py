@@ -75,7 +75,6 @@ def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], see
 
 
 def chosen_flights(path: Path, domain: Domain, splits: Mapping[str, SplitSpec]) -> Dataset:
-    """Return the first windows of each split of an existing file."""
     whole = load_dataset(path, domain.describe())
     parts = {name: whole.first(name, spec.windows) for name, spec in splits.items()}
     for name, spec in splits.items():

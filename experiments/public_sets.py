@@ -42,7 +42,6 @@ def main() -> None:
 
 
 def ran(folder: Path, given: list[str]) -> dict[str, Any]:
-    """Return the report of a command, or why there is none."""
     run = [sys.executable, "-m", "hybrid_jax", *given]
     done = subprocess.run(run, cwd=folder, capture_output=True, text=True)
     if done.returncode not in (0, 4):
@@ -56,7 +55,6 @@ def shown(errors: list[list[float]]) -> str:
 
 
 def processor() -> float:
-    """Return the processor seconds of the commands."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

@@ -73,7 +73,6 @@ EXACT = "It knows the true state without noise."
 
 
 def head(config: ClosedLoopConfig) -> str:
-    """Return the introduction of the report, with the hardware of the flights."""
     hardware = config.hardware()
     if hardware == Hardware():
         return HEAD.format(knows=EXACT).strip()
@@ -98,7 +97,6 @@ def train_one(console: Console, training: Training, name: str, model: str, confi
 
 
 def train_all(config: ClosedLoopConfig, console: Console, training: Training) -> dict[str, Trained]:
-    """Return all trained models by their id in `results.LEARNED`."""
     trained = {name: train_one(console, training, name, model, config) for name, model in MODELS.items()}
     own = config.invariant()
     trained["invariant"] = train_one(console, training, "invariant", "hybrid", own)
@@ -118,7 +116,6 @@ def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], training: 
 
 
 def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Places) -> list[Scenario]:
-    """Return the models of each domain along each reference at each distance from home [m]."""
     own = [domain for domain in (SOURCE, *DOMAINS) if domain.name in sets]
     return [Scenario(domain, *place, sets[domain.name], config.bandwidth) for domain in own for place in places]
 
@@ -162,7 +159,6 @@ def write(config: ClosedLoopConfig, trained: dict[str, Trained], flown: Sequence
 
 
 def draw(rows: Results, flown: Sequence[Flown], few: int) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
-    """Return figures with their captions by file, and notes on figures that could not be drawn."""
     followed = (Agent("nominal"), Agent("hybrid"), *(Agent(model, few) for model in SOURCES), ORACLE)
     made, missing = {}, []
     for domain in (each.name for each in DOMAINS):

@@ -25,8 +25,6 @@ CALL_MS, FLIGHT_MINUTES, FLIGHTS, FLIGHT_SECONDS = 1.5, 3.0, 360, 10.0
 
 
 class Speed(NamedTuple):
-    """Speed of the controller with the adapted hybrid, and of the simulation."""
-
     call_ms: float  # processor time of one call
     median_ms: float  # wall-clock time of one call
     flown_seconds: float  # simulated, of all flights together
@@ -43,7 +41,6 @@ class Evidence:
     speed: Speed
 
     def group(self, agent: Agent, domain: str, reference: str | None = None, distance: float = 0.0) -> Results:
-        """Select the flights of an agent in a domain, along one reference or all."""
         place = {} if reference is None else {"reference": reference}
         rows = self.rows.where(domain=domain, distance=distance, **place, **asdict(agent))
         if not len(rows):
@@ -60,13 +57,11 @@ class Evidence:
         return self.group(*first).interval(RMSE, self.group(*second), times)
 
     def references(self, agent: Agent) -> list[str]:
-        """Select an agent's flights at home under the parameter shift."""
         own = self.group(agent, PARAMETER_SHIFT)["reference"]
         return [name for name in REFERENCES if name in own]
 
 
 def claims(few: int) -> list[Claim[Evidence]]:
-    """Return all hypotheses, with those about a model for each of SOURCES; `few` is the smallest N."""
     made: list[Claim[Evidence]] = [Claim(id, text, lambda e, f=fast: f(e.speed)) for id, text, fast in SPEED_CLAIMS]
     for (number, text, parts), (letter, model) in product(CLAIMS, zip("abc", SOURCES, strict=True)):
         own = partial(parts, Agent(SOURCES[model]), Agent(model, few))

@@ -148,7 +148,6 @@ def paths(
 
 
 def flown_paths(flown: Sequence[Flown], domain: str, agents: Sequence[Agent]) -> Figure:
-    """Draw `paths` of seed 0 at home."""
     own = {each.scenario.name: each for each in flown}
     at_home = {name: own[f"{domain} {name}"] for name in THREE if f"{domain} {name}" in own}
     flights = {name: {agent: each.states(agent) for agent in agents} for name, each in at_home.items()}
@@ -168,7 +167,6 @@ def floor_note(smallest: float, floor: float, before: str, after: str = "") -> s
 
 
 def _grid(count: int, labels: Sequence[str], width: float = 1.9) -> tuple[Figure, list[Axes]]:
-    """Create panels, with room for the labels of lines in the first column."""
     columns = 2 if count == 4 else min(count, 3)
     rows, room = -(-count // columns), 0.06 * max(map(len, labels))
     size = width * columns + room, rows * (0.8 + 0.17 * len(set(labels))) + 0.6

@@ -36,16 +36,7 @@ ModelSet = Mapping[Agent, AbstractVectorField]  # stacked over seeds
 
 
 class Flight(NamedTuple):
-    """The arrays that define one flight.
-
-    Attributes:
-        model: of the controller.
-        world: the true system.
-        path: number in PATHS.
-        home: offset of the reference [m, world].
-        bandwidth: of the disturbance observer [rad/s]; 0 for none.
-        seed: of the noise, the same for all agents.
-    """
+    """The arrays that define one flight: `home` is the reference's offset [m], `bandwidth` the observer's [rad/s]."""
 
     model: AbstractVectorField
     world: World
@@ -62,15 +53,7 @@ class Flight(NamedTuple):
 
 @dataclass(frozen=True)
 class Scenario:
-    """Flights of a set of models in one domain along one of PATHS.
-
-    Attributes:
-        domain: the true system.
-        reference: a key of PATHS.
-        distance: from home [m], equally far in x and y.
-        models: of the controllers.
-        bandwidth: of the disturbance observers [rad/s].
-    """
+    """Flights of a set of models in one domain along one of PATHS, at a `distance` from home [m] in x and y."""
 
     domain: Domain
     reference: str
@@ -83,7 +66,6 @@ class Scenario:
         return f"{self.domain.name} {self.reference}{away(self.distance).replace(',', '')}"
 
     def keys(self) -> list[tuple[Agent, int]]:
-        """The agent and the seed of each flight."""
         return [(agent, seed) for agent, models in self.models.items() for seed in range(count(models))]
 
     def flights(self) -> Iterator[Flight]:
@@ -100,15 +82,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Flown:
-    """The results of a scenario.
-
-    Attributes:
-        scenario: the scenario.
-        arrays: by name, one value per flight; see `_simulate`.
-        seconds: wall-clock time of the simulation, without compiling.
-        processor_seconds: the same on all cores.
-        devices: number of devices.
-    """
+    """The results of a scenario: arrays of `_simulate` by name, and the time without compiling, also on all cores."""
 
     scenario: Scenario
     arrays: Arrays
@@ -128,7 +102,6 @@ class Flown:
         ]
 
     def states(self, agent: Agent, seed: int = 0) -> np.ndarray:
-        """Return the states of one flight, every `DRAW_EVERY` periods."""
         return self.arrays["states"][self.scenario.keys().index((agent, seed))]
 
 

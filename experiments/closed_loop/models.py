@@ -66,7 +66,6 @@ def _adapt(start: AbstractVectorField, config: Config, stages: Stages, fit: Call
 
 
 def disturbance_counts(fitted: Trained) -> list[str]:
-    """Return for each domain a sentence on how many seeds have a constant disturbance."""
     fields: dict[tuple[str, int], Any] = {**fitted.adapted}
     found = {domain: np.any(field.physics.residual.value != 0, axis=1) for (domain, _), field in fields.items()}
     return [f"{domain}: {own.sum()} of {len(own)} seeds have a disturbance." for domain, own in found.items()]
@@ -91,7 +90,6 @@ def model_set(domain: Domain, trained: dict[str, Trained], sizes: Sequence[int])
 
 
 def fused(fields: AbstractVectorField) -> AbstractVectorField:
-    """Return stacked fields in their inference layout, on the host."""
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(lambda field: as_field(field).fuse_for_inference()))(fields))
 
 

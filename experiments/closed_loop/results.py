@@ -56,17 +56,14 @@ ERROR = uncrashed("position_rmse")
 
 
 def by_agent(rows: Results) -> dict[Agent, Results]:
-    """Group rows by agent, in order of appearance."""
     return {Agent(*key): group for key, group in rows.group(*asdict(ORACLE)).items()}
 
 
 def away(distance: float) -> str:
-    """Return the suffix of a place's name."""
     return f", {distance:g} m away" if distance else ""
 
 
 def conclusion(rows: Results, few: int) -> list[str]:
-    """Summarise errors before and after adaptation, with and without an observer, against the true vehicle's."""
     sentences = []
     for domain in (PARAMETER_SHIFT, EXTERNAL_FORCE):
         flown = {agent: _at_home(own) for agent, own in by_agent(rows.where(domain=domain, distance=0.0)).items()}
@@ -120,7 +117,6 @@ def tables(rows: Results) -> list[Table]:
 
 
 def gap_tables(rows: Results) -> list[Table]:
-    """Return the share of the gap between source model and true vehicle that each adaptation closes, per domain."""
     made = []
     for domain in DOMAINS:
         shares = gaps(rows, domain)
@@ -147,7 +143,6 @@ def gaps(rows: Results, domain: str) -> dict[Agent, dict[str, Interval]]:
 
 
 def speed_table(speeds: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return milliseconds per call of the controller, for each timed model."""
     header = ("model", "median [ms]", "99 of 100 are below [ms]", "processor time, mean [ms]")
     keys = ("median_ms", "p99_ms", "processor_ms")
     lines = [(name, *(f"{speed[key]:.2f}" for key in keys)) for name, speed in speeds.items()]
@@ -155,19 +150,16 @@ def speed_table(speeds: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def number_text(column: str, factor: float, form: str) -> Cell:
-    """Format mean ± std over seeds, and the number of crashes if there are any."""
     return lambda rows: spread_text(rows.spread(uncrashed(column, factor)), form, what="crashed")
 
 
 def crash_text(rows: Results) -> str:
-    """Format the number of crashes, and mean saturation."""
     values = [value for value in rows["saturation"] if value is not None]
     share = f"{100 * sum(values) / len(values):.1f}" if values else EMPTY
     return f"{sum(rows['crashed'])} of {len(rows)}; {share}"
 
 
 def cost_text(rows: Results) -> str:
-    """Format the mean predicted cost, and the actual cost's mean relative error, of flights without a crash."""
     sound = rows.where(lambda row: None not in (row["promised"], row["excess"]), crashed=False)
     if not len(sound):
         return EMPTY

@@ -19,7 +19,6 @@ def call_times(fields: Sequence[AbstractVectorField], controller: Controller, ca
 
 
 def _call_times(field: AbstractVectorField, controller: Controller, calls: int) -> dict[str, float]:
-    """Time calls along a figure-8."""
     control, simulate = eqx.filter_jit(controller), eqx.filter_jit(advance)
     reference = sample(figure_eight(3.5), controller, controller.period * (WARM_UP + calls))
     plan, x = controller.begin(), reference[0]

@@ -155,7 +155,6 @@ def noise_of(config: ExcitationConfig) -> Noise:
 
 
 def sizes(noise: Noise) -> Float[Array, "13"]:
-    """Return the standard deviation of the noise on each state."""
     groups = (3, noise.position), (4, noise.quaternion), (3, noise.velocity), (3, noise.body_rates)
     return jnp.concatenate([jnp.full(count, size) for count, size in groups])
 
@@ -200,7 +199,6 @@ def _fly(domain: Domain, controller: Controller, references: Float[Array, "k n 1
 def fitted(
     config: ExcitationConfig, domain: Domain, flights: Mapping[tuple[str, int], Flown], name: str, seed: int
 ) -> list[Row]:
-    """Return a row for each parameter: the interval after a flight, the prediction, and the truth."""
     states, inputs = flights[name, seed]
     key = jax.random.fold_in(jax.random.key(2 + seed), FLIGHTS.index(name))
     log = jnp.asarray(states, jnp.float32), jnp.asarray(inputs, jnp.float32)

@@ -46,7 +46,6 @@ def margins(bounds: FlightBounds, states: Float[np.ndarray, "n 13"]) -> dict[str
 
 
 def worst(rows: Results, column: str) -> dict[int, float]:
-    """Return the widest interval of each seed, in %."""
     return {seed: float(own.numbers(column).max()) for seed, own in rows.group("seed").items()}
 
 
@@ -162,7 +161,6 @@ def interval_figure(rows: Results) -> Figure:
 
 @mpl.rc_context(STYLE)
 def flight_figure(design: Excitation, flown: Flown) -> Figure:
-    """Draw position, tilt, body rates and rotor speeds over time."""
     figure, panels = subplots((PAGE, 4.2), 2, 2, sharex=True)
     states, inputs = flown
     shown = {

@@ -32,7 +32,6 @@ def picture(path: str | Path) -> None:
 
 
 def render(path: str) -> None:
-    """Write the picture with the backend in the environment."""
     import mujoco
 
     from hybrid_jax.sim.scene import build_model

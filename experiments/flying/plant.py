@@ -16,13 +16,7 @@ FORCES = (drag, ground_effect, wind, weak_rotor)
 
 
 class World(NamedTuple):
-    """The true system of a flight.
-
-    Attributes:
-        vehicle: the true one.
-        shares: of each of FORCES, 1 where it acts.
-        clock: of the wind when the flight begins [s].
-    """
+    """The true system of a flight: FORCES with share 1 act, and `clock` is the wind's time at the start [s]."""
 
     vehicle: Parameters
     shares: Float[Any, " f"]
@@ -47,5 +41,4 @@ def plant_of(world: World, period: float) -> Plant:
 
 
 def wind_force(clock: Float[Any, ""]) -> Float[Any, "3"]:
-    """The force of the wind [N, world] at a time [s]."""
     return wind(jnp.zeros(13), jnp.zeros(4), clock, parameters_of(IRIS)).force

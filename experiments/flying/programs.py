@@ -16,14 +16,7 @@ WIDTH = {"cpu": 4}  # flights in one vmap; on another backend an even share of a
 def compiled(
     simulate: Callable, kinds: Mapping[Any, Sequence[Any]], most: Mapping[Any, int], shared: tuple
 ) -> dict[Any, LaneMap]:
-    """Compile a program for each kind of flight.
-
-    Args:
-        simulate: a pure function of a flight, a tree of arrays, and of shared arguments.
-        kinds: flights of each kind, equal in structure and shapes.
-        most: most flights of each kind that fly at once.
-        shared: further arguments of `simulate`.
-    """
+    """Compile a program for each kind of flight, of equal structure and shapes, for at most `most` flights at once."""
     programs = {}
     for kind in kinds:
         width = min(WIDTH.get(jax.default_backend(), -(-most[kind] // jax.device_count())), most[kind])
@@ -36,5 +29,4 @@ def compiled(
 
 
 def fly(program: LaneMap, flights: Sequence[Any], shared: tuple, none: bool = False) -> Any:
-    """Return the stacked results of `simulate` for all flights."""
     return program(stack(flights), shared, np.ones(len(flights)), range(0 if none else len(flights)))

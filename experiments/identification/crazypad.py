@@ -67,7 +67,6 @@ class Flight(NamedTuple):
 
 
 def flights(folder: Path, vehicle: str = "E8") -> tuple[list[Flight], list[Flight]]:
-    """Return normal flights, and flights with a cut propeller from long to short."""
     normal = [Flight(read_recording(path), WHOLE) for path in sorted((folder / "normal_flight").glob(f"{vehicle}_*"))]
     found = sorted(folder.glob(f"cut_propeller_M3_*/{vehicle}_*"))
     cut = [Flight(read_recording(path), float(re.findall(r"([\d.]+)mm", path.parent.name)[-1])) for path in found]
@@ -77,8 +76,6 @@ def flights(folder: Path, vehicle: str = "E8") -> tuple[list[Flight], list[Fligh
 
 
 def cut_out(recording: Recording, begin: float, end: float) -> Recording:
-    """Return the part of a recording between two times."""
-
     def part(signal: Signal) -> Signal:
         inside = (signal.t >= begin) & (signal.t <= end)
         return replace(signal, t=signal.t[inside], values=np.asarray(signal.values)[inside])
@@ -103,14 +100,12 @@ def rms(errors: np.ndarray) -> float:
 
 
 def source(normal: list[Flight]) -> Any:
-    """Estimate effectiveness of each rotor, and lag, from normal flights."""
     learn = rigid_body(VEHICLE, ("k_rotors",))
     field = actuated(learn, ACTUATOR, ("time_constant",))
     return identify(field, [each.recording for each in normal], LAYOUT, MEASURED).field
 
 
 def first_seconds(recording: Recording, seconds: float = SECONDS) -> tuple[Recording, float]:
-    """Return the first seconds in the air, and when they end."""
     begin, _ = airborne(recording)[0]
     return cut_out(recording, begin, begin + seconds), begin + seconds
 
@@ -136,7 +131,6 @@ def damage(fresh: Any, flight: Flight) -> tuple[np.ndarray, Float[np.ndarray, " 
 
 
 def changed(field: Any, log_efficiency) -> Any:
-    """Return the field with other efficiencies of the rotors."""
     body: Any = corrected(field.body)
     return replace(field, body=replace(body, deviations=body.deviations | {"efficiency": jnp.asarray(log_efficiency)}))
 

@@ -91,7 +91,6 @@ def windows_of(recordings, field: Actuated, stride: int = STRIDE) -> hj.Trajecto
 
 
 def tests_of(recording: Recording, field: Actuated) -> hj.Trajectories:
-    """Return windows of a flight, each with the `PAST` before it."""
     return cut_windows([flight_of(recording, field)], PAST + STEPS, STRIDE).windows
 
 
@@ -115,7 +114,6 @@ def errors(field, tests: hj.Trajectories, observed: bool = False) -> list[float]
 
 
 def fitted_to(start, recordings: list[Recording], field: Actuated, stride: int = 50):
-    """Fit a field's physics to windows of flights by least squares."""
     windows = windows_of(recordings, field, stride)
     return fit_least_squares(start, windows, max_steps=FIT_STEPS, scale=jnp.asarray(SCALE)).field
 

@@ -31,17 +31,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A system and its evaluation.
-
-    Attributes:
-        title: of the table.
-        columns: the names of input and output in the file.
-        unit: unit of the printed errors, and how many there are in one of the output.
-        candidates: an initial model and its prior, by name.
-        options: of `hj.fit_records`.
-        start: the initial state of another record, from its first output and the fitted model.
-        hidden: standard deviation of the state if a record begins in the middle.
-    """
+    """A system and its evaluation: errors are printed in `unit`, and `start` gives another record's initial state."""
 
     title: str
     columns: tuple[str, str]
@@ -70,12 +60,10 @@ def read(path: Path, columns: tuple[str, str]) -> hj.Record:
 
 
 def main(benchmark: Benchmark, name: str, arguments: Sequence[str] | None = None) -> None:
-    """Run the command of one benchmark."""
     command.call(name, Options, lambda options: run(benchmark, options, Console()), arguments)
 
 
 def run(benchmark: Benchmark, options: Options, console: Console) -> None:
-    """Fit, choose and predict, and print the results."""
     began, record = time.perf_counter(), read(options.record, benchmark.columns)
     test = None if options.test is None else read(options.test, benchmark.columns)
     table = Table("model", "left out", "this record", title=benchmark.title)

@@ -69,7 +69,6 @@ def residual(hidden: int) -> ResidualNetwork:
 
 
 def physics(shaped: bool = False) -> Tanks:
-    """Return initial physics."""
     flow, half = jnp.log(jnp.array([0.05, 0.05, 0.04])), jnp.full(2, 0.5)
     edge = jnp.array([9.0, 10.0])
     shape = jnp.zeros((2, 2)) if shaped else None
@@ -82,7 +81,6 @@ def level(x, u):
 
 
 def model(field) -> hj.StateSpaceModel:
-    """Return a model with an unknown level of the upper tank."""
     return hj.StateSpaceModel(field, ("u",), {"y": level}, start=(4.0, 5.2), spread=(5.0, 0.3))
 
 
@@ -90,7 +88,6 @@ NEAR = {"offset": 0.3, "edge": 0.7, "log_weir": 0.7, "caught": 1.5, "power": 0.1
 
 
 def white(shaped: bool):
-    """Return physics, with or without straight walls."""
     near = NEAR | ({"shape": 0.2} if shaped else {})
     return model(physics(shaped)), {f"field.{name}": value for name, value in near.items()}
 

@@ -99,13 +99,7 @@ def with_theta(theta: Float[Array | np.ndarray, " 12"]) -> AbstractVectorField:
 
 
 class FixedModel(AbstractEstimator):
-    """A model that does not learn.
-
-    Attributes:
-        observer: of the disturbance, with the model; bandwidth 0 for none.
-        share: 1 if it includes the wind, else 0.
-        clock: of the wind when the flight begins [s].
-    """
+    """A model that does not learn: `observer` has bandwidth 0 for none, `share` is 1 if it includes the wind."""
 
     observer: Observer
     share: Float[Array, ""]
@@ -167,7 +161,6 @@ class L1(AbstractEstimator):
 def fixed_model(
     field: AbstractVectorField, period: float, clock: float, bandwidth: float = 0.0, share: float = 0.0
 ) -> FixedModel:
-    """Return an agent that does not learn, or only by an observer."""
     numbers: list[Any] = [np.asarray(number, np.float32) for number in (bandwidth, share, clock)]
     return FixedModel(Observer(as_numpy(with_disturbance(field)), numbers[0], period), *numbers[1:])
 

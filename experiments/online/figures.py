@@ -45,7 +45,6 @@ def indices(run: Run, **tags) -> list[int]:
 
 
 def whole(run: Run, i: int, name: str) -> np.ndarray:
-    """Return a quantity of a flight from its beginning on."""
     return np.concatenate([getattr(run.before[run.trials[i].start], name), getattr(run.after, name)[i]])
 
 
@@ -86,7 +85,6 @@ def errors(run: Run, config: OnlineConfig, reference: str) -> Figure:
 
 @mpl.rc_context(STYLE)
 def parameters(run: Run, config: OnlineConfig, reference: str) -> Figure:
-    """Draw estimates of one flight with their 95 % intervals, and the truth."""
     figure, panels = _panels(config)
     for panel, change in zip(panels.flat, config.changes, strict=False):
         i = indices(run, change=change, agent="online", reference=reference, seed=0)[0]

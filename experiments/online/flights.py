@@ -51,15 +51,7 @@ class Trial(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """The part of a flight before or after the change.
-
-    Attributes:
-        estimator: adapts the controller's model.
-        moment: the closed loop at its start.
-        world: the true system.
-        path: number in PATHS.
-        first: number of its first period.
-    """
+    """The part of a flight before or after the change, from the period `first` on."""
 
     estimator: Any
     moment: Any
@@ -69,15 +61,7 @@ class Segment(NamedTuple):
 
 
 class Record(NamedTuple):
-    """The record of a segment at each period.
-
-    Attributes:
-        error: distance from the reference [m].
-        altitude: [m].
-        theta: estimated change of θ in the physics' own parametrisation; NaN without an estimate.
-        std: its standard deviation.
-        changes: number of detected changes so far.
-    """
+    """The record of a segment at each period: distances in m; `theta` is the change of θ, NaN without an estimate."""
 
     error: Float[Any, " t"]
     altitude: Float[Any, " t"]
@@ -87,15 +71,7 @@ class Record(NamedTuple):
 
 
 class Run(NamedTuple):
-    """All flights.
-
-    Attributes:
-        trials: in the order of `after`.
-        after: records after the change, stacked.
-        before: records before it, by `Trial.start`.
-        seconds: wall-clock time of all flights, without compiling.
-        processor_seconds: the same on all cores.
-    """
+    """All flights: records `after` the change, and `before` it by `Trial.start`; times exclude compiling."""
 
     trials: list[Trial]
     after: Record
@@ -105,7 +81,6 @@ class Run(NamedTuple):
 
 
 def simulate(config: OnlineConfig, segment: Segment, references: Float[Array, "k n 13"]):
-    """Fly a segment; return the moment at its end and a `Record`."""
     loop = Loop(config.controller(), config.hardware(), segment.estimator)
     plant, reference = plant_of(segment.world, loop.controller.period), references[segment.path]
 
@@ -174,7 +149,6 @@ def ground_fits(change: str, seeds: int, hardware: Hardware) -> AbstractVectorFi
 
 
 def fly_all(config: OnlineConfig, stages: Stages) -> Run:
-    """Fly every agent along every reference, through every change, with every seed."""
     references = sampled(config.controller(), 2 * config.seconds + 1)
     fitted: dict[str, Any] = {}
     if "least_squares" in config.agents:

@@ -42,7 +42,6 @@ HYPOTHESES = (
 
 
 def _iris(integral, x: State, seen: State, push: Float[Array, "3"]):
-    """Simulate a period of the project's own simulator, under an acceleration [m/s²]."""
     plan = pilot.Plan(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(()), jnp.zeros(4))
     integral, u = pilot.act(integral, seen, plan, parameters_of(IRIS), IRIS, pilot.scale_of(IRIS))
     truth = SOURCE.quadrotor()
@@ -65,16 +64,7 @@ WORLDS = {
 
 
 class Hovered(NamedTuple):
-    """The record of a flight at the end of each block of 0.1 s.
-
-    Attributes:
-        errors: squared prediction errors of v and ω over a block, of the adapted and the first model; with noise.
-        theta: estimated change of Ix, Iy, k and of the disturbance.
-        deviation: standard deviation of theta.
-        unexcited: flags.
-        inconsistent: flag.
-        changes: number of detected changes.
-    """
+    """The record of a flight at the end of each block of 0.1 s: squared errors of the adapted and the first model."""
 
     errors: Float[Any, "*n t 2 2"]
     theta: Float[Any, "*n t p"]
@@ -135,7 +125,6 @@ def hover(
 
 
 def main() -> None:
-    """Print a line for each filter, noise, world and rms of gusts."""
     blocks = round(float(sys.argv[1] if sys.argv[1:] else 600) / DT / BLOCK)
     gusts, keys = jnp.array([0.0, 1.0]), jax.random.split(jax.random.key(7))
     print("filter, noise, world, gusts | error of v, ω over the first model's | v after a wind | found after [s] |")

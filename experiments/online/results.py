@@ -23,8 +23,6 @@ TAGS = ("change", "reference", "agent", "seed")
 
 @dataclass(frozen=True)
 class Evidence:
-    """All flights, and their times."""
-
     rows: Results
     step_ms: float  # processor time of one step of the filter on one core
     seconds: float  # of all flights, on the clock, without compiling
@@ -67,7 +65,6 @@ def error(name: str):
 
 
 def tables(rows: Results) -> list[Table]:
-    """Return tables of each agent's errors by reference, of detection times and of coverage."""
     made = []
     columns = {REFERENCES[name]: {"reference": name} for name in rows.unique("reference")}
     for change, group in rows.group("change").items():

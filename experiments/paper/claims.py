@@ -31,7 +31,6 @@ class Evidence:
     truth: Mapping[str, float] | None
 
     def sizes(self) -> list[int]:
-        """Each N that a model with a network was fine-tuned with."""
         found = {n for model, mode, n in self.cells if mode == FINE_TUNED and model != names.PHYSICS_ONLY}
         if not found:
             raise Undecided("there are no fine_tuned rows")
@@ -109,7 +108,6 @@ def _less_spread(e: Evidence) -> Iterator[Part]:
 
 
 def _by_seed(rows: Results) -> dict[int, float]:
-    """Return the mean error of each seed over its draws."""
     return {seed: own.spread("test_mse").mean for seed, own in rows.group("seed").items()}
 
 

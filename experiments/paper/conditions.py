@@ -137,7 +137,6 @@ def held_back(subset: Int[np.ndarray, "*runs n"]) -> tuple[Int[np.ndarray, "*run
 
 
 def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[tuple[float, float], Stopping]:
-    """Return the rates of θ_p and θ_d, and the stopping rule, of a size."""
     rates, patience, i = config.rates, config.patience, column(size)
     if model == "no_physics":
         rate = rates.no_physics_target_only if mode == "target_only" else rates.no_physics[i]
@@ -209,7 +208,6 @@ def measure(x: Float[Array, "*n 13"], noise: Noise, key: PRNGKeyArray) -> Float[
 
 
 def measured(dataset: Dataset, level: float, seed: int) -> Dataset:
-    """Add `level` times the typical noise to all but the test splits."""
     if not level:
         return dataset
     noise = Noise(**{name: level * size for name, size in asdict(Noise()).items()})

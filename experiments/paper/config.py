@@ -98,7 +98,7 @@ class Encoding:
 
 @dataclass(frozen=True)
 class Config(Run):
-    """What all experiments in simulation share. Without options this is the paper's full protocol."""
+    """Shared options of all experiments in simulation. Defaults: the paper's full protocol."""
 
     sizes: tuple[int, ...] = TABLE_SIZES
     """N, target trajectories to train on; rates and patience are those of the nearest size in the paper's table."""
@@ -236,7 +236,7 @@ class AdaptationConfig(Config):
 
 @dataclass(frozen=True)
 class OneFlight(Config):
-    """What a user has after a change: one short flight with sensor noise, and nothing else."""
+    """What you have after a change: one short flight with sensor noise, and no other data."""
 
     sizes: tuple[int, ...] = (100,)
     """N, windows of 0.1 s: one number."""

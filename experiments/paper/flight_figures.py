@@ -27,13 +27,7 @@ Flights = Float[np.ndarray, "n t+1 13"]
 def predictions(
     predicted: Mapping[int, Mapping[str, Flights]], truth: Flights, shown: int, dt: float, title: str
 ) -> Figure:
-    """Figs. 2 and 4: one flight from above, and how the position error of many flights grows, by N and model.
-
-    Args:
-        predicted: N → model → predicted states (flights, t + 1, 13).
-        truth: the states of the same flights.
-        shown: index of the flight that is drawn from above.
-    """
+    """Figs. 2 and 4: the `shown` flight from above, and how the position error of all flights grows, by N and model."""
     sizes = sorted(predicted)
     figure = Figure(figsize=(PAGE, 5.0), layout="constrained")
     grid = figure.add_gridspec(2, len(sizes), height_ratios=(1.3, 1))
@@ -121,5 +115,4 @@ def _draw_space(axes: Any, states: States) -> None:
 
 
 def tilt(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
-    """The angle between body z and world z [deg]."""
     return np.degrees(np.arccos(np.clip(1 - 2 * (q[:, 1] ** 2 + q[:, 2] ** 2), -1, 1)))

@@ -73,7 +73,6 @@ def coverage(repeats: int, console: Console) -> Results:
 
 
 def recording(start_is_measured: Bool[Array, ""], drag: Float[Array, ""], key: PRNGKeyArray) -> Trajectories:
-    """Return windows of the true vehicle with measurement noise."""
     start_key, input_key, x0_key, x_key = jax.random.split(key, 4)
     x0, noise = starts(start_key), Noise()
     u = IRIS.hover_speed + ROTOR_SPEED * jax.random.normal(input_key, (WINDOWS, STEPS, 4))
@@ -96,7 +95,6 @@ def starts(key: PRNGKeyArray) -> Float[Array, "n 13"]:
 
 @jit_with(FASTEST_COMPILE)
 def _repeat(start_is_measured: Bool[Array, ""], drag: Float[Array, ""], key: PRNGKeyArray) -> dict[str, Array]:
-    """Return relative errors, and whether the 95 % intervals contain the truth."""
     windows = recording(start_is_measured, drag, key)
     found = fit_least_squares(rigid_body(IRIS), windows)
     around = intervals(found.field, covariance_of(found.field, windows), 0.95)
@@ -108,7 +106,6 @@ def _repeat(start_is_measured: Bool[Array, ""], drag: Float[Array, ""], key: PRN
 
 
 def known_body_table(rows: Results) -> Table:
-    """Return a line for each parameter in every case of `coverage`."""
     columns = {
         "coverage [%]": lambda r: f"{100 * r[0]['coverage']:.1f} ± {100 * r[0]['standard_error']:.1f}",
         "bias [%]": lambda r: f"{r[0]['bias']:+.2f}",

@@ -38,11 +38,7 @@ Cell = tuple[str, str, int]  # model, mode, n_train
 
 
 class Fit(NamedTuple):
-    """Models after training, or adapted in closed form: stacked, one for each size and seed.
-
-    Attributes:
-        val_mse: L_MSE of each on the validation windows.
-    """
+    """Models after training, or adapted in closed form: stacked, one for each size and seed."""
 
     fields: Any
     val_mse: Any
@@ -75,13 +71,7 @@ def lanes_of(
     theta: Mapping[str, np.ndarray] | None = None,
     more: Mapping[str, np.ndarray] | None = None,
 ) -> Lanes:
-    """Return models tested in a domain, one for each size, draw and seed, in this order.
-
-    Args:
-        errors: L^T_MSE on the test flights.
-        theta: name → the value of each, instead of the models' own.
-        more: further columns, the number of each.
-    """
+    """Return models tested in a domain, one for each size, draw and seed; `theta` replaces the models' own."""
     theta, runs = theta_of(fit.fields) if theta is None else theta, len(errors) // len(sizes)
 
     def row(i: int) -> Row:
@@ -125,7 +115,6 @@ def physics_in(field: Any) -> Any:
 
 
 def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray]:
-    """Return θ_p of a model, or of stacked ones; empty without physics."""
     return {name: np.asarray(value) for name, value in getattr(physics_in(field), "theta", dict)().items()}
 
 
@@ -161,14 +150,12 @@ def gain(row: Row) -> float:
 
 
 def cells(rows: Results) -> dict[Cell, Results]:
-    """Group rows by model, mode and N, in the order of MODELS, MODES and N."""
     if len(domains := sorted(rows.unique("domain"))) > 1:
         raise ValueError(f"rows must be of one domain, got {', '.join(domains)}")
     return rows.sort(model=MODELS, mode=MODES, n_train=None).group(*CELL)
 
 
 def by_domain(rows: Results) -> dict[str, Results]:
-    """Group rows by domain, in the order of DOMAINS."""
     return rows.sort(domain=DOMAINS).group("domain")
 
 

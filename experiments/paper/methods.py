@@ -33,13 +33,7 @@ else:
 
 @dataclass(frozen=True)
 class Case:
-    """Data and models for the methods in one target domain.
-
-    Attributes:
-        pretrained: by model, one per seed.
-        experts: the `ExpertAugmented` of all seeds, if Expert Augmentation is compared.
-        target: splits train (the pool), validation and test_with_past.
-    """
+    """Data and models for the methods in one target domain, with a pool of training windows."""
 
     config: Config
     stages: Stages
@@ -52,7 +46,6 @@ class Case:
         return self.target.config["domain"]
 
     def tested(self, name: str, fields: Any) -> np.ndarray:
-        """Return L^T_MSE of stacked fields on the steps after the past."""
         _, future = split(self.target.splits["test_with_past"], PAST)
         return self.stages.timed(
             f"test {name} {self.name}", lambda: evaluate(fields, future, 1, settings(self.config)), "testing"

@@ -31,13 +31,11 @@ CHANGES = {
 
 
 def of_each_case(rows: Results, name: str) -> np.ndarray:
-    """Return the test error of a candidate, a method or `AUTO`, for each domain, draw and seed."""
     own = rows.where(taken=True) if name == AUTO else rows.where(candidate=name)
     return np.array([case.numbers("test_mse")[0] for case in own.group("domain", "draw", "seed").values()])
 
 
 def best_of_each_case(rows: Results) -> np.ndarray:
-    """Return the smallest test error of all candidates, for each domain, draw and seed."""
     candidates = rows.where(lambda row: row["candidate"] not in COMPARED)
     return np.array([case.spread("test_mse").smallest for case in candidates.group("domain", "draw", "seed").values()])
 
@@ -103,7 +101,6 @@ CLAIMS: Sequence[Claim[Results]] = (
 
 
 def conclusion(rows: Results) -> list[str]:
-    """Summarise the removed share of the source's error, and fine-tuning, in one sentence."""
     gains = {domain: 1 - over(own, "source").mean() for domain, own in rows.group("domain").items()}
     sentence = (
         f"`adapt` removes {min(gains.values()):.0%} to {max(gains.values()):.0%} of the source's error, by change"
@@ -118,7 +115,6 @@ def conclusion(rows: Results) -> list[str]:
 
 
 def regret_table(rows: Results) -> Table:
-    """Return a line per domain: regret, ρ, and how often each candidate was chosen."""
     lines = []
     for domain, own in rows.group("domain").items():
         found, rho = regret(own), 1 - over(own, "source")
@@ -132,7 +128,6 @@ def regret_table(rows: Results) -> Table:
 
 
 def error_table(rows: Results) -> Table:
-    """Return mean test errors: a line per candidate and method, a column per domain."""
     groups = rows.group("domain")
 
     def text(own: Results, name: str) -> str:

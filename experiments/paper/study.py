@@ -106,7 +106,6 @@ def _adapted(
 
 
 def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> Fit:
-    """Pre-train a model on source flight, one run per seed."""
     shared, name = (settings(config), source, capacity(config)), f"pre-training {model}"
     found = stages.sweep(name, *pretraining(model, fresh_fields(model, vehicle, config), config), *shared)
     for factor in config.rates.decay:
@@ -147,7 +146,6 @@ def solved(
 
 
 def solving(method: Method, fields: AbstractVectorField, size: int, config: Config) -> tuple[Method, Settings, Any]:
-    """Return the arguments of `_solved` for a size, except the flights."""
     starts = lane(fields, np.tile(np.arange(config.seeds), config.draws))
     return method, settings(config), (starts, *windows_of(method, size, config))
 
@@ -219,7 +217,6 @@ def source_splits(config: Config) -> dict[str, SplitSpec]:
 
 
 def target_splits(config: Config) -> dict[str, SplitSpec]:
-    """Return the splits of the target; every seed draws from the train split."""
     return drawn_splits(config) | {"test": SplitSpec(config.test, 100)}
 
 
@@ -252,7 +249,6 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
 
 
 def _compile_solved(model: str, vehicle: Vehicle, config: Config) -> None:
-    """Compile the programs of a model that is not trained."""
     fields = pretraining(source_of(model), fresh_fields(source_of(model), vehicle, config), config)[0].best
     target = {name: placeholder(spec) for name, spec in target_splits(config).items()}
     for size in config.sizes:

@@ -69,7 +69,6 @@ def by_size(rows: Results) -> list[Table]:
 
 
 def conclusion(rows: Results) -> list[str]:
-    """Summarise each domain's best method at the smallest N, against the source's model."""
     sentences = []
     for place, group in _places(rows):
         n = min(adapted_sizes(group), default=0)
@@ -88,7 +87,6 @@ def conclusion(rows: Results) -> list[str]:
 
 
 def meaning(verdicts: Sequence[Verdict]) -> list[str]:
-    """Explain the verdicts on C1, C2 and C6 in one sentence."""
     sentences = {
         True: "A model with physics in it, adapted to a little flight, predicts better than before the change and "
         "better than a network without physics: what the paper claims holds (C1, C2, C6).",

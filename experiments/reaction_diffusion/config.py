@@ -7,13 +7,7 @@ from experiments.runner.options import Count, Run, distinct
 
 
 class Case(NamedTuple):
-    """A line of the table of forecasts.
-
-    Attributes:
-        kernel: of the residual; 0: none.
-        physics: "diffusion", "complete" or "none".
-        seeds: at most so many of --seeds.
-    """
+    """A line of the table of forecasts: `kernel` 0 is no residual; physics is "diffusion", "complete" or "none"."""
 
     name: str
     kernel: int = 1

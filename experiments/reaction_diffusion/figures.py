@@ -20,7 +20,6 @@ Shown = Arrays
 
 
 def draw(rows: Results, shown: Shown, patterns: Shown, dt: float) -> dict[str, tuple[Figure, str]]:
-    """Return the figures and their captions, by name."""
     found = {}
     known = [name for name in (POINTWISE, LOCAL) if name in shown]
     if known:
@@ -37,7 +36,6 @@ def draw(rows: Results, shown: Shown, patterns: Shown, dt: float) -> dict[str, t
 
 @mpl.rc_context(STYLE)
 def fields(shown: Shown, name: str, at: tuple[int, ...], dt: float, component: int = 0) -> Figure:
-    """Draw truth, forecast and error of one component at some steps."""
     truth, forecast = (_component(shown[each], component) for each in ("truth", name))
     error = forecast - truth
     figure, axes = subplots((PAGE * 0.8, PAGE * 0.8 * 3 / len(at) * 0.98), 3, len(at))

@@ -30,7 +30,6 @@ def scaling(kernel: int) -> ChannelScaling:
 
 
 def untrained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
-    """Return the model before training; the seed is for the network's weights."""
     grid, key = plane(config.points), jax.random.key(seed)
     if case.physics == "complete":
         return fitzhugh_nagumo(grid, *GUESS, k=0.0)

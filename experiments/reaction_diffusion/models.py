@@ -13,7 +13,6 @@ from hybrid_jax.dynamics.base import ravel_learned
 
 
 def weights(model: hj.AbstractVectorField) -> np.ndarray:
-    """Return all parameters of a model as a vector."""
     return np.asarray(ravel_learned(model)[0])
 
 
@@ -23,7 +22,6 @@ def with_weights(model: Any, vector: np.ndarray) -> Any:
 
 @eqx.filter_jit
 def predicted(model, data: hj.Trajectories, solver) -> jax.Array:
-    """Forecast all windows, a few at a time."""
     one = lambda pair: hj.rollout(model, pair[0], pair[1], data.dt, solver)  # noqa: E731
     return jax.lax.map(one, (jnp.asarray(data.x0), jnp.asarray(data.u)), batch_size=4)
 

@@ -135,7 +135,6 @@ def _scott(rows: Results) -> Part:
 
 
 def _ends(e: Evidence) -> tuple[int, int]:
-    """Return the smallest and the largest N."""
     if len(sizes := e.sizes()) < 2:
         raise Undecided("needs two sizes N")
     return sizes[0], sizes[-1]

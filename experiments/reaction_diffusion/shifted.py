@@ -61,8 +61,6 @@ def study(config: Config, kept: Kept) -> list[Row]:
 
 
 def sources(config: Config, kept: Kept) -> dict[tuple[str, int], hj.AbstractVectorField]:
-    """Return models of the equations before the change, by name and seed."""
-
     def train(model: str, seed: int) -> Found:
         data = reacting(fitzhugh_nagumo(plane(config.points)), SOURCES, (SOURCE, seed))
         return [], {"weights": weights(learned(untrained(model, config, seed), data, config.steps))}
@@ -76,7 +74,6 @@ def sources(config: Config, kept: Kept) -> dict[tuple[str, int], hj.AbstractVect
 
 
 def before(config: Config, trained, shift: str) -> list[Row]:
-    """Return the rows of the unadapted sources after a shift."""
     test = tested(config, shift)
     return [
         _tags(shift, model, seed) | {"mode": SOURCE_ONLY, "n": 0, "mse": error(source, test, COARSE), "rho": 0.0}

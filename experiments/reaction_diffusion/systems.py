@@ -52,7 +52,6 @@ def fitzhugh_nagumo(grid: hj.Grid, a: float = A, b: float = B, k: float = K, cou
 
 
 def plane(points: int) -> hj.Grid:
-    """Return the grid of FitzHugh–Nagumo on [−1, 1]²."""
     return hj.Grid((points, points), 2 / points, 2)
 
 
@@ -131,7 +130,6 @@ class Conversion(hj.AbstractVectorField):
 
 
 def gray_scott(environments, reacts: bool, points: int = 32) -> GrayScott:
-    """Return the field with (F, k) of each environment."""
     return GrayScott(jnp.log(jnp.asarray(environments)), reacts, hj.Grid((points, points), 1.0, 2))
 
 

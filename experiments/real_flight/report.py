@@ -54,7 +54,6 @@ def write(
     curves: Mapping[str, np.ndarray],
     stages: Stages,
 ) -> None:
-    """Write the report into the run's folder, and print its tables."""
     out, found = config.out / NAME, cells(rows)
     best = max((cell for cell in found if cell[0] in (ADAPTED, LEARNED)), key=lambda cell: cell[1])
     drawn = [(names.HOLD, 0), (names.THRUST, 0), (names.PHYSICS_ONLY, 0), *dict.fromkeys([(LEARNED, 0), best])]
@@ -84,7 +83,6 @@ def write(
 
 
 def cells(rows: Results) -> dict[Cell, Results]:
-    """Group rows over flights and seeds, in the order of MODELS."""
     return rows.sort(model=MODELS, n_train=None, seed=None).group("model", "n_train")
 
 
@@ -93,13 +91,11 @@ def label(model: str, n: int) -> str:
 
 
 def pooled(rows: Results, horizon: str, quantity: str) -> np.ndarray:
-    """Return the RMSE of each seed over the test flights."""
     groups = rows.sort(seed=None).group("seed").values()
     return np.array([np.sqrt(np.mean(own.numbers(f"scores.{horizon}.{quantity}") ** 2)) for own in groups])
 
 
 def conclusion(found: Mapping[Cell, Results], best: Cell, dt: float) -> list[str]:
-    """Summarise the tool's improvement over the best baseline, by velocity after the longest horizon."""
     horizon = max(found[best][0]["scores"], key=int)
     errs = {cell: pooled(rows, horizon, "velocity").mean() for cell, rows in found.items()}
     simple = min((cell for cell in errs if cell[0] in BASELINES), key=errs.__getitem__)
@@ -179,7 +175,6 @@ def parameter_table(found: Mapping[Cell, Results]) -> Table:
 
 
 def verdicts(found: Mapping[Cell, Results], best: Cell) -> list[Verdict]:
-    """Evaluate each hypothesis that the rows can answer."""
     baselines = [cell for cell in found if cell[0] in BASELINES]
     claims = [
         _better("F1", best, baselines, "every simple baseline"),

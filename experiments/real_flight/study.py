@@ -150,7 +150,6 @@ def expected_of(learned: np.ndarray | None, found: Adaptation | None, curve: np.
 
 
 def parameters_of(found: Adaptation | None) -> dict[str, Any]:
-    """Return θ_p in SI units, and its 95 % intervals."""
     if found is None:
         return {"theta": None, "theta_interval": None}
     theta = {name: one.value for name, one in found.parameters.items()}

@@ -66,12 +66,10 @@ def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
 
 
 def decided(table: Table) -> Table:
-    """Return a `verdict_table` without undecided hypotheses."""
     return table._replace(lines=[line for line in table.lines if OUTCOMES[None] not in line])
 
 
 def summary(verdicts: Sequence[Verdict]) -> list[str]:
-    """Count the hypotheses that are true, false and undecided in one sentence."""
     judged = [each for each in verdicts if not each.lacks_data]
     if not judged:
         return []

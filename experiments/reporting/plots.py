@@ -58,7 +58,6 @@ def colour(model: str) -> str:
 
 
 def subplots(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, np.ndarray]:
-    """Create a figure [inches] and its panels, (rows, columns)."""
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 

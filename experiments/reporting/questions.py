@@ -4,14 +4,7 @@ from typing import NamedTuple
 
 
 class Asked(NamedTuple):
-    """The question of an experiment.
-
-    Attributes:
-        question: the title of the report.
-        meaning: sentences on what the result means for you.
-        table: a part of the title of the unfolded table; by default the first without verdicts.
-        figure: the name of the unfolded figure; by default the first.
-    """
+    """A report's title, what the result means for you, and the unfolded table and figure, by default the first."""
 
     question: str
     meaning: tuple[str, ...] = ()

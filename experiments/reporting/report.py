@@ -26,17 +26,7 @@ MEANINGLESS = "The smoke preset only shows that everything works: its numbers me
 
 @dataclass(frozen=True)
 class Report:
-    """The content of a report in any format.
-
-    Attributes:
-        figures: path relative to the report → caption.
-        notes: sentences for the end of the page.
-        extra: further keys of report.json.
-        head: title and introduction of the page, Markdown.
-        tables: of the page and the terminal.
-        conclusion: sentences before that on hypotheses.
-        warnings: sentences before any number.
-    """
+    """The content of a report in any format; `figures` maps a path relative to the report to its caption."""
 
     experiment: str
     config: Mapping[str, Any]
@@ -64,7 +54,6 @@ class Report:
         return sorted(self.figures.items(), key=lambda figure: figure[0] != self.asked.figure)
 
     def conclusions(self) -> list[str]:
-        """The first sentences of the page."""
         return [MEANINGLESS] if self.meaningless else [*self.conclusion, *claims.summary(self.claims)]
 
     def shown(self) -> list[Table]:
@@ -124,8 +113,6 @@ def to_json(report: Report) -> dict[str, Any]:
 
 
 def lines_of(record: dict[str, Any]) -> str:
-    """JSON with a line for each row."""
-
     def text(value: Any) -> str:
         return json.dumps(value, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
 

@@ -86,7 +86,6 @@ class Results:
         return list(dict.fromkeys(self[column]))
 
     def tagged(self, **tags: Any) -> "Results":
-        """Return the rows with further tags, or other values of these."""
         rows = tuple({**tags, **{name: row[name] for name in row if name not in tags}} for row in self.rows)
         return Results(rows, (*tags, *(tag for tag in self.tags if tag not in tags)))
 
@@ -101,7 +100,6 @@ class Results:
         return np.array([missing if (value := read(row)) is None else value for row in self.rows], float)
 
     def spread(self, column: Column, missing: float = math.inf) -> Spread:
-        """Mean, standard deviation and more of a column; see `numbers`."""
         return spread(self.numbers(column, missing))
 
     def paired(self, other: "Results", column: Column) -> tuple[np.ndarray, np.ndarray]:
@@ -135,7 +133,6 @@ class Results:
         return text.getvalue()
 
     def _with(self, rows: Iterable[Row]) -> "Results":
-        """Return some of these rows, without checks."""
         found = object.__new__(Results)
         object.__setattr__(found, "rows", tuple(rows))
         object.__setattr__(found, "tags", self.tags)

@@ -22,13 +22,7 @@ Cell = Callable[[Results], str]  # the text of a cell, of the rows that belong t
 
 
 class Table(NamedTuple):
-    """Header and lines of cells, all text, under a title.
-
-    Attributes:
-        labels: columns that label a line.
-        verdicts: whether these are verdicts, which a smoke run must not show.
-        folded: whether a page shows it only on a click.
-    """
+    """Header and lines of text under a title; `labels` counts the first columns, a `folded` table opens on a click."""
 
     title: str
     header: Sequence[str]
@@ -95,19 +89,16 @@ def measured(mean: float, std: float) -> str:
 
 
 def over_seeds(results: Results) -> str:
-    """Count the seeds of the rows."""
     seeds = len(set(results["seed"]))
     return f"{seeds} seeds" if seeds > 1 else "one seed"
 
 
 def mean_over_seeds(results: Results) -> str:
-    """Describe the numbers of `spread_text`, for a title."""
     seeds = over_seeds(results)
     return seeds if seeds == "one seed" else f"mean ± std over {seeds}"
 
 
 def narrowed(table: Table) -> Table:
-    """Return only the table's first columns, at most FEW."""
     return table._replace(header=table.header[:FEW], lines=[line[:FEW] for line in table.lines])
 
 
@@ -149,5 +140,4 @@ def columns_of_parts(least: Sequence[int], labels: int, width: int) -> list[list
 
 
 def plain(text: str) -> str:
-    """Escape text for a cell and a line of Markdown."""
     return " ".join(text.replace("|", "\\|").split())

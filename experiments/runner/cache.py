@@ -24,13 +24,7 @@ FINISHED_BY = ("jax", "hybrid_jax")
 
 @dataclass(frozen=True)
 class Cache:
-    """A folder of finished stages.
-
-    Attributes:
-        folder: of the archives.
-        say: prints a line about what is moved aside.
-        fresh: whether results of other versions, and unfinished ones, are moved aside and computed again.
-    """
+    """A folder of finished stages; with `fresh`, results of other versions, and unfinished ones, are moved aside."""
 
     folder: Path
     say: Callable[[str], None]
@@ -41,7 +35,6 @@ class Cache:
         return self.folder / f"{_stem(name)}-{identity[:16]}.npz"
 
     def knows(self, name: str) -> bool:
-        """Whether a stage of this name, with any identity, is finished or begun."""
         return any(self.folder.glob(f"{_stem(name)}-*"))
 
     def load(self, path: Path) -> tuple[Any, Arrays] | None:
@@ -93,7 +86,6 @@ def sweep_identity(states: FitState, plans: RunConfig, settings: Settings, data:
 
 @cache
 def source_digest(package: str) -> str:
-    """Return the digest of all Python files of a package."""
     spec = find_spec(package)
     digest = hashlib.sha256()
     for root in sorted(spec.submodule_search_locations or ()) if spec else ():

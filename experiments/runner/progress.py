@@ -57,16 +57,13 @@ class Line(AbstractContextManager):
             self._print()
 
     def show_share(self, doing: str, share: float) -> None:
-        """Show the finished share of the work, 0 … 1, and the remaining time at this rate."""
         left = f", {clock(self._elapsed() * (1 - share) / share)} left" if share > 0 else ""
         self.say(f"{doing} {share:.0%}{left}")
 
     def show_parts(self, done: int, parts: int) -> None:
-        """Show the number of finished parts and the remaining time at this rate."""
         self.show_share(f"{done} of {parts} parts,", done / parts)
 
     def show_sweep(self, progress: Progress) -> None:
-        """Show active runs, best loss, and bounds of the remaining time."""
         share = progress.active / progress.lanes  # stopped runs cost nothing
         epoch = share * progress.seconds / max(progress.epochs, 1)
         self.say(

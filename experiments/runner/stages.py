@@ -36,14 +36,7 @@ Kept = Callable[[str, Mapping[str, Job]], dict[str, Found]]  # `Stages.kept` of 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A stage of an experiment, which `Stages.run` runs after the stages in `needs`.
-
-    Attributes:
-        words: the work and its object; together they name the stage.
-        work: computes the result, from the results of `needs`.
-        needs: the stages before it.
-        compile: compiles the programs of `work`, if their shapes are known before `needs` are done.
-    """
+    """A stage of an experiment, named by `words`; `compile` prepares the programs of `work` while others run."""
 
     words: tuple[str, ...]
     work: Callable[..., Any]
@@ -52,7 +45,6 @@ class Stage:
 
     @property
     def name(self) -> str:
-        """The words, as shown by console, report and cache."""
         return " ".join(self.words)
 
 
@@ -184,7 +176,6 @@ class Stages:
         return {job: found[job] for job in jobs}
 
     def notes(self) -> list[str]:
-        """Return remarks on the times in `seconds`."""
         reused = f"Taken from the cache, with the seconds of the run that made them: {', '.join(self.reused)}."
         saved = f"Saving checkpoints took {self._saving / (self._ran or 1):.2%} of the sweeps' time."
         return [reused] * bool(self.reused) + [saved] * bool(self._ran)
@@ -221,12 +212,10 @@ class Stages:
 
 
 def rows_of(found: Mapping[str, Found]) -> list[Row]:
-    """Return the rows of all jobs, in their order."""
     return [row for rows, _ in found.values() for row in rows]
 
 
 def stages_of(config: Run, console: Console) -> Stages:
-    """Return the stages of an experiment, with its cache folder."""
     return Stages(config.cache / "stages", console, config.saving, config.fresh)
 
 

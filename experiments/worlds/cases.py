@@ -40,14 +40,7 @@ else:
 
 
 class Flight(NamedTuple):
-    """A flight to adapt to.
-
-    Attributes:
-        kind: one of `world.KINDS`.
-        seconds: its length [s].
-        noise: of its sensors, over the usual noise.
-        burst: whether some of its samples are outliers.
-    """
+    """A flight to adapt to: one of `world.KINDS`, with noise relative to the usual and possibly a burst of outliers."""
 
     kind: str = "moving"
     seconds: float = 10.0
@@ -90,7 +83,6 @@ class WorldsConfig(OneFlight):
         distinct("--learn-from", self.learn_from)
 
     def cases(self) -> Iterator[tuple[ChangeName, FlightName]]:
-        """Return pairs of a change and a flight to adapt to."""
         for change in self.changes:
             for flight in self.learn_from:
                 if flight == USUAL or change == NOTHING:
@@ -98,13 +90,11 @@ class WorldsConfig(OneFlight):
 
 
 def key_of(world: World, config: WorldsConfig, purpose: int, draw: int = 0) -> PRNGKeyArray:
-    """Return the random key of this purpose."""
     key = jax.random.fold_in(jax.random.key(config.data_seed), [*WORLDS].index(world.name))
     return jax.random.fold_in(jax.random.fold_in(key, purpose), draw)
 
 
 def source_flights(world: World, config: WorldsConfig) -> Dataset:
-    """Return the windows to train sources on, and others for early stopping."""
     numbers = {"train": config.source_train, "validation": config.validating()}
     each = round(LEARNING / STEPS * 100)
     flights = {name: -(-number // each) for name, number in numbers.items()}
@@ -117,7 +107,6 @@ def source_flights(world: World, config: WorldsConfig) -> Dataset:
 
 
 def flown_after(world: World, change: str, flight: str, draw: int, config: WorldsConfig) -> hj.Trajectories:
-    """Return the windows of one flight to adapt to."""
     kind, seconds, noise, burst = FLIGHTS[flight]
     flown = world.fly(change, kind, 1, seconds, key_of(world, config, TARGET, draw))
     key, averaged = key_of(world, config, NOISE, 1 + draw), config.rotor_speeds == "averaged"
@@ -132,7 +121,6 @@ class Tests(NamedTuple):
 
 
 def tests_after(world: World, change: str, config: WorldsConfig) -> Tests:
-    """Return the test flights."""
     flown = world.fly(change, USUAL, config.test_flights, TESTING, key_of(world, config, TEST))
     key, averaged = key_of(world, config, TEST), config.rotor_speeds == "averaged"
     noisy = logged(flown, key, LONG, noise=config.noise, averaged=averaged)
@@ -173,7 +161,6 @@ def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
 
 
 def row_of(method: str, task: Task, change: str, test: Tests) -> dict[str, Any]:
-    """Apply a method to a task and test the result."""
     begun = time.process_time()
     model = METHODS[method](task)
     seconds = time.process_time() - begun

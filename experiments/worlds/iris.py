@@ -22,18 +22,12 @@ AT_ONCE = 1e-9  # s
 
 
 def domain_of(change: str) -> Domain:
-    """Return the true system after one of `CHANGES`, except motors."""
     return DOMAINS.get(change, SOURCE)
 
 
 @dataclass(frozen=True)
 class Iris:
-    """The Iris of `hybrid_jax.sim`, whose inputs are held over each interval; see `World`.
-
-    Attributes:
-        name: label in reports.
-        vehicle: its constants before a change.
-    """
+    """The Iris of `hybrid_jax.sim`, whose inputs are held over each interval; see `World`."""
 
     name: str = "iris"
     vehicle: Vehicle = IRIS

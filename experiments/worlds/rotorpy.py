@@ -153,12 +153,7 @@ def advance(c: Constants, x, speeds, command, t: Scalar):
 
 @dataclass(frozen=True, eq=False)
 class RotorPy:
-    """A vehicle of RotorPy; see `World`.
-
-    Attributes:
-        name: label in reports.
-        nominal: its constants before a change.
-    """
+    """A vehicle of RotorPy, with nominal constants before a change; see `World`."""
 
     name: str
     nominal: Constants
@@ -171,7 +166,6 @@ class RotorPy:
         return _vehicle(self.name, self.truth(change))
 
     def truth(self, change: str) -> Constants:
-        """Return the constants after one of `CHANGES`."""
         c, (ix, iy, iz) = self.nominal, self.nominal.inertia
         arm = float(np.abs(c.rotors).max())
         load = loaded(self.vehicle, 0.2 * c.mass, (0.2 * arm, 0.15 * arm, -0.25 * arm))

@@ -15,7 +15,6 @@ CASE = "world", "change", "flight"
 
 
 def _cases(rows: Results) -> dict[tuple, Results]:
-    """Return the cases of `hj.adapt`, the worst first."""
     cases = rows.where(method=AUTO).group(*CASE)
     return dict(sorted(cases.items(), key=lambda case: -case[1].numbers("ratio").max()))
 
@@ -26,7 +25,6 @@ def _sound(own: Results) -> bool:
 
 
 def ratio_table(rows: Results) -> Table:
-    """Return a line for each case, the worst first."""
     lines = []
     for case, own in _cases(rows).items():
         ratio, taken = own.numbers("ratio"), [row["chosen"] for row in own]
@@ -38,7 +36,6 @@ def ratio_table(rows: Results) -> Table:
 
 
 def conclusion(rows: Results) -> list[str]:
-    """Summarise how often the law is true, and its worst case."""
     cases = _cases(rows)
     worst, own = next(iter(cases.items()))
     return [
@@ -49,7 +46,6 @@ def conclusion(rows: Results) -> list[str]:
 
 
 def known(rows: Results, column: str) -> np.ndarray:
-    """Return the available numbers of a column."""
     return np.array([row[column] for row in rows if row[column] is not None], float)
 
 

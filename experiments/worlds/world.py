@@ -98,7 +98,6 @@ class World(Protocol):
 
 
 def draw_reference(key: PRNGKeyArray, kind: Kind, steps: int) -> Reference:
-    """Draw a reference of so many decisions."""
     shares = jax.random.uniform(key, (2, TONES, 4))
     omega = 2 * jnp.pi * (kind.slowest + (kind.fastest - kind.slowest) * shares[0])
     size = np.sqrt(2 / TONES) * kind.acceleration * np.array([1.0, 1.0, 0.5, 0.0]) / omega**2
@@ -112,7 +111,6 @@ def draw_reference(key: PRNGKeyArray, kind: Kind, steps: int) -> Reference:
 
 
 def starting_state(reference: Reference) -> Float[Array, "13"]:
-    """Start on the reference, level."""
     level = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), reference.heading[0])
     return jnp.concatenate([reference.position[0], level, reference.velocity[0], jnp.zeros(3)])
 
@@ -132,13 +130,7 @@ def logged(
 ) -> Trajectories:
     """Return consecutive windows of `steps` intervals of the logs of all flights.
 
-    Args:
-        flights: the truth.
-        key: of the noise.
-        steps: intervals of a window.
-        noise: of the sensors, 1 is typical; 0 gives the truth.
-        averaged: whether rotor speeds are means over an interval, or sampled at its start.
-        burst: whether some samples of each flight are outliers.
+    `noise` 1 is typical, 0 gives the truth; rotor speeds are `averaged` or sampled; a `burst` is some outliers.
     """
 
     def with_noise(states: np.ndarray, level: float, key: PRNGKeyArray) -> np.ndarray:

@@ -290,7 +290,6 @@ _mse = jit_with(FAST_COMPILE)(rollout_mse)
 
 
 def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[str, Any]:
-    """Return the attributes of `Adaptation` that describe the choice and the expected errors."""
     seconds = windows.horizon * windows.dt
     chain = seconds * longest_chain(windows, len(choice.ends))
     return {
@@ -324,7 +323,6 @@ def _split(windows: Trajectories, validation: Trajectories | None, needed: bool)
 
 
 def _size(field: AbstractVectorField) -> int:
-    """Count the parameters of the physics, without a disturbance."""
     physics = physics_of(without_disturbance(field))
     return sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(physics, trainable(physics))))
 
@@ -337,7 +335,6 @@ def _parameters(
     without: str | None,
     choice: Choice | None,
 ) -> dict[str, Any]:
-    """Return the attributes of `Adaptation` about the parameters, with the reason if there are no intervals."""
     if not 0 < _size(field) <= NAMED:
         return {"parameters": {}, "without_intervals": NOT_LEAST_SQUARES}
     own = physics_of(without_disturbance(field))

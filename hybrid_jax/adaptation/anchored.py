@@ -52,13 +52,7 @@ def fit_anchored(
     error: Float[Array, ""],
     blocks,
 ) -> Anchored:
-    """Compute the step for each penalty and choose the best.
-
-    Args:
-        starts: of the windows, see `smoothed`, and the variance of one error from noise.
-        error: sum of squares of the source's own error without any change, see `Unchanged`.
-        blocks: of windows, see `blocks_of`.
-    """
+    """Compute the step for each penalty and choose the best; `error` is the source's own, see `Unchanged`."""
     weights, _ = weights_of(field)
     smooth, weigh = from_starts(windows, starts)
 
@@ -108,7 +102,6 @@ def fit_anchored(
 
 
 def with_change(field: AbstractVectorField, change: Float[Array, " w"]) -> AbstractVectorField:
-    """Add a change to the weights of a field's network."""
     weights, unravel = weights_of(field)
     return eqx.tree_at(lambda hybrid: hybrid.residual, field, unravel(weights + change))
 

@@ -153,7 +153,6 @@ class Auto(Method):
 def _judge(
     field, larger, train: Trajectories, around: Fit, every: Fit, own: Fit | None, learned_from, sizes, solver, scale
 ) -> tuple[Posterior, Float[Array, ""]]:
-    """Compute the candidates' probabilities around one fit and a fit of everything, and the source's own error."""
     start, free = ravel_parameters(larger)[0], np.stack([*free_parameters(larger).values()])
     if own is None:
         return posterior(around, every, start, free, sizes, jnp.zeros_like(start)), jnp.zeros(())
@@ -206,18 +205,15 @@ _fit_each, _judged, _concluded = _compiled(fit_each), _compiled(_judge), _compil
 
 
 def at(fits: Fit, index: Int[Array, ""] | int) -> Fit:
-    """Select one of several fits."""
     return jax.tree.map(lambda leaf: leaf[index], fits)
 
 
 def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
-    """Select between two trees of the same structure."""
     arrays, rest = eqx.partition(other, eqx.is_array)
     return eqx.combine(jax.tree.map(partial(jnp.where, which), eqx.filter(one, eqx.is_array), arrays), rest)
 
 
 def network_effect(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> Float[Array, ""]:
-    """Sum the squares of the network's effect on the predictions, over scale."""
     fields = field, without_network(field)
     errors = [
         jax.lax.map(lambda w, f=f: prediction_errors(f, w, solver, scale), windows, batch_size=64) for f in fields
@@ -226,13 +222,11 @@ def network_effect(field: AbstractVectorField, windows: Trajectories, solver: So
 
 
 def without_network(field: AbstractVectorField) -> AbstractVectorField:
-    """Return the field with a zero network of the same structure."""
     weights, unravel = weights_of(field)
     return eqx.tree_at(lambda hybrid: hybrid.residual, field, unravel(jnp.zeros_like(weights)))
 
 
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:
-    """Build a candidate's field from the extended source."""
     adapted = ravel_parameters(larger)[1](choice.theta[index])
     return adapted if choice.change is None else with_change(adapted, choice.change[index])  # type: ignore
 

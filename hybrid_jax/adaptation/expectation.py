@@ -17,12 +17,7 @@ def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, f
     """Return the RMSE at the end of single and of joined windows, with an 80 % prediction interval for an equal flight.
 
     The interval (Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7) uses Student's t for the logarithm of the mean
-    square over blocks.
-
-    Args:
-        squares: for each block the mean squared error of each state at the end of single and of joined windows.
-        seconds: durations of these windows.
-        space: state space.
+    `squares` over blocks; `seconds` are the durations of the windows.
     """
     blocks = len(squares)
     reach = scipy.special.stdtrit(blocks - 1, (1 + LEVEL) / 2) * np.sqrt(2 * ALIKE / blocks) if blocks > 1 else np.inf
@@ -40,8 +35,6 @@ def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, f
 
 
 def lines_of(expected: Expected, units: Mapping[str, str]) -> list[str]:
-    """Format a line for each horizon."""
-
     def text(name: str, value: float, low: float, high: float) -> str:
         return f"{name} {value:.3g} ({low:.2g} to {high:.2g}) {units[name]}".rstrip()
 

@@ -69,7 +69,6 @@ class Plausible:
 
 
 def groups_of(names: Sequence[str]) -> list[str]:
-    """Return the group of each parameter of an extended field, by its name."""
     steady = {name for name in names if name.startswith("disturbance[")}
     groups = GROUPS if steady <= GROUPS.keys() else GROUPS | dict.fromkeys(steady, "disturbance")
     return [groups.get(name, groups.get(name.split("[")[0], "theta")) for name in names]

@@ -68,7 +68,6 @@ def combined(
 
 
 def _estimates(result: Adaptation) -> dict[str, tuple[float, float]]:
-    """Return each parameter in the physics' own parametrisation, and its variance."""
     theta, _ = ravel_parameters(result.field)
     assert result.covariance is not None
     pairs = zip(theta.tolist(), np.diag(result.covariance).tolist(), strict=True)
@@ -76,6 +75,5 @@ def _estimates(result: Adaptation) -> dict[str, tuple[float, float]]:
 
 
 def _at(result: Adaptation, name: str, value: float) -> float:
-    """Convert a number from the physics' own parametrisation to the units of the report."""
     theta, unravel = ravel_parameters(result.field)
     return float(named_parameters(unravel(theta.at[[*result.parameters].index(name)].set(value)))[name])

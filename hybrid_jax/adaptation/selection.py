@@ -56,7 +56,6 @@ class Fit(NamedTuple):
     converged: Bool[Array, ""]
 
     def at(self, theta: Float[Array, " p"]) -> NormalEquations:
-        """Return the equations at other parameters."""
         (gram, score, square), move = self.equations, theta - self.theta
         return NormalEquations(gram, score + gram @ move, square + (2 * score + gram @ move) @ move)
 
@@ -86,12 +85,7 @@ def fit_each(
 
 
 class Unchanged(NamedTuple):
-    """What windows show without any change.
-
-    Attributes:
-        apparent: variance of the apparent change of each parameter (p,).
-        error: sum over the windows of the source's squared errors, over scale, that they may share.
-    """
+    """Without any change: the `apparent` variance of each parameter, and the summed squared `error` over scale."""
 
     apparent: Float[Array, " p"]
     error: Float[Array, ""]
@@ -138,15 +132,9 @@ class Posterior(NamedTuple):
 
 
 def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array, " p"]) -> Posterior:
-    """Compare candidates by the squared errors around one of them.
+    """Compare candidates by the squared errors around one fit; `sizes` and `apparent` are the prior of the changes.
 
-    Args:
-        around: its fit.
-        every: a fit of everything.
-        start: the source's parameters (p,).
-        free: which of them each candidate changes (c, p).
-        sizes: prior standard deviations; if infinite, the variance is what one window determines.
-        apparent: variance of the apparent changes without any change.
+    A parameter with an infinite size has the variance that one window determines.
     """
     variance = dispersion(every, sizes)  # what remains where everything may change
     information = jnp.sum(around.equations.gram, axis=0) / variance
@@ -254,7 +242,6 @@ def _follow(starts: Float[np.ndarray, "n d"], ends: Float[np.ndarray, "n d"]) ->
 
 
 def overlap(windows: Trajectories) -> bool:
-    """Whether a window begins inside the previous one."""
     return bool((np.asarray(windows.x0)[1:, None] == np.asarray(windows.x)[:-1, :-1]).all(axis=-1).any())
 
 

@@ -53,15 +53,7 @@ def move(equations: NormalEquations, p: int, damping: Float[Array, ""], free: Bo
 
 
 class End(NamedTuple):
-    """The end of a search.
-
-    Attributes:
-        theta: the parameters (p).
-        own: the unknowns of each piece.
-        equations: normal equations there.
-        steps: of Levenberg–Marquardt.
-        status: how it ended.
-    """
+    """The end of a search: θ, the unknowns of each piece, and their normal equations."""
 
     theta: Float[Array, " p"]
     own: Float[Array, "n s"]
@@ -80,16 +72,9 @@ def descend(
     max_steps: int = 50,
     tolerance: float = 1e-6,
 ) -> End:
-    """Minimise the cost over the parameters and the pieces' own unknowns.
+    """Minimise the cost over θ and the pieces' own unknowns, by Levenberg–Marquardt.
 
-    Args:
-        equations: normal equations of θ and the own unknowns.
-        theta: initial parameters.
-        own: initial own unknowns.
-        free: the parameters to fit, by default all.
-        least: parameters with no more information than this, after elimination, stay fixed.
-        max_steps: of Levenberg–Marquardt.
-        tolerance: a step that lowers the cost by a smaller share is slow.
+    Parameters that are not `free`, or with information of at most `least` after elimination, do not change.
     """
     moves = jnp.ones(len(theta), bool) if free is None else jnp.asarray(free)
 
@@ -113,10 +98,7 @@ def covariance(
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "n s"]]:
     """Return the covariance of θ, and the variances of the own unknowns; infinite if not identifiable.
 
-    Args:
-        equations: at the minimum.
-        p: the number of parameters.
-        meat: covariance of each piece's score (a sandwich; White 1980), by default its Gram matrix.
+    `meat` is the covariance of each piece's score (a sandwich; White 1980), by default its Gram matrix.
     """
     gram = np.asarray(equations.gram)
     meat = gram if meat is None else meat

@@ -107,7 +107,6 @@ def solver_errors(solver: Solver) -> Iterator[None]:
 
 
 def warn_of_steps(discretisation: float, remedy: str) -> None:
-    """Warn if half the solver's step would give other parameters."""
     if discretisation > COARSE:
         errors = f"{discretisation:.2g} standard errors"
         warnings.warn(f"half the solver's step would move a parameter by {errors}: give {remedy}", stacklevel=3)
@@ -138,7 +137,6 @@ def _fit_and_compare(field: AbstractVectorField, windows: Trajectories, solver: 
 
 
 def _linearised(errors: Callable[[Theta, Trajectories], Array], theta: Theta, windows: Trajectories):
-    """Return the Jacobian of all windows' errors, and the errors."""
     return jax.jacfwd(lambda theta: 2 * (jax.vmap(partial(errors, theta))(windows),), has_aux=True)(theta)
 
 

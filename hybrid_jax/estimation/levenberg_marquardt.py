@@ -66,13 +66,7 @@ def begin(point: PyTree, found: PyTree, damping: float = DAMPING) -> State:
 
 
 def judged(state: State, cost: Float[Array, ""], tolerance: float = 0.0) -> tuple[Bool[Array, ""], State]:
-    """Accept or reject the point that was tried, and update the damping as a trust region (Gould et al. 2005).
-
-    Args:
-        state: with the point that was tried.
-        cost: the sum of squares there.
-        tolerance: a step that lowers the cost by a smaller share is slow.
-    """
+    """Accept or reject the point that was tried, and update the damping as a trust region (Gould et al. 2005)."""
     first, change = state.steps == 0, cost - state.cost
     accepted = first | (change <= -0.01 * state.expected) | (state.last & jnp.isfinite(change))
     good = ~first & (change < -0.99 * state.expected)
@@ -122,7 +116,6 @@ def minimise(
 
 
 def in_python(goes_on: Callable[[State], Bool[Array, ""]], step: Callable[[State], State], state: State) -> State:
-    """Run `jax.lax.while_loop` one step at a time."""
     while goes_on(state):
         state = step(state)
     return state

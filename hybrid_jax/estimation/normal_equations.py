@@ -68,7 +68,6 @@ def normal_equations(
 def equations_of(
     jacobian: Float[Array, "t d p"], r: Float[Array, "t d"], error: ErrorLoss | None = None
 ) -> NormalEquations:
-    """Return the normal equations of one window, from its errors and their Jacobian."""
     bent, slope = jacobian, r  # half the curvature of the square times J, half its slope
     if error is not None:
         bent = jnp.einsum("tde,tep->tdp", jax.vmap(jax.hessian(error))(r), jacobian)

@@ -66,7 +66,6 @@ class Search(NamedTuple):
 
     @property
     def still(self) -> Float[Array, "r q"]:
-        """Return zero changes of all nodes."""
         return jnp.zeros((len(self.centres), self.centres.shape[1] * self.problem.model.space.tangent_size))
 
     def model(self, theta) -> Model:
@@ -106,7 +105,6 @@ class Search(NamedTuple):
         return NormalEquations(*map(jnp.asarray, total))
 
     def predicted(self, theta, own) -> Predicted:
-        """Simulate each record, or each segment from its node."""
         model, nodes = self.model(theta), self.nodes(own)[0]
         if self.off is None:
             return shooting.simulated(self.problem, model, nodes[:, 0], self.segments)

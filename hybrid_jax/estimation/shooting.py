@@ -47,7 +47,6 @@ class Segments(NamedTuple):
 
 
 def cut(records: list[Gridded], steps: int) -> Segments:
-    """Cut all records into segments of `steps` intervals."""
     most = max(-(-len(each.u) // steps) for each in records)
     parts = [_cut(each, steps, most) for each in records]
     widest = {name: max(part.there[name].shape[-1] for part in parts) for name in records[0].y}
@@ -143,7 +142,6 @@ class Predicted(NamedTuple):
 
 
 def predicted(problem: Problem, model: Model, x0, segment: Segments) -> Predicted:
-    """Predict a segment; errors are zero where nothing was measured."""
     segment = segment._replace(index=jax.tree.map(jnp.asarray, segment.index))
     states, u = states_of(problem, model, x0, segment)
     y, errors = outputs_of(model, states, u, segment, problem.dt), {}
@@ -200,8 +198,6 @@ def simulation(problem: Problem, theta, starts: Float[Array, "r d"], charts: Flo
 
 @eqx.filter_jit
 def simulated(problem: Problem, model: Model, starts, segments: Segments) -> Predicted:
-    """Predict every segment, in one simulation of each record."""
-
     def step(x, segment):
         found = predicted(problem, model, x, segment)
         return found.states[-1], found

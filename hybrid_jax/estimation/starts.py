@@ -43,14 +43,7 @@ class Starts(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Normal equations of the start of adjacent windows, from their errors.
-
-    Attributes:
-        effect: derivative of the last state with respect to the start.
-        gram: AᵀA, with A the derivative of all states.
-        score: Aᵀr, with r the errors.
-        square: rᵀr.
-    """
+    """Normal equations of the start of adjacent windows, and its `effect` on the last state."""
 
     effect: Float[Array, "d d"]
     gram: Float[Array, "d d"]
@@ -59,7 +52,6 @@ class Sums(NamedTuple):
 
     @staticmethod
     def of(jump: Float[Array, " d"], trust: Float[Array, ""]) -> "Sums":
-        """From only the measured start."""
         one, trust = jnp.eye(len(jump), dtype=jump.dtype), trust.astype(jump.dtype)
         return Sums(one, trust * one, trust * jump, trust * jump @ jump)
 
@@ -70,12 +62,10 @@ class Sums(NamedTuple):
         return Sums(rows[-1], self.gram + flat.T @ flat, self.score + flat.T @ r, self.square + r @ r)
 
     def unexplained(self) -> Float[Array, ""]:
-        """Return the residual sum of squares."""
         return jnp.maximum(self.square - self.score @ solve(self.gram, self.score), 0.0)
 
 
 def unknown_starts(windows: Trajectories) -> Starts:
-    """Return the measured starts, without any effect."""
     t, d = windows.x.shape[1:]
     n, x0 = len(windows), jnp.asarray(windows.x0)
     return Starts(
@@ -127,7 +117,6 @@ def smoothed(
 
 
 def _unexplained(rows: Float[Array, "t d k"], r: Float[Array, "t d"]) -> Float[Array, ""]:
-    """Return the residual sum of squares of r after regression on the rows."""
     flat = rows.reshape(-1, rows.shape[-1])
     gram = flat.T @ flat
     damped = gram + 1e-6 * jnp.diag(jnp.diagonal(gram) + 1e-6)

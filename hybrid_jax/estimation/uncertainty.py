@@ -180,7 +180,6 @@ def intervals(
 
 
 def check_level(level: float) -> None:
-    """Raise unless a confidence level is between 0 and 1."""
     if not 0 < (checks.real(level) or 0) < 1:
         raise ValueError(f"level must be between 0 and 1, got {checks.short_repr(level)}")
 

@@ -64,13 +64,11 @@ def sizes_of(field: Any, state_size: Size, input_size: Size) -> tuple[int, int]:
 
 
 def vehicle_in(field: Any) -> Vehicle | None:
-    """Return the vehicle of a field or of its parts."""
     vehicles = (getattr(part, "vehicle", None) for part in _parts(field))
     return next((one for one in vehicles if isinstance(one, Vehicle)), None)
 
 
 def _known_sizes(tree: Any) -> tuple[int, int] | None:
-    """Return the sizes of the outermost module in a tree that has them."""
     for part in _parts(tree):
         if isinstance(vehicle := getattr(part, "vehicle", None), Vehicle):
             return STATE_SIZE, vehicle.rotors
@@ -80,7 +78,6 @@ def _known_sizes(tree: Any) -> tuple[int, int] | None:
 
 
 def _parts(tree: Any) -> Iterator[Any]:
-    """Yield a tree and all trees in it, each before its own parts."""
     yield tree
     for child in jax.tree.leaves(tree, is_leaf=lambda node: node is not tree):
         if child is not tree:

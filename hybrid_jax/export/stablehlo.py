@@ -162,7 +162,6 @@ def _check_calls(exported: jax.export.Exported) -> None:
 
 
 def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int]:
-    """Return (batched, d, m) of a program (x, u) → ẋ or x⁺."""
     (x, u), (result,) = exported.in_avals, exported.out_avals
     batched, d, m = len(x.shape) == 2, x.shape[-1], u.shape[-1]
     batch = (BATCH,) if batched else ()

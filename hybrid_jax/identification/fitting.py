@@ -136,7 +136,6 @@ def identify(
 def _search(
     field, recordings: Sequence[Recording], layout: Layout, measured: Sequence[str], most: int
 ) -> tuple[Search, Windows, Float[np.ndarray, "m k"]]:
-    """Return the windows of recordings, in double precision, and the quantities to compare."""
     physics = physics_of(field)
     commanded = isinstance(physics, Actuated)
     if volts := commanded and physics.reads_voltage:
@@ -225,7 +224,6 @@ def _telling(equations: NormalEquations, p: int, most: int, moves) -> Int[np.nda
 
 
 def _whitened(search: Search, theta, own, between, root) -> Search:
-    """Weight the search's errors by the possible effect of commands between their samples."""
     segments, (scale, dt) = search.segments._replace(whitening=None), (search.problem.scale, search.problem.dt)
     ways = slow_commands.bridges(between, dt * np.arange(segments.u.shape[2] + 1), root)
     r, along = effects(search.problem, search.model(theta), search.nodes(own)[0][:, 0], segments, ways)
@@ -263,7 +261,6 @@ def _widened(name: str, interval: Interval, shares) -> Interval:
 
 
 def _names(field) -> list[tuple[str, str]]:
-    """Return for each number of θ its parameter and its own name."""
     physics = physics_of(field)
     leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(physics, trainable(physics)))[0]
     named = [(jax.tree_util.keystr(path[-1:], simple=True), leaf.size) for path, leaf in leaves]

@@ -52,7 +52,6 @@ class Multirotor(eqx.Module):
 
     @property
     def rotor_states(self) -> int:
-        """The number of rotor states after those of the body."""
         body = self.field.field
         return body.rotor_states if isinstance(body, Actuated) else 0
 

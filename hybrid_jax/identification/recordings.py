@@ -78,14 +78,8 @@ def cut(
 ) -> tuple[Windows, dict[str, tuple[int, ...]], Float[np.ndarray, "m k"]]:
     """Return windows in flight without gaps, the compared axes, and the root of `slow_commands`.
 
-    Args:
-        told: the quantity that is the field's input, "command" or "rotor_speed".
-        measured: quantities to compare, by default all of `MEASURED` that every recording has, but for the input.
-        most: windows at most, spread evenly.
-        volts: whether the battery's voltage is the last input.
-
-    Raises:
-        ValueError: a recording lacks a quantity, or no window is left, with name and what was expected.
+    `told` is the input, "command" or "rotor_speed", whose last channel may be `volts`. ValueError if a recording lacks
+    a quantity or no window is left.
     """
     found = [name for name in MEASURED if name != told and all(name in each.signals for each in recordings)]
     names = tuple(measured) or tuple(found)
@@ -148,7 +142,6 @@ def _windows(recording: Recording, layout: Layout, told: str, names, starts, mos
 
 
 def _clear(recording: Recording, told: str, names, begin, end) -> Bool[np.ndarray, " n"]:
-    """Whether each span is in flight and without gaps."""
     flights = airborne(recording, told)
     clear = np.any([(begin >= first) & (end <= last) for first, last in flights] or [np.zeros(len(begin))], axis=0)
     for name in (told, *names):
@@ -184,11 +177,10 @@ def on_grid(signal: Signal, t: Float[np.ndarray, "n t"], dt: float):
 def initial_states(
     recording: Recording, starts: Float[np.ndarray, " n"], layout: Layout
 ) -> tuple[Float[np.ndarray, "n 13"], Float[np.ndarray, "n 12"]]:
-    """Estimate the state at each time, and the standard deviations of its error, from samples up to that time.
+    """Fit a quadratic to the samples up to each time; return the states and their standard deviations.
 
-    A quadratic is fitted to the samples of `layout.span` before it; unmeasured velocity and rates are the slopes of
-    position and attitude. Other unmeasured states are zero with the deviations of `UNKNOWN`; unknown position and
-    heading are exact by choice of the origin.
+    Unmeasured velocity and rates are the slopes of position and attitude; other unmeasured states are zero with the
+    deviations of `UNKNOWN`; unknown position and heading are exact by choice of the origin.
     """
     n, signals = len(starts), recording.signals
     x, spread = np.zeros((n, STATE_SIZE)), np.zeros((n, RIGID_BODY_SPACE.tangent_size))
@@ -224,10 +216,7 @@ def _rotation(q) -> "scipy.spatial.transform.Rotation":
 def fitted(signal: Signal, starts: Float[np.ndarray, " n"], layout: Layout, numbers: Callable | None = None):
     """Fit a quadratic to the last samples: value (n, k), its standard deviation (k), slope and its deviation.
 
-    They are the samples of `layout.span`, at least six, or all if there are fewer.
-
-    Args:
-        numbers: converts a slice of the signal to samples (s, k), by default their values.
+    They are the samples of `layout.span`, at least six, or all if there are fewer; `numbers` converts them.
     """
     found = []
     for t in starts:

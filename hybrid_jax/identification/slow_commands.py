@@ -48,14 +48,7 @@ def whitened(
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, "n r r"]]:
     """Return the noise of each channel without the bridges, and the whitening W of each window: Wᵀ W = (1 + B Bᵀ)⁻¹.
 
-    Errors and B are in units of the noise there, which is found by expectation maximisation (Dempster, Laird and Rubin
-    1977).
-
-    Args:
-        r: the errors of n windows.
-        effects: ∂r/∂ξ.
-        there: which were measured.
-        channel: the sensor's channel of each error.
+    Errors `r` and B = `effects` are in units of the noise, which is found by expectation maximisation.
     """
     noise = np.ones(channel.max() + 1)
     precision, counts = _precision(effects, noise[channel]), np.bincount(channel, there.sum(axis=0))

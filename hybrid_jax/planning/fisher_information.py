@@ -39,13 +39,9 @@ def information_of(
     noise: Float[Array, " d"],
     solver: Solver = None,
 ) -> Information:
-    """Return the information in a trajectory, cut into windows of `steps` intervals; the remainder is not used.
+    """Return the information in true states x every `dt` [s], cut into windows of `steps` intervals.
 
     Each window is a rollout from its first sample, whose noise acts on the whole window and on the previous one.
-
-    Args:
-        x: the true states, one before each interval of `dt` [s] and one after the last.
-        noise: standard deviation of the white noise on each state.
     """
     count = len(u) // steps
     starts, inputs = x[: count * steps : steps], u[: count * steps].reshape(count, steps, -1)

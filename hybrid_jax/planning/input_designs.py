@@ -233,13 +233,11 @@ class InputSeries(eqx.Module):
         return inputs
 
     def trajectory(self, coefficients: Coefficients, model: AbstractVectorField) -> Trajectory:
-        """Return the inputs in the middle of each interval, and the predicted states."""
         middles = self.dt * (jnp.arange(round(self.seconds / self.dt)) + 0.5)
         u, start = jax.vmap(self.path(coefficients))(middles), jnp.asarray(self.bounds.start, float)
         return jnp.concatenate([start[None], rollout(model, start, u, self.dt)]), u
 
     def uses(self, x: Float[Array, "n+1 d"], u: Float[Array, "n m"]) -> Float[Array, "n limits"]:
-        """Return the used fraction of each state's box over time."""
         if self.bounds.state_low is None or self.bounds.state_high is None:
             return jnp.zeros((len(u), 0), x.dtype)
         low, high = np.array(self.bounds.state_low), np.array(self.bounds.state_high)

@@ -147,7 +147,6 @@ class _Search(eqx.Module):
         return information_of(self.model, x, u, self.design.dt, self.window, self.noise)
 
     def value(self, x, u, asked: Bool[Array, " p"], seen: Bool[Array, " p"]) -> Float[Array, ""]:
-        """Return log det of the inverse covariance of the requested parameters, over their number."""
         covariance = self.information(x, u).covariance(seen)
         size = jnp.sqrt(jnp.where(asked, jnp.diagonal(covariance), 1.0))
         scaled = jnp.where(asked & asked[:, None], covariance / (size * size[:, None]), jnp.eye(len(size)))
@@ -155,8 +154,6 @@ class _Search(eqx.Module):
 
     @eqx.filter_jit
     def kept(self, coefficients: Coefficients) -> Coefficients:
-        """Shrink the series into the limits."""
-
         def keeps(factor):
             uses = self.design.uses(*self.planned(factor * coefficients))
             return (uses <= SPARE).all()
@@ -177,8 +174,6 @@ class _Search(eqx.Module):
     # Equinox passes the options to jax.jit, but does not declare them.
     @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
     def improved(self, begun: Starts, asked, seen, steps: int) -> Starts:
-        """Improve the series by some steps of Adam."""
-
         def loss(coefficients, penalty):
             x, u = self.planned(coefficients)
             excess = jnp.maximum(self.design.uses(x, u) - SPARE, 0.0)

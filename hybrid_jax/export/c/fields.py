@@ -80,14 +80,12 @@ def export_c(
 
 
 def check_name(name: str) -> None:
-    """Raise ValueError if C files and functions cannot have this name."""
     # math.h is the one header that a source includes.
     if not isinstance(name, str) or not re.fullmatch("[a-z][a-z0-9_]*", name) or name == "math":
         raise ValueError(f"name must be a lower-case C identifier, got {checks.short_repr(name)}")
 
 
 def written(folder: str | Path, name: str, header: str, source: str, parts: Mapping[str, Any]) -> tuple[Path, Path]:
-    """Write NAME.h and NAME.c, from templates and their parts, and return their paths."""
     paths = Path(folder) / f"{name}.h", Path(folder) / f"{name}.c"
     for path, template in zip(paths, (header, source), strict=True):
         write_atomic(path, Template(template).substitute(parts, name=name, NAME=name.upper()))
@@ -95,7 +93,6 @@ def written(folder: str | Path, name: str, header: str, source: str, parts: Mapp
 
 
 def _with_slopes(field: AbstractVectorField, x, u):
-    """Return ẋ and its Jacobian in x and u (d × (d + m))."""
     directions = jnp.eye(len(x) + len(u))
     return as_field(field).linearize(x, u, directions[: len(x)], directions[len(x) :])
 
@@ -112,7 +109,6 @@ def body_of(
 
 
 def _about(is_multirotor: bool, smooth: float | None) -> str:
-    """Describe x and u as lines of a comment."""
     lines = []
     if is_multirotor:
         lines = [
