@@ -31,8 +31,8 @@ def not_traced(name: str, *arguments: Any) -> None:
     """Raise TypeError inside `jax.jit`, `jax.vmap` or `jax.grad`, for functions that branch on values."""
     if any(map(is_traced, jax.tree.leaves(arguments))):
         raise TypeError(
-            f"{name} cannot be called under jax.jit, jax.vmap or jax.grad, as it decides by numbers; "
-            "call it as it is, or hybrid_jax.sweep.sweep for many seeds, fields or sets of windows at once"
+            f"{name} cannot be called under jax.jit, jax.vmap or jax.grad, as it branches on values; "
+            "call it outside, or use hybrid_jax.sweep.sweep for many seeds, fields or sets of windows at once"
         )
 
 
@@ -171,5 +171,5 @@ def first_line(error: BaseException) -> str:
 def content_of(path: str | Path) -> bytes:
     """The bytes of a regular file; OSError for others, since a pipe or a device may never end."""
     if Path(path).exists() and not Path(path).is_file():
-        raise OSError(errno.EINVAL, "is no regular file")
+        raise OSError(errno.EINVAL, "is not a regular file")
     return Path(path).read_bytes()

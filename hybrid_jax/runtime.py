@@ -72,8 +72,8 @@ def configure(folder: Path | None = None) -> None:
         jax.config.update("jax_num_cpu_devices", cores())
     except RuntimeError:
         warnings.warn(
-            f"JAX has begun, so that its {jax.local_device_count()} device(s) and XLA's options stay as they are; call "
-            "hybrid_jax.runtime.configure() before the first array is made. All else is set.",
+            f"JAX has already started: its {jax.local_device_count()} device(s) and XLA's options stay as they are; "
+            "call hybrid_jax.runtime.configure() before the first array is made. Everything else is set.",
             stacklevel=2,
         )
     jax.config.update("jax_compilation_cache_dir", str(programs))

@@ -68,7 +68,7 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
     if min(n, d, u.shape[1]) == 0:
         raise ValueError(f"{name}: is empty: x0 {x0.shape}, u {u.shape}")
     if isinstance(trajectories.dt, np.ndarray | jax.Array):
-        raise ValueError(f"{name}: dt must be a number and no array, such as float(dt)")
+        raise ValueError(f"{name}: dt must be a number and not an array, such as float(dt)")
     checks.positive(f"{name}: dt", trajectories.dt, "a positive number of seconds")
     for part, array in parts.items():
         checks.finite(f"{name}: {part}", array)
@@ -100,7 +100,7 @@ def check_like(trajectories: Trajectories, windows: Trajectories, name: str, dt:
         if found != expected:
             raise ValueError(f"{name}: {axis} of {expected} numbers expected, as in the other windows, got {found}")
     if dt and not math.isclose(trajectories.dt, windows.dt, rel_tol=SAME):
-        raise ValueError(f"{name}: dt must be {windows.dt}, as of the other windows, got {trajectories.dt}")
+        raise ValueError(f"{name}: dt must be {windows.dt}, as in the other windows, got {trajectories.dt}")
 
 
 def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:

@@ -44,7 +44,7 @@ devices = len(jax.devices())
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     configure()
-assert "JAX has begun" in str(caught[-1].message)
+assert "JAX has already started" in str(caught[-1].message)
 print(devices == len(jax.devices()), jax.config.jax_persistent_cache_min_compile_time_secs == 0)
 """
 FORK = """

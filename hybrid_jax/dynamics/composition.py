@@ -172,8 +172,8 @@ def check_batch_norm(
     """Raise ValueError for a BatchNorm that is not evaluated at x and u, or is hidden from differentiation."""
     if _is_wrapped(field) and not all(all(count.tolist()) for count, *_ in moments_of(field, x, u)):
         raise ValueError(
-            f"field: {type(field).__name__} holds a BatchNorm whose minibatch statistics cannot be recorded, as under "
-            "stop_gradient or jax.grad; use norm='layer' or 'none', or wrap it in Frozen"
+            f"field: {type(field).__name__} contains a BatchNorm whose minibatch statistics cannot be recorded, "
+            "e.g. in stop_gradient or jax.grad; use norm='layer' or 'none', or wrap it in Frozen"
         )
 
 

@@ -69,7 +69,7 @@ def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
     if {"k", "k_rotors"} <= set(learn):
         raise ValueError("learn must not name both k and k_rotors: a factor common to all rotors is in both")
     if "mass" in learn and (other := {"k", "k_rotors"} & set(learn)):
-        raise ValueError(f"learn must not name both mass and {other.pop()}: accelerations tell their ratio")
+        raise ValueError(f"learn must not name both mass and {other.pop()}: only their ratio is identifiable")
 
 
 def shape_of(vehicle: Vehicle, name: str) -> tuple[int, ...]:

@@ -125,7 +125,7 @@ def from_numpy(array: np.ndarray, kind: Mapping[str, str]) -> Any:
 def _read_entries(path: Path) -> dict[str, bytes]:
     """The bytes of each entry by name; ValueError for paths outside the folder and for compression."""
     if path.exists() and not path.is_file():
-        raise ValueError("it is no regular file")  # a pipe would be waited for, a device read without end
+        raise ValueError("not a regular file")  # a pipe would be waited for, a device read without end
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             place = PurePosixPath(entry.filename.replace("\\", "/"))
@@ -134,7 +134,7 @@ def _read_entries(path: Path) -> dict[str, bytes]:
             if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size:
                 raise ValueError(f"entry {entry.filename!r} is compressed")
         if sum(entry.file_size for entry in archive.infolist()) > path.stat().st_size:
-            raise ValueError("its entries declare more than the file holds")
+            raise ValueError("its entries declare more than the file contains")
         return {name: archive.read(name) for name in archive.namelist()}  # which verifies the CRC of each
 
 
@@ -142,7 +142,7 @@ def _read_array(name: str, entry: bytes) -> np.ndarray:
     try:
         array = np.lib.format.read_array(io.BytesIO(entry), allow_pickle=False)
     except Exception as error:  # NumPy parses the header as Python, which fails in many ways
-        raise ValueError(f"entry {name!r} is no array: {error}") from error
+        raise ValueError(f"entry {name!r} is not an array: {error}") from error
     if array.dtype.newbyteorder("=") not in NUMERIC:
         raise ValueError(f"entry {name!r} is not numeric")
     return array

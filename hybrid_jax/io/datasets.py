@@ -52,7 +52,7 @@ class Dataset:
             raise ValueError(f"{self.origin}: has no split {split!r}, only {', '.join(self.splits)}")
         windows = self.splits[split]
         if count is not None and not 1 <= count <= len(windows):
-            raise ValueError(f"{self.origin}: {count} windows of split {split!r} asked for, it has {len(windows)}")
+            raise ValueError(f"{self.origin}: {count} windows of split {split!r} requested, but it has {len(windows)}")
         return windows[:count]
 
 

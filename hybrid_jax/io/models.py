@@ -108,7 +108,7 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
         about, tree = dict(metadata["about"]), metadata["field"]
         field = decode(tree, arrays) if like is None else _filled(like, tree, arrays)
         if not isinstance(field, eqx.Module):
-            raise TypeError(f"its field is a {type(field).__name__}")
+            raise TypeError(f"the saved object is a {type(field).__name__}")
         if spoiled := _not_finite(field):
             raise ValueError(spoiled)
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:

@@ -237,7 +237,7 @@ def _require_shapes(name: str, known: Iterable[dataclasses.Field], values: Mappi
             if not isinstance(value, kind.dtype[kind.array_type, f"*others {kind.dim_str}"]):
                 found = f"{value.dtype}{list(value.shape)}" if eqx.is_array(value) else short_repr(value)
                 sizes = ", ".join(kind.dim_str.split())
-                raise ValueError(f"{name}: {key} must be {kind.dtype.__name__}[{sizes}] as the others, got {found}")
+                raise ValueError(f"{name}: {key} must be {kind.dtype.__name__}[{sizes}] like the others, got {found}")
 
 
 def _name_of(value: Any) -> str | None:

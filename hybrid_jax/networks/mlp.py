@@ -123,7 +123,7 @@ class ResidualNetwork(AbstractVectorField):
     def inputs(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
         """z = [x, scaled u]."""
         if len(x) + len(u) != (size := self.weight_in.shape[1]):
-            raise ValueError(f"its weights are for {size} states and inputs, got {len(x)} and {len(u)}")
+            raise ValueError(f"x and u must have {size} entries in total, got {len(x)} and {len(u)}")
         return self.scaling.concatenate(x, u)
 
     def train_batch(self, x, u):

@@ -30,7 +30,7 @@ def _check(inputs: str, outputs: str, vehicle: Vehicle | None) -> None:
     if inputs not in (needed := GO_WITH.get(outputs, tuple(INPUTS))):
         raise ValueError(f"outputs {outputs!r} needs inputs of {' or '.join(needed)}, got {inputs!r}")
     if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
-        raise ValueError(f"{needing[0]!r} needs the vehicle whose rotors feel the ground, got None")
+        raise ValueError(f"{needing[0]!r} needs vehicle=, for the ground effect, got None")
     if vehicle is not None and inputs == "near_ground":
         checks.positive("vehicle.rotor_radius", vehicle.rotor_radius)
 

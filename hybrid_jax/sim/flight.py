@@ -151,7 +151,7 @@ class SplitSpec:
         checks.count("steps", self.steps)
         checks.count("flights", self.flights, least=0)
         if self.flights and (self.windows % self.flights or self.windows * self.steps > self.flights * SECONDS / DT):
-            raise ValueError(f"windows must be as many of each of {self.flights} flights of {SECONDS:g} s")
+            raise ValueError(f"windows must be divided evenly among {self.flights} flights of {SECONDS:g} s")
         if self.steps > round(SECONDS / DT):
             raise ValueError(f"steps must be at most {round(SECONDS / DT)}, a whole flight, got {self.steps}")
 

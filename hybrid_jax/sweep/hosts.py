@@ -55,7 +55,7 @@ def initialize(
             raise
         raise ValueError(f"coordinator, processes, process: {error}") from error
     except RuntimeError as error:
-        raise PeerLost(f"the processes did not find each other: {error}") from error
+        raise PeerLost(f"the processes could not connect: {error}") from error
     # XLA's connections are made here; afterwards the service that arranges them is not needed.
     _require_alike({"devices": jax.local_device_count()} | dict(alike or {}))
     if jax.default_backend() == "cpu":

@@ -47,7 +47,7 @@ class Peers:
                 except (OSError, ValueError):  # a stranger
                     link.close()
         absent = [number for number in range(1, processes) if number not in links]
-        news = f"process {', '.join(map(str, absent))} did not come within {self._timeout:g} s" if absent else ""
+        news = f"process {', '.join(map(str, absent))} did not join within {self._timeout:g} s" if absent else ""
         for link in links.values():
             link.sendall(f"{news}\n".encode())
         if news:
@@ -69,7 +69,7 @@ class Peers:
                 raise
             except OSError:
                 time.sleep(BEAT / 5)
-        raise PeerLost(f"process 0 at {host}:{port} did not come within {self._timeout:g} s")
+        raise PeerLost(f"process 0 at {host}:{port} did not join within {self._timeout:g} s")
 
     def _listen(self) -> None:
         next_beat = 0.0

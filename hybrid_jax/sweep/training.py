@@ -207,4 +207,4 @@ def _check(plans: RunConfig, train: PyTree, validation: PyTree, settings: Settin
         outside = index[(index < 0) | (index >= len(windows))]
         if outside.size:
             words = f"which is not an index of the {len(windows)} windows of {split}"
-            raise ValueError(f"{name} holds {outside[0]}, {words}")
+            raise ValueError(f"{name} contains {outside[0]}, {words}")

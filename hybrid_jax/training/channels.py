@@ -64,7 +64,7 @@ class ChannelLoss(TrajectoryLoss):
 
     def __post_init__(self):
         if not isinstance(self.channels, tuple) or not self.channels:
-            raise ValueError(f"channels must be a tuple of some Channel, got {checks.short_repr(self.channels)}")
+            raise ValueError(f"channels must be a nonempty tuple of Channel, got {checks.short_repr(self.channels)}")
         if self.huber is not None:
             checks.positive("huber", self.huber)
 

@@ -168,12 +168,12 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
     if isinstance(settings.objective, TrajectoryLoss):
         check_callable(field)
     if not any(jax.tree.leaves(trainable(field))):
-        missing = "no array of floating-point numbers; a Python float is none, use jnp.asarray"
+        missing = "no array of floating-point numbers; convert Python floats by jnp.asarray"
         raise ValueError(f"field: {type(field).__name__} has nothing to learn, {missing}")
     for path, leaf in jax.tree_util.tree_leaves_with_path(field):
         if isinstance(leaf, jax.Array) and leaf.shape == () and jnp.issubdtype(leaf.dtype, jnp.integer):
             name = jax.tree_util.keystr(path, simple=True, separator=".")
-            raise ValueError(f"field: {name} is an integer, which is not learned; make it a float, or no array")
+            raise ValueError(f"field: {name} is an integer, which is not learned; make it a float, or a Python int")
     for name, windows in data.items():
         if isinstance(field, AbstractVectorField):
             try:

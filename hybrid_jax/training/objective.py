@@ -146,7 +146,7 @@ def check_minibatch(field: Learner, settings: Settings) -> None:
     """Reject minibatches of one window if a BatchNorm is trained: minus its own mean, a window is a constant."""
     if settings.batch_size < 2 and batch_norms(field):
         size = settings.batch_size
-        raise ValueError(f"settings.batch_size must be at least 2 where the field holds a BatchNorm, got {size}")
+        raise ValueError(f"settings.batch_size must be at least 2 if the field contains a BatchNorm, got {size}")
 
 
 def compiler_options(field: Learner, data: PyTree, settings: Settings) -> dict[str, bool | int]:

@@ -161,7 +161,7 @@ def test_thirteen_states_are_not_taken_for_a_rigid_body():
 
 WIDE = replace(swings(40), u=np.zeros((40, 8, 2), np.float32))
 OTHERS = {
-    "another dt": ("validation", replace(swings(40), dt=0.1), "dt must be 0.05, as of the other windows, got 0.1"),
+    "another dt": ("validation", replace(swings(40), dt=0.1), "dt must be 0.05, as in the other windows, got 0.1"),
     "validation": ("validation", WIDE, "inputs of 1 numbers expected, as in the other windows, got 2"),
     "learned_from": ("learned_from", WIDE, "inputs of 1 numbers expected, as in the other windows, got 2"),
 }

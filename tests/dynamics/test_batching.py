@@ -110,7 +110,7 @@ def test_a_frozen_network_in_a_wrapper_stays_in_inference_mode():
 @pytest.mark.parametrize("how", HIDDEN_FROM_DERIVATIVES)
 def test_statistics_that_cannot_be_recorded_are_refused(how):
     x, u = batch()
-    with pytest.raises(ValueError, match="field: Gain holds a BatchNorm whose minibatch statistics cannot be recorded"):
+    with pytest.raises(ValueError, match="field: Gain contains a BatchNorm whose minibatch statistics cannot be"):
         check_batch_norm(Gain(network(), how=how), x, u[0])
     check_batch_norm(Gain(Frozen(network()), how=how), x, u[0])
 

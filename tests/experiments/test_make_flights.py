@@ -35,7 +35,7 @@ def test_the_first_windows_are_taken_so_that_sizes_are_nested(file):
 @pytest.mark.parametrize(
     ("domain", "splits", "said"),
     [
-        (SOURCE, {"train": SplitSpec(9, 10)}, "9 windows of split 'train' asked for, it has 8"),
+        (SOURCE, {"train": SplitSpec(9, 10)}, "9 windows of split 'train' requested, but it has 8"),
         (SOURCE, {"test": SplitSpec(1, 100)}, "has no split 'test'"),
         (SOURCE, {"train": SplitSpec(3, 20)}, "split 'train' has windows of 10 steps, expected 20"),
         (PARAMETER_SHIFT, {"train": SplitSpec(3, 10)}, 'domain is "source", expected "parameter_shift"'),

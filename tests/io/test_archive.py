@@ -33,7 +33,7 @@ def test_a_header_that_is_none_is_refused_with_the_name_of_the_file(header, tmp_
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(HEADER, json.dumps({"format": "any 1"}))
         archive.writestr("array.npy", npy(header))
-    with pytest.raises(ValueError, match=r"odd\.npz: .* entry 'array.npy' is no array"):
+    with pytest.raises(ValueError, match=r"odd\.npz: .* entry 'array.npy' is not an array"):
         load_archive(path, "any 1")
 
 

@@ -133,7 +133,7 @@ def test_malformed_windows_and_metadata_are_not_saved(tmp_path, dataset):
 def test_subsets_are_nested(file):
     loaded = load_dataset(file)
     np.testing.assert_array_equal(loaded.first("train", 7).x, loaded.first("train").x[:7])
-    with pytest.raises(ValueError, match=r"set\.npz: 21 windows of split 'train' asked for, it has 20"):
+    with pytest.raises(ValueError, match=r"set\.npz: 21 windows of split 'train' requested, but it has 20"):
         loaded.first("train", 21)
     with pytest.raises(ValueError, match="no split 'validation', only"):
         loaded.first("validation")

@@ -121,7 +121,7 @@ def test_near_the_ground_each_rotor_is_as_high_as_in_the_simulator():
 
 @pytest.mark.parametrize("options", [{"inputs": "near_ground"}, {"outputs": "rotors"}], ids=str)
 def test_rotors_of_an_unknown_vehicle_are_refused(options):
-    with pytest.raises(ValueError, match="needs the vehicle whose rotors feel the ground, got None"):
+    with pytest.raises(ValueError, match="needs vehicle=, for the ground effect, got None"):
         make_residual(KEY, **options)
     with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
         view(**options, vehicle=replace(IRIS, rotor_radius=0.0))

@@ -187,7 +187,7 @@ def test_a_stopped_process_is_named_and_the_state_saved(whole, tmp_path):
 def test_a_process_whose_peer_never_comes_says_so(tmp_path):
     options = "--distributed", "--coordinator", address(), "--processes", "2", "--process-id", "0", "--timeout", "2"
     process = experiment(tmp_path / "out", tmp_path / "cache", *options)
-    assert process.communicate(timeout=120)[1] == "param_shift: process 1 did not come within 2 s\n"
+    assert process.communicate(timeout=120)[1] == "param_shift: process 1 did not join within 2 s\n"
     assert process.returncode == 2
 
 

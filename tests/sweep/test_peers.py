@@ -45,10 +45,10 @@ def test_a_result_is_waited_for_and_an_error_of_the_exchange_is_a_lost_peer():
 
 
 def test_who_never_comes_is_named_by_all():
-    assert set(meet(0, 2, timeout=0.5)) == {"process 1 did not come within 0.5 s"}
+    assert set(meet(0, 2, timeout=0.5)) == {"process 1 did not join within 0.5 s"}
     (alone,) = meet(1, timeout=0.5)
     assert alone.startswith("process 0 at 127.0.0.1:")
-    assert alone.endswith("did not come within 0.5 s")
+    assert alone.endswith("did not join within 0.5 s")
 
 
 @pytest.mark.parametrize("victim", [0, 1])

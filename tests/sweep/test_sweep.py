@@ -212,7 +212,7 @@ def test_plans_that_do_not_fit_the_data_are_refused(size):
 def test_subsets_that_point_outside_the_data_are_refused(place, index):
     """A gather would clamp such an index and train on another window in silence."""
     wrong = replace(PLANS[1], subset=PLANS[1].subset.at[place].set(index))
-    with pytest.raises(ValueError, match=f"subset holds {index}"):
+    with pytest.raises(ValueError, match=f"subset contains {index}"):
         swept(starts(), [PLANS[0], wrong, PLANS[2]])
 
 
@@ -223,7 +223,7 @@ def test_runs_stop_by_their_own_validation_windows():
     np.testing.assert_array_equal(parted.best_epoch, alone.best_epoch)
     np.testing.assert_allclose(parted.best_mse, alone.best_mse, rtol=1e-4)  # another program for the same float32 sums
     wrong = replace(own[1], validate_on=own[1].validate_on.at[0].set(20))
-    with pytest.raises(ValueError, match="validate_on holds 20, which is not an index of the 20 windows of validation"):
+    with pytest.raises(ValueError, match="validate_on contains 20, which is not an index of the 20 windows"):
         swept(starts(), [own[0], wrong])
 
 

@@ -44,13 +44,13 @@ class Stiff(AbstractVectorField):
 
 
 SPOILED = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[2, 3, 1].set(jnp.inf))
-NOTHING = "{} has nothing to learn, no array .* a Python float is none, use jnp.asarray$"
+NOTHING = "{} has nothing to learn, no array .* convert Python floats by jnp.asarray$"
 REFUSED = {
     "train": (pendulum(), {"train": SPOILED}, r"train: x\[2, 3, 1\] is not finite"),
     "validation": (pendulum(), {"validation": SPOILED}, r"validation: x\[2, 3, 1\] is not finite"),
     "weight": (pendulum(), {"regulariser_weight": 1.0}, "regulariser_weight is 1.0 but settings.regulariser is None;"),
     "optimiser": (pendulum(), {"optimiser": "adam"}, r"optimiser must be an optax\.GradientTransformation"),
-    "hidden": (Stopped(jnp.ones(()), NETWORK), {}, "field: Stopped holds a BatchNorm whose minibatch statistics"),
+    "hidden": (Stopped(jnp.ones(()), NETWORK), {}, "field: Stopped contains a BatchNorm whose minibatch statistics"),
     "float": (Stiff(1.0), {}, f"field: {NOTHING.format('Stiff')}"),
     "integer": (Hybrid(Stiff(jnp.array(1)), NETWORK), {}, "field: physics.length is an integer, which is not learned;"),
     "frozen": (Frozen(pendulum()), {}, f"field: {NOTHING.format('Frozen')}"),
@@ -62,7 +62,7 @@ REFUSED = {
     "inputs": (
         Hybrid(pendulum(), residual_network(2, 3, KEY)),
         {},
-        "train: field: ResidualNetwork does not take a state .* its weights are for 5 states and inputs, got 2 and 1$",
+        "train: field: ResidualNetwork does not take a state .* x and u must have 5 entries in total, got 2 and 1$",
     ),
     "one output": (
         Hybrid(pendulum(), residual_network(2, 1, KEY, outputs=1)),
@@ -108,7 +108,7 @@ def test_one_window_is_not_normalised_by_itself(alone):
         plan = make_run_config(0.03, jnp.arange(60), 60, 0, 1, 1, 0.0)
         return sweep(stack([start(field, KEY)]), stack([plan]), TRAIN, VALIDATION, Settings(1))
 
-    with pytest.raises(ValueError, match=r"^settings.batch_size must be at least 2 where the field holds a BatchNorm"):
+    with pytest.raises(ValueError, match=r"^settings.batch_size must be at least 2 if the field contains a BatchNorm"):
         train("batch")
     for state in (train("layer"), train("batch", Frozen)):
         assert np.all((state.epochs if alone else state.epoch) == 1)

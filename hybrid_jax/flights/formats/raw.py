@@ -70,7 +70,7 @@ def readable(path: str | Path, unpack: bool = True) -> Iterator[IO[bytes]]:
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
-            raise OSError(0, "is no regular file")  # a pipe or a device may never end
+            raise OSError(0, "is not a regular file")  # a pipe or a device may never end
         with path.open("rb") as plain:
             packed = unpack and plain.read(2) == GZIP
             plain.seek(0)
