@@ -10,11 +10,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax.adaptation.selection import TINY, left_out_steps
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
 from hybrid_jax.estimation.normal_equations import NormalEquations
@@ -109,6 +108,4 @@ def with_change(field: AbstractVectorField, change: Float[Array, " w"]) -> Abstr
 def weights_of(field: AbstractVectorField) -> tuple[Float[Array, " w"], Callable[[Float[Array, " w"]], PyTree]]:
     """Return the network's trainable weights as a vector, and the network as a function of it."""
     assert isinstance(field, Hybrid)
-    learned, rest = eqx.partition(field.residual, trainable(field.residual))
-    weights, unravel = ravel_pytree(learned)
-    return weights, lambda changed: eqx.combine(unravel(changed), rest)
+    return ravel_learned(field.residual)

@@ -11,11 +11,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_learned
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, in_python, minimise, move_of_equations
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
@@ -117,11 +116,10 @@ def fit_gauss_newton(
     ):
         known = ", ".join(PENALTIES)
         raise ValueError(f"penalty must be one of {known}, of a Hybrid, got {penalty!r} of {type(field).__name__}")
-    size = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(field, trainable(field))))
+    size = ravel_learned(field)[0].size
     if not 0 < size <= MOST:
         raise ValueError(f"field: 1 to {MOST} parameters expected for Gauss-Newton, got {size}; use fit")
     field = ready(field, windows)
-    learned, rest = eqx.partition(field, trainable(field))
     rows = None if penalty is None else PENALTIES[penalty]
     if scale is not None:
         scale = checks.floating("scale", scale)
@@ -129,22 +127,21 @@ def fit_gauss_newton(
             raise ValueError(f"scale must be {windows.x0.shape[1:]} positive numbers, got shape {scale.shape}")
     if scale is None and overflows(windows):
         return GaussNewtonFit(field, np.inf, 0, Status.DIVERGED)
-    problem = _Problem(learned, rest, jnp.asarray(weight, float), scale, rows, RK4() if solver is None else solver)
+    problem = _Problem(field, jnp.asarray(weight, float), scale, rows, RK4() if solver is None else solver)
     return _descend(problem, jax.tree.map(jnp.asarray, windows), max_steps)
 
 
 class _Problem(eqx.Module):
     """r(θ) of one window, such that the loss is the mean over windows of ‖r‖²."""
 
-    learned: PyTree
-    rest: PyTree
+    source: AbstractVectorField
     weight: Float[Array, ""]
     scale: Float[Array, " d"] | None
     penalty: Rows | None = eqx.field(static=True)
     solver: Solver = eqx.field(static=True)
 
     def field(self, theta: Float[Array, " p"]) -> AbstractVectorField:
-        return eqx.combine(ravel_pytree(self.learned)[1](theta), self.rest)
+        return ravel_learned(self.source)[1](theta)
 
     def rows(self, candidate, predicted: Float[Array, "t d"], window: Trajectories) -> Float[Array, " r"]:
         errors = predicted - window.x if self.scale is None else (predicted - window.x) / self.scale
@@ -193,7 +190,7 @@ def _descend(problem: _Problem, windows: Trajectories, max_steps: int) -> GaussN
             move, expected = (np.asarray(part) for part in _move(gram, score, float(damping)))
         return theta + jnp.asarray(move, theta.dtype), jnp.asarray(expected, damping.dtype), 0.0
 
-    theta = ravel_pytree(problem.learned)[0]
+    theta = ravel_learned(problem.source)[0]
     nothing = theta, np.zeros((theta.size, theta.size)), np.zeros(theta.size)
     end = minimise(evaluate, aim, begin(theta, nothing, FIRST), max_steps, SLOW, in_python)
     return GaussNewtonFit(problem.field(end.best[0]), float(end.cost), int(end.steps), Status(int(end.status)))
