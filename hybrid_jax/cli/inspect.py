@@ -33,6 +33,7 @@ BORNE = ("quantities", "slowest signal", "gaps", "repeated samples")
 SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
 NOT_RUN = f"not checked for want of --vehicle: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
 EMPTY = "–"
+LESS = "{} of them lack quantities, but have motors: hybrid-jax fit identifies what these and the other sensors tell."
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,7 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
     ]
     learn = f"Learn from them: hybrid-jax fit {options.folder} -o source.npz --vehicle {options.vehicle or 'v.toml'}"
     read = [log for log in logs if log.recording is not None]
+    less = sum("quantities" in {c.name for c in log.failed} for log in read if log.recording and log.recording.rotors)
     worst = sorted(logs, key=lambda log: log.result == "ready")
     return page.Page(
         f"Do the logs of {printable(str(options.folder))} suffice for a model?",
@@ -169,7 +171,7 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
             for log in read[:PICTURED]
             if log.recording is not None
         ],
-        [NOT_RUN] if options.vehicle is None and read else [],
+        [*([LESS.format(less)] if less else []), *([NOT_RUN] if options.vehicle is None and read else [])],
         [*([] if ready else [f"{log}: {check}: {mend}" for log, check, mend in mends[:LINES]]), learn],
         [
             page.Table(
