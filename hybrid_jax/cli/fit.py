@@ -14,7 +14,7 @@ from hybrid_jax.cli.inspect import inspected, write_vehicle
 from hybrid_jax.cli.learning import CANDIDATES, FROZEN, Learned, learn
 from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, raw_logs, read_flights
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
-from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
+from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.flights.conversion import missing_states
 from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.io.files import json_value
@@ -65,7 +65,8 @@ def run(options: Options) -> int:
     model = replace(model, learn=options.learn or model.learn)
     if not model.learn:
         raise ValueError(f"{path}: learn: names nothing; give --learn Ix Iy, or what else is not known")
-    flights = read_flights(options.before, model.vehicle, options.dt, options)
+    lagging = LAG in model.learn or model.terms.motor_time_constant > 0
+    flights = read_flights(options.before, model.vehicle, options.dt, options, lagging=lagging)
     if len(flights.logs) < 2:
         raise ValueError(f"{options.before}: holds one flight; two at least, of which one is left out to judge by")
     with step(f"learning from {len(flights.logs)} flights, which are left out in turn") as told:

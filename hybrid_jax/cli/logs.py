@@ -11,7 +11,7 @@ import numpy as np
 
 from hybrid_jax.cli.command import RARE, ChecksFailed, step
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
-from hybrid_jax.flights.checks.consistency import RATIO, Check, check_log
+from hybrid_jax.flights.checks.consistency import GYRO, RATIO, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import flight_at
 from hybrid_jax.flights.load import find_logs, read_recording
@@ -26,6 +26,7 @@ STEPS = 10  # intervals of a window
 ONE_TO_ONE = (0.0, 1.0)  # rotor speed = command, in whatever unit: motors are still compared with the motion
 CUT = ("time on the ground",)  # is cut out
 CHANGED = 2.0  # factor by which thrust may differ from the vehicle's where a change is asked for
+BORNE = {RATIO: lambda ratio: 1 / CHANGED < ratio < CHANGED, GYRO: lambda lag: lag > 0}  # values that may be right
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,9 +141,12 @@ def raw_logs(folder: Path, read: Callable[[Path], Any]) -> tuple[list[tuple[Path
     return [(path, read(path)) for path in paths], left
 
 
-def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptions, changed: bool = False) -> Flights:
-    """Read, check and cut all logs; failed ones are left out with a line, and `changed` tolerates another thrust.
+def read_flights(
+    folder: Path, vehicle: Vehicle, dt: float, options: FlightOptions, changed: bool = False, lagging: bool = False
+) -> Flights:
+    """Read, check and cut all logs; failed ones are left out with a line.
 
+    `changed` tolerates another thrust, `lagging` motors that lead the gyro, as the model knows or learns by how much.
     Raises ChecksFailed if no log is left, and ValueError if a log is unreadable or a duplicate.
     """
     with step(f"reading {folder}") as told:
@@ -151,7 +155,7 @@ def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptio
         require_distinct(list(contents.items()))
         logs, failed = [], []
         for path, raw in raws:
-            one = look(path, raw, vehicle, dt, options, changed)
+            one = look(path, raw, vehicle, dt, options, changed, lagging)
             lines = failures(one.checks, path.name) or [f"{path.name}: no flight: {one.refusal}"] * bool(one.refusal)
             said += [f"{path.name}: {note}" for note in (*raw.notes, *one.notes)]
             failed += lines
@@ -169,7 +173,13 @@ def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptio
 
 
 def look(
-    path: Path, raw: Recording, vehicle: Vehicle | None, dt: float, options: SpeedOptions, changed: bool = False
+    path: Path,
+    raw: Recording,
+    vehicle: Vehicle | None,
+    dt: float,
+    options: SpeedOptions,
+    changed: bool = False,
+    lagging: bool = False,
 ) -> Looked:
     """Check a log and cut it to its flight; without a vehicle, it is compared with itself."""
     checks, notes = check_recording(raw, vehicle, dt), []
@@ -186,12 +196,9 @@ def look(
         refusal = ""
     except ValueError as error:
         log, refusal = None, str(error).removeprefix(f"{path}: ")
-    excused = [each for each in checks if each.name in CUT or (changed and each.name == RATIO and _near(each.value))]
+    borne = {RATIO: changed, GYRO: lagging}
+    excused = [each for each in checks if each.name in CUT or (borne.get(each.name) and BORNE[each.name](each.value))]
     return Looked(log, [each for each in checks if each not in excused], refusal, notes)
-
-
-def _near(ratio: float) -> bool:
-    return 1 / CHANGED < ratio < CHANGED
 
 
 def windows_of(logs: Sequence[FlightLog], steps: int, stride: int, most: int | None = None) -> LogWindows:

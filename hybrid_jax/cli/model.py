@@ -58,9 +58,10 @@ def reading_of(known: Known, options: FlightOptions) -> Any:
 
 def flights_for(known: Known, folder: Path, options: FlightOptions, changed: bool) -> Flights:
     """Read the flights of a folder; none of them may be one of the model's training flights."""
-    found = read_flights(folder, known.vehicle, known.dt, reading_of(known, options), changed)
+    lag = known.about.get("lag", 0.0)
+    found = read_flights(folder, known.vehicle, known.dt, reading_of(known, options), changed, lag > 0)
     require_unseen(known.about["learned_from"], found.contents)
-    return found._replace(logs=lagged(found.logs, known.about.get("lag", 0.0)))
+    return found._replace(logs=lagged(found.logs, lag))
 
 
 def unlike(known: Known, flights: Flights) -> list[str]:

@@ -57,8 +57,9 @@ def run(options: Options) -> int:
     checks.writable_folder("--out", options.out)
     models = {path: known_of(path, load(path)) for path in (options.model, options.other) if path is not None}
     first = models[options.model]
-    logs = read_flights(options.flight, first.vehicle, first.dt, reading_of(first, options), changed=True).logs
-    logs = lagged(logs, first.about.get("lag", 0.0))
+    lag = first.about.get("lag", 0.0)
+    reading = reading_of(first, options)
+    logs = lagged(read_flights(options.flight, first.vehicle, first.dt, reading, True, lag > 0).logs, lag)
     if len(logs) > 1:
         raise ValueError(f"{options.flight}: holds {len(logs)} flights; give one of them")
     steps, every = max(1, round(options.ahead / first.dt)), max(1, round(1 / SHOWN / first.dt))

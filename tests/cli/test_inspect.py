@@ -5,13 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recorded import LOGS, write
+from recorded import DT, LOGS, write
 from scipy.signal import lfilter
 
 from experiments.real_flight.simulated import vehicle_toml
+from hybrid_jax.cli.command import ChecksFailed
 from hybrid_jax.cli.estimates import estimate
 from hybrid_jax.cli.inspect import Options, inspected, trusted
+from hybrid_jax.cli.logs import FlightOptions, read_flights
 from hybrid_jax.cli.vehicle_text import vehicle_text
+from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.state import STATE_NAMES, input_names
 from hybrid_jax.vehicle import IRIS, load_vehicle
@@ -163,3 +166,11 @@ def test_bad_options_end_in_one_line(tmp_path, monkeypatch, called, options, wor
     assert code == 2
     (line,) = said.splitlines()
     assert words in line
+
+
+def test_motors_that_lead_the_gyro_are_borne_where_the_lag_is_known(tmp_path):
+    early = [FlightLog(log.t[:-5], log.x[:-5], log.u[5:], log.name) for log in LOGS[:1]]
+    options = FlightOptions()
+    assert len(read_flights(write(tmp_path, early), IRIS, DT, options, lagging=True).logs) == 1
+    with pytest.raises(ChecksFailed, match="lag of the gyro behind the motors"):
+        read_flights(tmp_path, IRIS, DT, options)
