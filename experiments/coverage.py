@@ -63,13 +63,13 @@ class CoverageConfig(OneFlight):
     """Adapt to many flights after each change of the vehicle, and count how often intervals contain the true value."""
 
     seeds: Count = SOURCES
-    """Sources, whose intervals are pooled."""
+    """Number of sources to pool."""
     draws: Count = 100
-    """Flights: each source adapts to each of them alone."""
+    """Number of flights; each source adapts to one at a time."""
     clean: bool = True
-    """Adapt to the same flights without noise, too."""
+    """Also adapt to the same flights without noise."""
     changes: tuple[Change, ...] = RIGHT
-    """Which changes; by default those that leave the vehicle's mass as the model has it."""
+    """Which changes; by default all that do not change the mass."""
     repeats: Count = 100
     """Recordings of a known rigid body, each with its own fit."""
 

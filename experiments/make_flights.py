@@ -36,9 +36,9 @@ class Options:
     out: Path
     """File to write (.npz)."""
     seed: CountFromZero = 0
-    """Seed of everything random."""
+    """Random seed."""
     train: CountFromZero = 1000
-    """Windows of 0.1 s (10 steps) to learn from; 0 leaves a split out."""
+    """Windows of 0.1 s (10 steps) for training; 0 omits a split."""
     validation: CountFromZero = 1000
     """Windows of 0.1 s."""
     test: CountFromZero = 0
@@ -55,7 +55,7 @@ class Options:
         steps = {"train": 10, "validation": 10, "test": 100, "test_with_past": 20}
         splits = {name: SplitSpec(getattr(self, name), n) for name, n in steps.items() if getattr(self, name) != 0}
         if not splits:
-            raise ValueError("no windows asked for: give --train, --validation, --test or --test-with-past")
+            raise ValueError("no windows requested; give --train, --validation, --test or --test-with-past")
         return splits
 
 

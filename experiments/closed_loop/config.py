@@ -25,37 +25,37 @@ class ClosedLoopConfig(Config):
     references: tuple[Reference, ...] = get_args(Reference)
     """References flown at home."""
     away: Positive = 60.0
-    """Distance from home [m] of the flights away from it."""
+    """Distance of flights away from home [m]."""
     away_references: tuple[Reference, ...] | None = None
-    """References flown there, of --references; by default hover, figure_eight and low_pass, if they are among these."""
+    """Subset of --references to fly away from home; by default hover, figure_eight and low_pass."""
     bandwidth: Positive = 10.0
-    """Of the disturbance observer [rad/s]."""
+    """Bandwidth of the disturbance observer [rad/s]."""
     noise: NotNegative = 0.0
     """White noise on the states that controller and observer see; 1 is typical of motion capture and a gyroscope."""
     latency: NotNegative = 0.0
-    """From a sample to its command, a multiple of 0.01 [s]. Controller and observer know it."""
+    """Latency from a sample to its command [s], a multiple of 0.01. Controller and observer model it."""
     rotor_lag: NotNegative = 0.0
-    """Time constant with which rotors follow their commands [s]. Controller and observer know it."""
+    """Time constant of the rotors [s]. Controller and observer model it."""
     invariant_inputs: ResidualInputs = "near_ground"
     """Inputs of the translation- and yaw-invariant residual (see --residual-inputs)."""
     invariant_outputs: Literal["accelerations", "wrench", "rotors"] = "rotors"
-    """Its outputs (see --residual-outputs)."""
+    """Outputs of this residual (see --residual-outputs)."""
     invariant_linear: bool = True
-    """It has a linear skip connection (see --residual-linear)."""
+    """Give it a linear skip connection (see --residual-linear)."""
     invariant_hidden: Count = 64
-    """Its hidden units, and those of the network that all rotors share."""
+    """Hidden units of this residual, and of the network that all rotors share."""
     invariant_norm: Literal["batch", "none"] = "none"
-    """Normalisation of its hidden layer."""
+    """Normalisation of this residual's hidden layer."""
     invariant_rates: tuple[Positive, ...] = (3e-3, 3e-4, 3e-5)
-    """Its learning rates in pre-training, one stage each; those of θ_p decay by the same factors."""
+    """Learning rates of this residual in pre-training, one stage each; the rates of θ_p decay by the same factors."""
     invariant_source: Count = 10_000
-    """At most so many source trajectories for it."""
+    """Largest number of source trajectories for this residual."""
     invariant_epochs: Count = 2000
-    """At most so many epochs for it."""
+    """Largest number of epochs for this residual."""
     invariant_offset: Positive | None = 0.3
-    """Learning rate of its output bias in adaptation [m/s² or rad/s² per step]; see --rates.offset."""
+    """Learning rate of this residual's output bias in adaptation [m/s² or rad/s² per step]; see --rates.offset."""
     invariant_disturbance: Literal["needed", "always"] = "needed"
-    """Fit a constant disturbance by least squares always, or only where it lowers the leave-one-out error."""
+    """Fit a constant disturbance by least squares always, or only if it lowers the leave-one-out error."""
     calls: Count = 300
     """Calls of the controller to time."""
 

@@ -97,7 +97,7 @@ def shares(rows: Results, domain: str) -> Figure:
     found = gaps(rows, domain)
     names = [name for name in REFERENCES if any(name in line for line in found.values())]
     if not names:
-        raise ValueError(f"rows must hold a source model and the true vehicle in {domain}")
+        raise ValueError(f"rows must have a source model and the true vehicle in {domain}")
     figure, panels = _grid(len(names), [agent.name for agent in found])
     at_home = rows.where(domain=domain, distance=0.0)
     for axes, name in zip(panels, names, strict=False):

@@ -77,11 +77,11 @@ class ExcitationConfig(Run):
     seconds: Positive = 10.0
     """Length of each flight [s]."""
     change: str = "parameter_shift"
-    """What has changed when the vehicle flies: source (nothing) or a change of `experiments.changes`."""
+    """The change before the flight: source (nothing) or a change of `experiments.changes`."""
     parameters: tuple[Parameter, ...] = get_args(Parameter)
-    """Parameters that the flight is to tell."""
+    """Parameters to identify."""
     noise: NotNegative = 1.0
-    """Noise of the sensors, in multiples of the typical one."""
+    """Sensor noise; 1 is typical."""
     bounds: FlightBounds = field(default_factory=FlightBounds)
     """The box of the designed flight."""
     speed: Positive = 3.5
@@ -89,7 +89,7 @@ class ExcitationConfig(Run):
     bandwidth: Positive = 2.0
     """Highest frequency of the design [Hz]."""
     starts: Count = 4
-    """Random series that the design starts from."""
+    """Number of random series to start from."""
     steps: Count = 200
     """Steps of the search."""
 

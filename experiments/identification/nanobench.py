@@ -57,7 +57,7 @@ class Options:
     """
 
     folder: Annotated[Path, tyro.conf.Positional]
-    """The flights of the data set, such as B2_circle_slow_rep1.csv.gz."""
+    """The flights of the data set, for example B2_circle_slow_rep1.csv.gz."""
 
 
 def thrust_of(recordings: list[Recording], voltage: bool = True, start: Actuated | None = None, free=None) -> Actuated:

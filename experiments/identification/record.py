@@ -24,9 +24,9 @@ class Options:
     """Fit physics, with and without a residual, to a record, choose by left-out parts, and predict from inputs only."""
 
     record: Annotated[Path, tyro.conf.Positional]
-    """CSV with the columns t, u and the measured output; it may be packed by gzip."""
+    """CSV with the columns t, u and the measured output; you may compress it with gzip."""
     test: Path | None = None
-    """Another record of the same form, which is predicted and has no part in the fit."""
+    """Another record with the same columns to predict; it is not used in the fit."""
 
 
 @dataclass(frozen=True)

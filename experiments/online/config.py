@@ -19,21 +19,21 @@ class OnlineConfig(Run):
     seconds: Positive = 4.0
     """Length of a flight after the change [s]."""
     changes: tuple[Change, ...] = get_args(Change)
-    """What changes."""
+    """Changes in the air."""
     references: tuple[Reference, ...] = ("hover", "figure_eight", "fast_figure_eight", "low_pass")
-    """References flown."""
+    """References to fly."""
     agents: tuple[Agent, ...] = get_args(Agent)
-    """Who flies."""
+    """Agents to compare."""
     noise: NotNegative = 1.0
     """White noise on the measured states; 1 is typical of motion capture and a gyroscope."""
     latency: NotNegative = 0.01
-    """From a sample to its command, a multiple of 0.01 [s]."""
+    """Latency from a sample to its command [s], a multiple of 0.01."""
     rotor_lag: NotNegative = 0.03
     """Time constant of the rotors [s]."""
     bandwidth: Positive = 8.0
-    """Of the disturbance observer [rad/s]."""
+    """Bandwidth of the disturbance observer [rad/s]."""
     l1_cutoff: Positive = 8.0
-    """Of the low-pass filter of L1 adaptive augmentation [rad/s]."""
+    """Cutoff of the low-pass filter of L1 adaptive augmentation [rad/s]."""
 
     def __post_init__(self):
         Run.__post_init__(self)

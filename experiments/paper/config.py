@@ -41,22 +41,22 @@ class Rates:
     """Adam's learning rates; a tuple has one for each of the sizes 100, 300, 500, 700, 1000."""
 
     physics: NotNegative = 1e-2
-    """θ_p from a fresh start: pre-training, and target-only."""
+    """Rate of θ_p in pre-training and target-only."""
     physics_fine_tuning: NotNegative = 1e-2
-    """θ_p in fine-tuning; not confirmed in the paper. Claims C8 and C10 of param_shift are sensitive to it."""
+    """Rate of θ_p in fine-tuning; not confirmed in the paper. Claims C8 and C10 of param_shift are sensitive to it."""
     pretraining: NotNegative = 1e-4
-    """θ_d, both models."""
+    """Rate of θ_d in pre-training, both models."""
     decay: tuple[Positive, ...] = ()
-    """Factors: pre-training continues from its best model with all rates times each in turn; none by default."""
+    """Factors: pre-training continues from its best model with all rates times each factor in turn; none by default."""
     hybrid: tuple[NotNegative, ...] = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)
-    """θ_d of the hybrid, fine-tuned and target-only."""
+    """Rate of the hybrid's θ_d, fine-tuned and target-only."""
     no_physics: tuple[NotNegative, ...] = (1e-4, 1e-4, 1e-4, 1e-4, 1e-5)
-    """The network without physics, fine-tuned (not confirmed in the paper for the first four)."""
+    """Rate of the network without physics, fine-tuned (the first four are not confirmed in the paper)."""
     no_physics_target_only: NotNegative = 1e-4
-    """The network without physics, from a fresh start."""
+    """Rate of the network without physics, target-only."""
     offset: Positive | None = None
-    """Rate of v̇ and ω̇ in the output bias of θ_d [m/s², rad/s² a step], fine-tuned and target-only; by default that of
-    θ_d. Only this bias can represent a steady force; at 1e-3 that takes thousands of steps, and the rest overfits."""
+    """Rate of v̇ and ω̇ in the output bias of θ_d [m/s², rad/s² a step], fine-tuned and target-only; by default the
+    rate of θ_d. Only this bias can represent a constant force; at 1e-3 you need thousands of steps, which overfit."""
 
 
 @dataclass(frozen=True)
@@ -83,15 +83,15 @@ class Encoding:
     """The encoder of Expert Augmentation, which estimates θ_p from the past; the paper gives no details."""
 
     box: tuple[float, float] = (0.5, 2.0)
-    """θ_p of augmented flights: the source model's times a factor in this range, even in its logarithm."""
+    """Range of factors on θ_p in augmented flights, uniform in the logarithm."""
     hidden: Count = 128
     """Units in each of the encoder's two hidden layers."""
     rate: NotNegative = 1e-3
     """Adam's learning rate."""
     weight: NotNegative = 1.0
-    """Weight of the mean squared error of log θ̂_p, added to the error of the prediction."""
+    """Weight of the mean squared error of log θ̂_p, relative to the prediction error."""
     stopping: Stopping = Stopping(100, 60)
-    """Early stopping, by the error of the prediction on source and augmented validation flights."""
+    """Early stopping by the prediction error on source and augmented validation flights."""
     max_epochs: Count = 400
     """Cap on the encoder's epochs."""
 
@@ -105,15 +105,15 @@ class Config(Run):
     pool: int | None = None
     """Target trajectories from which a seed draws its N; by default as many as the largest N."""
     draw: Literal["random", "contiguous"] = "random"
-    """Which N target trajectories. random: of many flights, as in the paper. contiguous: from the start of one flight,
-    of ten seconds for 100 trajectories; of as few flights as hold them for more."""
+    """Which N target trajectories. random: from many flights, as in the paper. contiguous: from the start of
+    one flight (ten seconds for 100 trajectories), or of as few flights as possible."""
     draws: Count = 1
-    """Draws of target trajectories for each seed; contiguous draws are of different flights, the same for all seeds."""
+    """Draws of target trajectories for each seed; contiguous draws use different flights, the same for all seeds."""
     source_train: Count = 10_000
     """Source trajectories for pre-training."""
     validation: Count | Literal["own"] = 1000
-    """Validation trajectories, in the source and in the target. own: nothing but the N target trajectories is used;
-    where a method needs some to stop by, these are the last fifth of them."""
+    """Validation trajectories, in the source and in the target. own: only the N target trajectories, with the
+    last fifth held out if a method needs early stopping."""
     test: Count = 1000
     """Target test trajectories."""
     data_seed: CountFromZero = 0
@@ -121,13 +121,13 @@ class Config(Run):
     hidden: Count = 64
     """Hidden units of f_d."""
     inputs: Literal["hover", "raw"] = "hover"
-    """Rotor speeds as f_d sees them: hover: (u − hover) / (hover / 10); raw: u in rad/s."""
+    """Scaling of rotor speeds for f_d. hover: (u − hover) / (hover / 10); raw: u in rad/s."""
     norm: Norm = "batch"
     """Normalisation of f_d's hidden layer."""
     activation: Activation = "relu"
-    """Activation of f_d's hidden layer. All but ReLU suit solvers of optimal control problems."""
+    """Activation of f_d's hidden layer. For optimal control you should not use ReLU."""
     residual_inputs: ResidualInputs = "all"
-    """Inputs of f_d from the state. no_xy: without p_x, p_y. no_xy_yaw: without yaw too. near_ground: also each rotor's
+    """Inputs of f_d from the state. no_xy: without p_x, p_y. no_xy_yaw: nor yaw. near_ground: also each rotor's
     distance to the ground. body: altitude, and velocity, rates and gravity in the body frame."""
     residual_outputs: ResidualOutputs = "all"
     """Outputs of f_d. all: 13 derivatives. accelerations: v̇ and ω̇. wrench: these as a force and a torque, so that Ix
@@ -137,15 +137,15 @@ class Config(Run):
     guess: tuple[float, float] = (0.8, 1.25)
     """θ_p starts at nominal times a random factor in this range."""
     perturbed_by: Positive | None = None
-    """Instead of --guess: each of θ_p starts at nominal times or over 1 + this, at random."""
+    """Instead of --guess with this value x: θ_p starts at nominal × (1 + x) or nominal / (1 + x), at random."""
     noise: NotNegative = 0.0
     """White noise on the states of training and validation flights; 1 is typical of motion capture and a gyroscope."""
     noise_on: Literal["all", "target"] = "all"
-    """Which of these flights are noisy: those before the change as well, or those after it alone."""
+    """Flights with noise. all: before and after the change. target: only after it."""
     regulariser: RegulariserName = "trajectory_correlation"
-    """Penalty that keeps f_d from replacing f_p."""
+    """Penalty against f_d replacing f_p."""
     regulariser_weight: NotNegative = 1e-3
-    """λ."""
+    """Weight λ of the penalty."""
     solver: SolverName = "rk4"
     """Integrator, one step for each input interval of 0.01 s."""
     batch_size: Count = 100
@@ -167,7 +167,7 @@ class Config(Run):
         self._check_draws()
         if self.pooled() + self.source_train + self.validating() + self.test > MOST:
             options = "--sizes, --draws, --pool, --source-train, --validation and --test"
-            raise ValueError(f"{options} must ask for at most {MOST:,} trajectories together")
+            raise ValueError(f"{options} must request at most {MOST:,} trajectories together")
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
         if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
             needed = f"more than the {FITTED} parameters of {CONSTANT_DISTURBANCE}"
@@ -220,12 +220,12 @@ class AdaptationConfig(Config):
     """Pre-train on source flight, adapt to the target with N short trajectories, and test."""
 
     models: tuple[Model, ...] = MODELS
-    """Which models to compare. constant_disturbance: the source's hybrid, of which θ_p and a constant disturbance are
-    fitted by least squares."""
+    """Which models to compare. constant_disturbance: the source's hybrid with θ_p and a constant
+    disturbance fitted by least squares."""
     target_only: bool = True
-    """Train every model on the N target trajectories from a fresh start, too."""
+    """Train every model on the N target trajectories from scratch, too."""
     source_flights: Path | None = None
-    """A file of `python -m experiments.make_flights --domain source` to use; by default flights are made and cached."""
+    """A file of `python -m experiments.make_flights --domain source` ; by default flights are simulated and cached."""
     target_flights: Path | None = None
     """The same for the target, with the splits train, validation and test."""
 
@@ -241,16 +241,16 @@ class OneFlight(Config):
     sizes: tuple[int, ...] = (100,)
     """N, windows of 0.1 s: one number."""
     draw: Literal["random", "contiguous"] = "contiguous"
-    """Which N target trajectories. contiguous: from the start of one flight, of ten seconds for 100 trajectories.
-    random: of many flights, as in the paper."""
+    """Which N target trajectories. contiguous: from the start of one flight (ten seconds for 100
+    trajectories). random: from many flights, as in the paper."""
     draws: Count = 4
-    """Draws of target trajectories; each seed's source adapts to each of them alone."""
+    """Draws of target trajectories; each seed's source adapts to one at a time."""
     validation: Count | Literal["own"] = "own"
-    """own: nothing but the N target trajectories is used. A number is that of the source's validation trajectories."""
+    """own: only the N target trajectories. Or the number of validation trajectories, as in the source."""
     noise: float = 1.0
     """White noise on the states of all flights but the test flights; 1 is typical of motion capture and a gyroscope."""
     noise_on: Literal["all", "target"] = "target"
-    """Which of these flights are noisy: those before the change as well, or those after it alone."""
+    """Flights with noise. all: before and after the change. target: only after it."""
     changes: tuple[Change, ...] = CHANGED
     """Which changes of the vehicle."""
 

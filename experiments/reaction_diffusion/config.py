@@ -44,19 +44,19 @@ class Config(Run):
     """Learn and adapt reaction-diffusion equations."""
 
     seeds: Count = 10
-    """Trials: initial weights and training trajectories. Forecasts take three at most: the tables say how many."""
+    """Trials: initial weights and training trajectories. Forecasts use at most three."""
     parts: tuple[Part, ...] = get_args(Part)
     """forecast: as APHYNITY. shifted: adapt to changed equations. gray_scott: as Neural Context Flows."""
     cases: tuple[CaseName, ...] = tuple(case.name for case in CASES)
     """Lines of the table of forecasts."""
     shifts: tuple[Shift, ...] = get_args(Shift)
-    """parameter_shift: a × 2, b ÷ 2, k × 2. new_term: u_t has a term that the source never had."""
+    """parameter_shift: a × 2, b ÷ 2, k × 2. new_term: u_t has a term that is not in the source."""
     sizes: tuple[Count, ...] = (1, 2, 4, 8)
     """Trajectories to adapt to."""
     points: Count = 32
     """Grid points along each axis."""
     test: Count = 100
-    """Test trajectories of forecasts; after a shift, and of Gray–Scott, a third."""
+    """Test trajectories of forecasts; a third of these after a shift and for Gray–Scott."""
     hidden: Count = 24
     """Hidden units of the pointwise residual of forecasts."""
     channels: Count = 8
@@ -64,7 +64,7 @@ class Config(Run):
     units: Count = 12
     """Hidden units of the hybrids that are adapted."""
     starts: Count = 3
-    """Random networks that begin; the one with the least training loss after ten steps goes on."""
+    """Random networks to start with; the one with the least training loss after ten steps is continued."""
     steps: Count = 35
     """Gauss–Newton steps on single intervals, the first ten included."""
     polish: Count = 8

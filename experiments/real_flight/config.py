@@ -31,9 +31,9 @@ class RealFlightConfig(FlightOptions, Run):
     test: Path | None = None
     """Folder of test flights; by default the target's flights are held out in turn."""
     simulated: bool = False
-    """Simulate flights, write their logs to --out and use these."""
+    """Simulate flights, write their logs to --out and use them."""
     learn: tuple[str, ...] = ()
-    """Parameters to learn, in place of those of the vehicle file."""
+    """Parameters to learn, instead of the vehicle file's."""
     dt: Positive = 0.01
     """Interval of the models [s]."""
     horizon: tuple[Count, ...] = (10, 50)

@@ -69,7 +69,7 @@ def run_folds(
     made = make_folds(sets.get("target", sets["source"]).logs, tested, config)
     for fold in made:
         if not adapts and len(fold.train) < 2:
-            raise ValueError(f"--source: without {fold.name} one flight is left; two at least, of which one judges")
+            raise ValueError(f"--source: without {fold.name} one flight is left; two at least, one for validation")
         for log in fold.test:
             if not count_windows([log], max(config.horizon)):
                 raise ValueError(f"--horizon: no window of {max(config.horizon)} intervals without gaps in {log.name}")

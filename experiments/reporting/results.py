@@ -111,7 +111,7 @@ class Results:
         if lacking:
             seed, draw = lacking[0]
             where = seed if draw is None else f"{seed} of draw {draw}"
-            raise ValueError(f"other must hold the same seeds, {where} is missing")
+            raise ValueError(f"other must have the same seeds, {where} is missing")
         return self.numbers(column), np.array([theirs[run] for run in self._runs()])
 
     def interval(self, column: Column, minus: "Results | None" = None, times: float = 1.0) -> Interval:

@@ -31,20 +31,20 @@ class Run:
     """Results are written to --out. Flights and finished stages are kept in --cache and reused by later runs."""
 
     preset: Literal["paper", "quick", "smoke"] = "paper"
-    """paper: the full protocol. quick: few seeds, sizes and epochs, about a minute. smoke: a functional check."""
+    """paper: the full protocol. quick: few seeds, sizes and epochs, a few minutes. smoke: a functional check."""
     out: Path = Path("runs")
     """Folder for the report, the figures and the models; a subfolder named after the experiment is created in it."""
     cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))
     """Folder for flights and finished stages. Compiled programs are kept in the user's cache folder, or in
     JAX_COMPILATION_CACHE_DIR."""
     fresh: bool = False
-    """Start anew: earlier results in --out and unfinished sweeps are moved to a backup; nothing is deleted."""
+    """Restart: earlier results in --out and unfinished sweeps are moved to a backup; nothing is deleted."""
     saving: float = 0.02
-    """Largest share of a sweep's time spent on saving checkpoints; a smaller share means more work lost by a kill."""
+    """Largest share of a sweep's time for checkpoints; with a smaller share you lose more work if the run is killed."""
     seeds: Count = 10
     """Trials of each condition: initialisation, order of minibatches, which N trajectories are drawn."""
     distributed: bool = False
-    """Be one of several processes, on one machine or many, that share the runs: start the same command for each.
+    """Share the runs between processes, on one machine or many: start the same command for each.
     Process 0 writes. Slurm, Open MPI, Kubernetes and Cloud TPU are detected; elsewhere set the next three options."""
     coordinator: str | None = None
     """With --distributed: host:port of process 0; the port must be free there and reachable by all processes."""
@@ -53,7 +53,7 @@ class Run:
     process_id: int | None = None
     """With --distributed: the index of this process, from 0."""
     timeout: Positive = 120.0
-    """With --coordinator: seconds after which a process that does not come, or does not answer, is taken for lost."""
+    """With --coordinator: seconds without an answer after which a process counts as lost."""
 
     def __post_init__(self):
         if not self.distributed and (self.coordinator, self.processes, self.process_id) != (None, None, None):

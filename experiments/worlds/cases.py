@@ -69,9 +69,9 @@ class WorldsConfig(OneFlight):
     """Which changes of the vehicle."""
     learn_from: tuple[FlightName, ...] = get_args(FlightName)
     """Flights to adapt to. moving: ten seconds of usual flight. near_ground: slow. short: three seconds. noisy: sensors
-    three times as noisy. outliers: 0.3 s of wild samples."""
+    three times as noisy. outliers: 0.3 s of outliers."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
-    """How a log has them: as means over each interval, or sampled at its start."""
+    """How a log samples them: means over each interval, or values at its start."""
     rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
     """Changes after which other methods are compared with `hj.adapt`."""
     test_flights: int = 6
