@@ -1,8 +1,4 @@
-"""What the numbers of a state mean, and how to perturb and compare states that are not vectors, for example attitudes.
-
-A field describes its state by its attribute `state_space`; without one, all numbers are vectors. To add a quantity of
-your own, write a subclass of `Quantity`.
-"""
+"""The meaning of a state's numbers, to perturb and compare states that are not vectors, for example attitudes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -21,7 +17,7 @@ Change = Float[Array, " e"]  # of a state or a quantity, in the tangent space
 
 @dataclass(frozen=True)
 class Quantity:
-    """Numbers of a state that form one vector; subclasses override the methods for a manifold.
+    """Numbers of a state that form one vector; write a subclass for a manifold of your own.
 
     Attributes:
         name: for example "velocity".
@@ -160,7 +156,7 @@ class Attitude(Quantity):
 
 @dataclass(frozen=True)
 class StateSpace:
-    """A sequence of quantities with d numbers in total.
+    """A sequence of quantities with d numbers in total, which a field defines by its attribute `state_space`.
 
     Attributes:
         quantities: in the order of the state; empty if nothing is known about it.

@@ -76,11 +76,7 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
 
 
 def overflows(trajectories: Trajectories) -> bool:
-    """Whether squares of its states are too large for their type, as of 1e30 in float32: then no loss is finite.
-
-    Args:
-        trajectories: windows of any system.
-    """
+    """Whether squares of its states overflow their type, for example 1e30 in float32: then no loss is finite."""
     states = np.asarray(trajectories.x0), np.asarray(trajectories.x)
     most = np.finfo(jax.dtypes.canonicalize_dtype(states[0].dtype)).max / states[0].shape[-1]
     return max(max(part.max(), -part.min()) for part in states) > most**0.5

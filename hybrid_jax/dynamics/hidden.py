@@ -1,8 +1,4 @@
-"""Unmeasured parts of a system: lags, delays, varying disturbances and swinging loads.
-
-Each appends its own states to those of a field, and acts on the field's inputs or on ẋ. Their initial states are
-unknown, see `StateSpaceModel`.
-"""
+"""Unmeasured parts of a system, with their own states behind the field's: lags, delays, disturbances and loads."""
 
 from abc import abstractmethod
 

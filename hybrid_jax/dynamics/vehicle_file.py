@@ -2,7 +2,7 @@
 
 Above all tables `learn = ["Ix", "drag", …]`, names from `terms.SHAPES`; then `[vehicle]` with constants of `Vehicle`,
 `[vehicle.NAME]` with the overrides of a variant, `[terms]` with nominal values of `Terms`, and, for logs of commands
-instead of rotor speeds, `[actuator]` with those of `Actuator`, whose names `learn` may also contain. You can explain
+instead of rotor speeds, `[actuator]` with values of `Actuator`, whose names you can add to `learn`. You can explain
 terms above the tables, for example `purpose = { cable_pull = "the load hangs on a cable" }`.
 """
 
@@ -61,7 +61,7 @@ def check_learned(learn: tuple[str, ...], actuator: Actuator | None = None) -> N
 
 
 def learned_by_field(learn: tuple[str, ...]) -> tuple[str, ...]:
-    """The learned names without those of the actuators."""
+    """The learned names except the actuators'."""
     return tuple(name for name in learn if name != LAG and name not in NAMES)
 
 

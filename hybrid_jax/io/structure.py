@@ -1,7 +1,6 @@
 """The structure of a field as JSON: classes and functions by name, static values, and the path of each array.
 
-Reading a structure runs no code that the file chooses. A class must be an Equinox module of exactly that name in a
-module that the program has already imported. Its `__init__` is not called.
+Reading runs no code that the file chooses: a class must be an Equinox module in a module that is already imported.
 """
 
 import builtins

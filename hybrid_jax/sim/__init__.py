@@ -1,14 +1,10 @@
-"""A simulated quadrotor in MuJoCo MJX with drag, ground effect and wind, and a pilot for random flights.
-
-Raises ImportError if mujoco or mujoco-mjx is missing or of an unsupported version: the two integrate a free body
-differently across versions, and mujoco-mjx sets no upper bound on mujoco.
-"""
+"""A simulated quadrotor in MuJoCo MJX with drag, ground effect and wind, and a pilot for random flights."""
 
 from hybrid_jax.io.datasets import versions
 
 
 def check_versions(found: dict[str, str]) -> None:
-    """Raise ImportError, with the install command, unless both versions are 3.17.*."""
+    """Raise ImportError, with the install command, unless both are 3.17.*: others integrate a free body differently."""
     if not all(found[package].startswith("3.17.") for package in ("mujoco", "mujoco-mjx")):
         raise ImportError(
             f"hybrid_jax.sim needs mujoco and mujoco-mjx 3.17.*, found mujoco {found['mujoco']} and mujoco-mjx "

@@ -1,7 +1,6 @@
-"""Simulated systems: the paper's source domain and its two targets, and the dynamics of their vehicle.
+"""Simulated systems, the paper's source domain and its two targets: accelerations of MuJoCo MJX integrated by RK4.
 
-Accelerations are those of MuJoCo MJX for iris.xml with the vehicle's constants, integrated by classical RK4. Every RK4
-stage recomputes the forces: MJX freezes xfrc_applied within a step, which makes its integrators first order in drag.
+Every stage recomputes the forces: MJX freezes xfrc_applied within a step, which makes it first order in drag.
 """
 
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,4 @@
-"""Forces on the simulated vehicle besides rotor thrust, reaction torque and gravity.
-
-A force is a function (x, u, t, parameters) → Wrench. You can add your own to the `forces` of a `Domain`.
-"""
+"""Forces on the simulated vehicle: functions (x, u, t, parameters) → Wrench, to which you can add your own."""
 
 import math
 from collections.abc import Callable

@@ -1,8 +1,4 @@
-"""A pilot for random flight between waypoints, sometimes close to the ground, with dither on all axes.
-
-A `Plan` contains all random numbers. `act` is the closed loop: a cascade of position, velocity, attitude and rate
-control at 100 Hz for the nominal vehicle. Constants are for the Iris; `Scale` adapts them to other sizes.
-"""
+"""A pilot for random flight at 100 Hz between waypoints, sometimes close to the ground, with dither on all axes."""
 
 import math
 from typing import NamedTuple

@@ -1,7 +1,6 @@
 """Map one function over many independent lanes: chunks of lanes under `vmap`, chunks in a loop, loops on all devices.
 
-A lane is a slice of a pytree along its first axis. Which lanes are active is data, not shape, so that a sweep compiles
-once. In a multi-process run (see hosts.py) each process feeds its own devices, and all get all results.
+A lane is a slice of a pytree along its first axis. Which lanes are active is data, so that a sweep compiles once.
 """
 
 import heapq

@@ -1,8 +1,4 @@
-"""A loss that weights the channels of the state and is robust against outliers.
-
-Without weights, an error of 1 rad/s in the body rates counts ten thousand times as much as one of 1 cm in position.
-Here the error of each channel is relative to a simple baseline: 1 is no better than the baseline.
-"""
+"""A loss that divides each channel of the state by its error under a baseline, and is robust against outliers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -49,6 +45,7 @@ class Channel:
 class ChannelLoss(TrajectoryLoss):
     """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, instead of the square in `TrajectoryLoss`.
 
+    You should use it where units differ: otherwise 1 rad/s in the body rates counts ten thousand times as much as 1 cm.
     ρ(r) = r²; beyond `huber` it is 2 huber r − huber² (Huber 1964, doubled). As r is a norm, no direction is preferred.
 
     Attributes:

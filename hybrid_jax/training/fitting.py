@@ -61,7 +61,7 @@ def run(
     optimiser: Optimiser = ADAM,
     losses: Float[Array, "e 2"] | None = None,
 ) -> tuple[FitState, Float[Array, "e 2"] | None]:
-    """Continue until the run has stopped or has completed `until` epochs; `losses` stores those of the first epochs."""
+    """Continue until the run has stopped or has completed `until` epochs; `losses` is filled from its start."""
     first = state.epoch
     # A user's field may hold leaves that are not arrays (an activation function). A loop carries arrays only.
     arrays, rest = eqx.partition(state, eqx.is_array)

@@ -1,8 +1,7 @@
 """Damped Gauss–Newton for all parameters of a field, network and physics, to a precision that Adam does not reach.
 
-A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the column norms of J. J is computed in the
-field's precision one window at a time, with the trajectory (`sensitivities`). JᵀJ and the step are in double precision,
-since squaring J in float32 would lose the least sensitive directions.
+A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the column norms of J (`sensitivities`), in
+double precision: squaring J in float32 would lose the least sensitive directions.
 """
 
 from collections.abc import Callable

@@ -112,7 +112,7 @@ def fit_in_stages(
         stages: one training run each, in this order.
         optimiser: any Optax optimiser instead of Adam, whose updates the rates of a stage then multiply.
         regulariser_weight: λ, by default 1e-3.
-        settings: of all stages; by default those of `fit`.
+        settings: of all stages; defaults as in `fit`.
         progress: True for a bar on stderr, or a function of (epoch, state) that is called about twice a second.
 
     Raises:
