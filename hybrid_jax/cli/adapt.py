@@ -92,11 +92,11 @@ def _page(
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
     told = f"Changed: {what}." if own else "These flights differ from the model; no parameter of its own says how."
     if not changed and found.candidates["source"] >= UNLIKELY:
-        told = f"Nothing changed that these flights can tell; {ALONE}"
+        told = f"These flights show no change; {ALONE}"
     todo = [f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."]
     if not different:
-        told = "Nothing changed that these flights can tell."
-        todo = ["Keep the model; if something did change, fly what excites the vehicle more."]
+        told = "These flights show no change."
+        todo = ["Keep the model. If something did change, you should fly manoeuvres that excite it more."]
     rows = [(name, f"{value:.4g}", str(one)) for name, value, one in [*own, *lacked][:SHOWN]]
     expected = [
         (horizon, name, *(f"{number:.3g}" for number in one))

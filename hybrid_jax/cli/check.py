@@ -65,7 +65,9 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
     header = ("", *(name.replace("_", " ") for name in errors.UNITS))
     names = [flight_of(log) for log in flights.logs]
     by_flight = [(name, *errors.texts(curves["model"][i, at])) for i, name in enumerate(names)]
-    beaten = f"{better:.2g} times as exact as with frozen rates" if better > 1 else "no better than with frozen rates"
+    beaten = (
+        f"{better:.2g} times as accurate as with frozen rates" if better > 1 else "no better than with frozen rates"
+    )
     worse = [name for i, name in enumerate(names) if (curves["model"][i, at] > frozen[i, at]).all()]
     meaning = [f"The model is worse than frozen rates in every quantity on {', '.join(worse)}."] if worse else []
     return page.Page(
@@ -74,7 +76,7 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
         page.Table(f"RMSE after {known.steps * known.dt:g} s", header, rows),
         [("RMSE over the time since a prediction began, all flights", errors.figure(curves, known.dt))],
         [*meaning, *unlike(known, flights)],
-        ["Where it is wrong for long, adapt it to such flights: hybrid-jax adapt."],
+        ["If it is wrong for long, adapt it to such flights: hybrid-jax adapt."],
         [
             page.Table("When it is most wrong", ("flight", "at", *header[1:]), _worst(known, flights, names, each)),
             page.Table("RMSE on each flight", ("flight", *header[1:]), by_flight),

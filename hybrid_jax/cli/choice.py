@@ -52,10 +52,7 @@ def _within_error(scores: np.ndarray, best: np.ndarray) -> bool:
 
 
 def expected(logs: Float[np.ndarray, "flights ..."], level: float = LEVEL) -> Float[np.ndarray, "3 ..."]:
-    """Return the expected error on another flight and its interval, from the log-errors of flights.
-
-    It uses Student's t, with log-errors of flights as samples of one normal distribution. One flight gives no bound.
-    """
+    """Return the expected error on another flight and its interval, by Student's t of the flights' log-errors."""
     n, middle = len(logs), logs.mean(axis=0)
     if n < 2:
         return np.stack([np.exp(middle), np.zeros_like(middle), np.full_like(middle, np.inf)])

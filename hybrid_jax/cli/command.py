@@ -24,12 +24,12 @@ Options = TypeVar("Options")
 # Exit codes; that of a signal is 128 + its number. ADAPTED is 0.
 BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED = 2, 3, 4
 VERBS = {
-    "inspect": "say what logs hold and lack, and write a vehicle file from them",
+    "inspect": "check what logs contain, and write a vehicle file from them",
     "fit": "learn a vehicle from its logs",
-    "identify": "learn a vehicle from its commands and whatever was measured",
+    "identify": "learn a vehicle from its commands and any measurements",
     "adapt": "adapt a model to logs after a change, and say what changed",
     "check": "compare a model's predictions with flights",
-    "plan": "plan the flight that tells the parameters of a model best",
+    "plan": "plan the most informative flight for a model",
     "replay": "show a flight in 3-D, and where a model expects the vehicle",
     "export": "write a model as C, CasADi functions or StableHLO",
 }
@@ -133,13 +133,7 @@ def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
 
 @contextlib.contextmanager
 def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
-    """On invalid input or a signal, end the process with one line on stderr and an exit code.
-
-    Args:
-        program: the program's name, which begins the line.
-        command: the command whose options appear in messages; see `in_flags`.
-        interrupted: the message on Ctrl-C.
-    """
+    """On invalid input or a signal, end the process with one line on stderr and an exit code."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a letter ends no run

@@ -131,7 +131,7 @@ def unlearned_drag(logs: Sequence[Recording]) -> str:
     if correlation > -DRAGGED:
         return ""
     told = f"specific force across the thrust is {slope:.2g} v (correlation {correlation:.2f})"
-    return f"{told}: drag, which is not learned, so lag and inertia take it up: learn drag as well"
+    return f"{told}: drag, which is not learned, so lag and inertia absorb it: learn drag as well"
 
 
 def _across(log: Recording) -> tuple[np.ndarray, np.ndarray] | None:

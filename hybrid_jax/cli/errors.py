@@ -70,4 +70,4 @@ def parameter_table(found: Adaptation) -> Table:
 def unknown(found: Adaptation) -> list[str]:
     """Say which parameters the flights do not identify; empty if there are none."""
     names = [name for name, one in found.parameters.items() if one.high == np.inf]
-    return [f"The flights do not tell {', '.join(names)}: other values fit them as well."] if names else []
+    return [f"The flights do not identify {', '.join(names)}: other values fit as well."] if names else []

@@ -24,7 +24,7 @@ GRAVITY, HOVER = 9.81, 0.5  # m/s²; the specific force of hover is that close t
 FLYING = 0.3  # share of the motors' 0.9-quantile below which a vehicle stands
 SLOW = 1.0  # s of a trend that is taken out; longer than the lag, which would not show otherwise
 EXPLAINED = 0.3  # correlation of roll and pitch with the regression from which on it counts
-FOLLOWS = 0.5  # correlation of thrust with the motors from which on it tells their lag
+FOLLOWS = 0.5  # correlation of thrust with the motors above which it determines their lag
 LEAST_SPREAD = 0.3  # m/s², of the specific force, for a curve of thrust
 
 
@@ -94,12 +94,12 @@ def estimate(recordings: Sequence[Recording]) -> Estimate:
     count = usable[0].rotors if usable else 0
     pieces = [piece for each in usable if each.rotors == count for piece in _pieces(each)]
     if not pieces:
-        raise ValueError("vehicle file: no log holds motors in flight; hybrid-jax inspect says what to log")
+        raise ValueError("vehicle file: no log has motors in flight; hybrid-jax inspect says what you should log")
     commands = pieces[0].commands
     pieces = [piece for piece in pieces if piece.commands == commands]
     fits = {lag: _regress(pieces, lag) for lag in TIME_CONSTANTS}
     heave = {lag: found for lag in TIME_CONSTANTS if (found := _curve(pieces, lag)) is not None}
-    # Thrust tells the lag better than roll and pitch, which the controller couples to the motors.
+    # Thrust determines the lag better than roll and pitch, which the controller couples to the motors.
     scores = {lag: correlation for lag, (_, correlation) in heave.items()}
     if min(scores.values(), default=0.0) < FOLLOWS:
         scores = {lag: float(correlations[:2].sum()) for lag, (_, correlations) in fits.items()}

@@ -91,7 +91,7 @@ def run(options: Options) -> int:
         raise ValueError(f"--dt is needed: {options.model} does not say how long the steps of its flights were")
     checks.positive(f"{options.model}: dt" if options.dt is None else "--dt", dt, "a positive number of seconds")
     if "c" not in options.to and any(getattr(options, name) for name in FILTER):
-        raise ValueError(f"--{', --'.join(FILTER)} need --to c: the filter is written as C alone")
+        raise ValueError(f"--{', --'.join(FILTER)} need --to c: the filter is only written as C")
     for name in ("smooth", "period"):
         if (value := getattr(options, name)) is not None:
             checks.positive(f"--{name}", value)
@@ -151,7 +151,7 @@ def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> 
     if not (sensors := options.noise or SENSOR_NOISE * rigid):
         return "--noise must say how exactly the states are measured"
     if options.disturbance and not rigid:
-        raise ValueError("--disturbance is that of a rigid body, and the model is none")
+        raise ValueError("--disturbance needs the model of a rigid body")
     noise, process = (
         _of_states("noise", sensors, d),
         _of_states("process", options.process or PROCESS * rigid or (0,), d),
@@ -182,7 +182,7 @@ def _prior(words: tuple[str, ...], field: AbstractVectorField) -> float | dict[s
             return float(words[0])
         named = {name: float(value) for name, value in (word.split("=") for word in words)}
     except ValueError:
-        raise ValueError(f"--prior must be a number, or words such as Ix=0.3, got {' '.join(words)}") from None
+        raise ValueError(f"--prior must be a number, or for example Ix=0.3, got {' '.join(words)}") from None
     groups = {name.partition("[")[0] for name in named_parameters(field)} - {"disturbance"}
     return dict.fromkeys(groups, PRIOR) | named
 
@@ -190,12 +190,10 @@ def _prior(words: tuple[str, ...], field: AbstractVectorField) -> float | dict[s
 def _change(field: AbstractVectorField, beta: float) -> str:
     """Describe the largest difference in ẋ between the smooth field and the field."""
     if (motion := motion_of(field)) is None:
-        return "How much smoothing changes ẋ was not looked at: the model holds no windows that it learned from."
+        return "The effect of smoothing on ẋ is unknown: the model has no training windows."
     columns = jnp.asarray(motion.x0.T), jnp.asarray(motion.u[:, 0].T)
     before, after = (np.asarray(eqx.filter_jit(one.infer_batch)(*columns)) for one in (field, smoothed(field, beta)))
     off = np.abs(after - before).max(axis=1)
     entry = int(off.argmax())
     told = f"smooth {beta:g}: ẋ differs by at most {off[entry]:.2g}, in entry {entry}"
-    return (
-        f"{told}, of RMS {np.sqrt(np.mean(np.square(before[entry]))):.2g}; {len(motion)} states that it learned from."
-    )
+    return f"{told}, of RMS {np.sqrt(np.mean(np.square(before[entry]))):.2g}; {len(motion)} training states."

@@ -64,12 +64,12 @@ def run(options: Options) -> int:
         return identify.run(identify.Options(folder=options.before, vehicle=path, **own))
     model = replace(model, learn=options.learn or model.learn)
     if not model.learn:
-        raise ValueError(f"{path}: learn: names nothing; give --learn Ix Iy, or what else is not known")
+        raise ValueError(f"{path}: learn: is empty; give --learn Ix Iy, or other unknown parameters")
     lagging = LAG in model.learn or model.terms.motor_time_constant > 0
     flights = read_flights(options.before, model.vehicle, options.dt, options, lagging=lagging)
     if len(flights.logs) < 2:
-        raise ValueError(f"{options.before}: holds one flight; two at least, of which one is left out to judge by")
-    with step(f"learning from {len(flights.logs)} flights, which are left out in turn") as told:
+        raise ValueError(f"{options.before}: has one flight; you need at least two, because one is held out")
+    with step(f"learning from {len(flights.logs)} flights, each held out in turn") as told:
         found = learn(model, flights.logs, options.seed)
         told(f"{found.chosen} predicts them best")
     about = _about(options, model, flights, found)
@@ -126,16 +126,16 @@ def _page(options: Options, flights: Flights, found: Learned) -> page.Page:
         (name, *(f"{errors.ratio(found.left_out[each][i, -1], frozen[i]):.3g}" for each in CANDIDATES))
         for i, name in enumerate(flights.contents)
     ]
-    adds = "a network beside it predicts better still" if found.chosen == "hybrid" else "a network adds nothing"
+    adds = "a network improves the predictions" if found.chosen == "hybrid" else "a network does not help"
     return page.Page(
-        f"What do {len(flights.logs)} flights of {options.before} tell of the vehicle?",
-        f"Predictions of {seconds:g} s on flights left out are {better:.2g} times as exact as with frozen rates.",
+        f"What do {len(flights.logs)} flights of {options.before} show about the vehicle?",
+        f"Predictions of {seconds:g} s on held-out flights are {better:.2g} times as accurate as with frozen rates.",
         page.Table(
-            f"Error to expect after {seconds:g} s on a flight that nobody has recorded",
+            f"Expected error after {seconds:g} s on a new flight",
             ("quantity", "RMSE", "80 % from", "to", FROZEN),
             rows,
         ),
-        [("RMSE on flights that were left out", errors.figure(found.left_out, options.dt))],
+        [("RMSE on held-out flights", errors.figure(found.left_out, options.dt))],
         [
             f"The model is {found.chosen}: {adds}.",
             *([f"Rotors follow the motors of the logs with {1000 * found.lag:.3g} ms."] if found.lag else []),
@@ -144,7 +144,7 @@ def _page(options: Options, flights: Flights, found: Learned) -> page.Page:
         [f"After a change: hybrid-jax adapt {options.output} AFTER -o adapted.npz, with ten seconds of flight."],
         [
             errors.parameter_table(found.physics),
-            page.Table(f"Error on each flight left out, over that of {FROZEN}", ("flight", *CANDIDATES), by_flight),
+            page.Table(f"Error on each held-out flight relative to {FROZEN}", ("flight", *CANDIDATES), by_flight),
         ],
         flights.said,
     )

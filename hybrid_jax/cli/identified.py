@@ -53,18 +53,22 @@ def adapt(options: Any, model: Model) -> int:
         for name in dict.fromkeys([*changed, *after])
     ]
     alone = [
-        f"{name} alone, from {before[name]['value']:.4g} to {value:.4g} ({low:.4g} to {high:.4g}), would explain "
+        f"{name} from {before[name]['value']:.4g} to {value:.4g} ({low:.4g} to {high:.4g}) would by itself explain "
         f"{share:.0%} of how these logs differ."
         for name, (share, value, low, high) in changed.items()
     ]
     todo = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     shown = page.Page(
         f"What changed, by {len(logs)} logs of {options.after}, {found.seconds:.0f} s?",
-        f"Changed: {alone[0]}" if changed else "Nothing changed that these logs can tell.",
+        f"Changed: {alone[0]}" if changed else "These logs show no change.",
         page.Table("Before, and after with 95 % intervals", HEADER, lines[:LINES]),
         [("Errors of predictions of the adapted model", figure(found.field, logs, layout))],
         [*warned(read, found), *alone[1:]],
-        [todo if changed else "Keep the model; if something did change, fly what excites the vehicle more."],
+        [
+            todo
+            if changed
+            else "Keep the model. If something did change, you should fly manoeuvres that excite it more."
+        ],
         [
             page.Table("All parameters", HEADER, lines),
             predicted(model.field, logs, layout, "before"),
@@ -82,10 +86,10 @@ def check(options: Any, model: Model) -> int:
     read, layout = _like(options, options.flights, model), layout_of(model.about["identified"])
     logs = [*read.logs.values()]
     whole = predicted(model.field, logs, layout, "all logs")
-    ends = "; ".join(f"{name} by {error} {unit}" for name, unit, _, error in whole.lines)
+    ends = "; ".join(f"{name} {error} {unit}" for name, unit, _, error in whole.lines)
     shown = page.Page(
         f"How well does {options.model.name} predict {len(logs)} logs of {options.flights}?",
-        f"After {layout.dt * layout.steps:.3g} s it errs in {ends}.",
+        f"After {layout.dt * layout.steps:.3g} s its RMS errors are: {ends}.",
         whole,
         [("Errors of predictions, all logs", figure(model.field, logs, layout))],
         [ANYWAY.format(len(read.failed))] * bool(read.failed),
@@ -107,7 +111,7 @@ def _like(options: Any, folder: Path, model: Model) -> Read:
     told = "command" if isinstance(field, Actuated) else "rotor_speed"
     for log in read.logs.values():
         if told not in log.signals:
-            raise ValueError(f"{log.name}: has no {told}, which the model is told; leave it out")
+            raise ValueError(f"{log.name}: has no {told}, which the model needs; leave it out")
     require_unseen(model.about["learned_from"], read.contents)
     return read
 

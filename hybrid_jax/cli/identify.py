@@ -166,10 +166,10 @@ def _model_of(options: Options) -> VehicleModel:
     model = load_vehicle_model(options.vehicle)
     model = replace(model, learn=options.learn) if options.learn else model
     if not model.learn:
-        raise ValueError(f"{options.vehicle}: learn: names nothing; give --learn Ix Iy, or what else is not known")
+        raise ValueError(f"{options.vehicle}: learn: is empty; give --learn Ix Iy, or other unknown parameters")
     if LAG in model.learn:
         mend = _learn(model.learn, (LAG,))
-        raise ValueError(f"{options.vehicle}: learn: {LAG} is for rotor speeds alone, not for commands: {mend}")
+        raise ValueError(f"{options.vehicle}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
     return model
 
 
@@ -186,7 +186,7 @@ def _field_of(options: Options, model: VehicleModel, logs: Sequence[Recording]) 
             mend = f"leave out {speeds_alone[0]}" if speeds_alone else "give it a table [actuator]; see --help"
             raise ValueError(f"{options.vehicle}: {log.name} has commands and no rotor speeds: {mend}")
     if lost := [name for name in model.learn if name in NAMES]:
-        why = f"need commands, and {speeds_alone[0]} has rotor speeds alone"
+        why = f"need commands, and {speeds_alone[0]} has only rotor speeds"
         raise ValueError(f"{options.vehicle}: learn: {', '.join(lost)}: {why}: {_learn(model.learn, lost)}")
     return model.physics()
 
@@ -205,12 +205,12 @@ def _page(options: Options, found: Identified, read: Read) -> page.Page:
     fitted = [(name, _unit(name), "  ".join(f"{e:.3g}" for e in each)) for name, each in found.errors.items()]
     again = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     return page.Page(
-        f"What do {len(logs)} logs of {options.folder} tell of the vehicle?",
-        f"{len(values) - len(unseen)} of {len(lines)} numbers are told by {found.seconds:.4g} s of flight.",
+        f"What do {len(logs)} logs of {options.folder} show about the vehicle?",
+        f"{len(values) - len(unseen)} of {len(lines)} parameters are identified by {found.seconds:.4g} s of flight.",
         page.Table("Parameters, with 95 % intervals", header, lines[:LINES]),
-        [("Errors of predictions from the state that earlier samples tell", errors)],
+        [("Errors of predictions from the state estimated from earlier samples", errors)],
         [*warned(read, found), *_notes(found, logs, unseen)],
-        [f"Fly what excites {', '.join(unseen)}, or learn less." if unseen else again],
+        [f"You should excite {', '.join(unseen)} more, or learn fewer parameters." if unseen else again],
         [
             *([page.Table("All parameters, with 95 % intervals", header, lines)] * (len(lines) > LINES)),
             page.Table("RMS of the errors over the windows fitted", ("quantity", "unit", "x, y, z …"), fitted),
@@ -220,7 +220,7 @@ def _page(options: Options, found: Identified, read: Read) -> page.Page:
 
 
 def warned(read: Read, found: Identified) -> list[str]:
-    stopped = "The fit stopped before it converged: start nearer, or learn less."
+    stopped = "The fit stopped before it converged: start closer, or learn fewer parameters."
     return [ANYWAY.format(len(read.failed))] * bool(read.failed) + [stopped] * (not found.converged)
 
 
@@ -230,11 +230,11 @@ def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) 
     shares = ", ".join(f"{axis} {share:.2f}" for axis, share in zip("xyz", found.explained, strict=True))
     learned = {name.partition("[")[0] for name in found.intervals}
     notes = {
-        f"Not told by these logs, left as they were: {', '.join(unseen)}.": unseen,
-        f"Commands {max(slow, default=0):.3g} s apart: they changed in between, which the intervals count; a delay and "
-        "a lag are hardly told apart by such a log.": slow,
-        f"Share of the body rates within a window, less their trend, that commands explain: {shares}; inertia and "
-        "torque have intervals that hold both regressions, of torque on acceleration and the other way round.": True,
+        f"Not identifiable from these logs, unchanged: {', '.join(unseen)}.": unseen,
+        f"Commands {max(slow, default=0):.3g} s apart: the intervals include changes in between; such a log "
+        "hardly distinguishes a delay from a lag.": slow,
+        f"Share of the detrended body rates within a window that commands explain: {shares}; inertia and "
+        "torque have intervals that contain both regressions, of torque on acceleration and the other way round.": True,
         ("" if "drag" in learned else unlearned_drag(logs)): True,
     }
     return [note for note, holds in notes.items() if note and holds]

@@ -82,7 +82,7 @@ class Inspected(NamedTuple):
 
     @property
     def result(self) -> str:
-        """The result in one word: refused, fails, or ready."""
+        """The result: not read, FAILS, no flight, or ready."""
         if self.recording is None:
             return f"not read: {self.refusal}"
         if more := self.failed:
@@ -220,7 +220,7 @@ def _checks(logs: Sequence[Inspected]) -> page.Table:
     for log in logs:
         own = {check.name: check for check in log.checks}
         lines.append((log.name, *(_verdict(own[name]) if name in own else EMPTY for name in every)))
-    return page.Table("Checks (? cannot tell; docs/howto/logs.md says what each asks)", ("log", *every), lines)
+    return page.Table("Checks (?: cannot tell; docs/howto/logs.md explains each)", ("log", *every), lines)
 
 
 def _verdict(check: Check) -> str:

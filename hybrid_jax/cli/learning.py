@@ -51,13 +51,7 @@ class Learned(NamedTuple):
 
 
 def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Learned:
-    """Learn from all flights, and choose by held-out flights whether to add a network to the physics.
-
-    Args:
-        model: the vehicle's constants and, in `learn`, the unknown ones.
-        logs: two flights or more; the rotor lag is the model's, or is selected if it should be learned.
-        seed: random seed of the network.
-    """
+    """Learn from all flights (two or more), and choose by held-out flights whether to add a network to the physics."""
     lag = _lag(model, logs) if LAG in model.learn else model.terms.motor_time_constant
     logs = lagged(logs, lag)
     # One scale of errors for all flights, so that all trainings share a program.

@@ -45,7 +45,7 @@ class LogOptions:
         """Arguments of the functions of `hybrid_jax.flights.load`; raises ValueError for malformed topics."""
         for word in self.topics:
             if "=" not in word:
-                raise ValueError(f"--topics must be words such as odometry=/odom, got {word!r}")
+                raise ValueError(f"topics must be pairs like odometry=/odom, got {word!r}")
         topics = dict(word.split("=", 1) for word in self.topics)
         return {"columns": self.columns, "topics": topics, "motor_order": self.motor_order}
 
@@ -106,9 +106,7 @@ class Looked(NamedTuple):
 
 
 def require_distinct(flights: Sequence[tuple[str, Any]]) -> None:
-    """Raise ValueError if a flight occurs twice, since it could be in training and test; `flights` are names and
-    contents.
-    """
+    """Raise ValueError if a flight occurs twice, as it could be in training and test; pass names and contents."""
     first: dict[Any, str] = {}
     for name, content in flights:
         if content in first:
@@ -121,7 +119,9 @@ def require_unseen(learned_from: Mapping[str, str], contents: Mapping[str, str])
     names = {content: name for name, content in learned_from.items()}
     for name, content in contents.items():
         if content in names:
-            raise ValueError(f"{name}: the same flight as {names[content]}, which the model learned from; leave it out")
+            raise ValueError(
+                f"{name}: the same flight as {names[content]}, which the model was trained on; leave it out"
+            )
 
 
 def content_of(recording: Recording) -> str:
@@ -144,10 +144,9 @@ def raw_logs(folder: Path, read: Callable[[Path], Any]) -> tuple[list[tuple[Path
 def read_flights(
     folder: Path, vehicle: Vehicle, dt: float, options: FlightOptions, changed: bool = False, lagging: bool = False
 ) -> Flights:
-    """Read, check and cut all logs; failed ones are left out with a line.
+    """Read, check and cut logs; failed ones are left out with a line.
 
-    `changed` tolerates another thrust, `lagging` motors that lead the gyro, as the model knows or learns by how much.
-    Raises ChecksFailed if no log is left, and ValueError if a log is unreadable or a duplicate.
+    `changed` tolerates another thrust, and `lagging` motors that lead the gyro because the model includes their lag.
     """
     with step(f"reading {folder}") as told:
         raws, said = raw_logs(folder, lambda path: read_recording(path, **options.reading))
@@ -166,7 +165,9 @@ def read_flights(
         for line in failed:
             print(f"  {line}", file=sys.stderr)
         if not logs:
-            raise ChecksFailed(*failed, "no log passed its checks; mend them as the lines above say, or --anyway")
+            raise ChecksFailed(
+                *failed, "no log passed its checks; correct them as the lines above say, or use --anyway"
+            )
         found = Flights(logs, contents, said + failed)
         told(f"{len(logs)} of {len(raws)} flights, {found.seconds:.0f} s in the air")
     return found
@@ -181,7 +182,7 @@ def look(
     changed: bool = False,
     lagging: bool = False,
 ) -> Looked:
-    """Check a log and cut it to its flight; without a vehicle, it is compared with itself."""
+    """Check a log and cut it to its flight; if the vehicle cannot be used, it is compared with itself."""
     checks, notes = check_recording(raw, vehicle, dt), []
     scaled = "rotor_speed" in raw.signals or bool(options.polynomial)
     try:

@@ -18,13 +18,7 @@ from hybrid_jax.vehicle import Vehicle
 
 
 class Known(NamedTuple):
-    """A model of a vehicle.
-
-    Attributes:
-        field: the model.
-        vehicle: its constants.
-        about: metadata written by `fit`.
-    """
+    """A model of a vehicle, with its constants and the metadata written by `fit`."""
 
     field: AbstractVectorField
     vehicle: Vehicle
@@ -45,7 +39,7 @@ def known_of(path: Path, model: Model) -> Known:
     if "identified" in model.about:
         raise ValueError(f"{path}: was identified without states, which replay draws; hybrid-jax check predicts logs")
     if vehicle is None or not {"dt", "steps", "learned_from", "motion"} <= model.about.keys():
-        raise ValueError(f"{path}: is no model that hybrid-jax fit or adapt wrote")
+        raise ValueError(f"{path}: is not a model written by hybrid-jax fit or adapt")
     return Known(model.field, vehicle, model.about)
 
 
@@ -72,7 +66,5 @@ def unlike(known: Known, flights: Flights) -> list[str]:
     shares = shares_outside(learned, asked)
     unit = "of the time, so errors there may be larger than expected"
     return [
-        f"{name} is outside of what was learned from {share:.0%} {unit}."
-        for name, share in shares.items()
-        if share > WARN
+        f"{name} is outside the training range {share:.0%} {unit}." for name, share in shares.items() if share > WARN
     ]

@@ -28,13 +28,7 @@ img { background: #fff } figcaption { color: #aaa } }
 
 
 class Table(NamedTuple):
-    """A table of texts.
-
-    Attributes:
-        title: title of the table.
-        header: names of the columns.
-        lines: rows of cells.
-    """
+    """A titled table of texts."""
 
     title: str
     header: Sequence[str]
@@ -67,14 +61,7 @@ class Page:
 
 
 def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
-    """Write report.html and report.json into a folder, and print where they are.
-
-    Args:
-        out: the folder.
-        verb: name of the verb.
-        page: contents of the HTML page.
-        found: JSON values by name, for programs.
-    """
+    """Write report.html and report.json (`found`, for programs) into a folder, and print where they are."""
     record = {"format": FORMAT, "verb": verb, "answer": page.answer, "notes": list(page.notes)} | found
     write_atomic(out / "report.json", json_text(json_value(record)).encode())
     write_atomic(out / "report.html", document(page).encode())

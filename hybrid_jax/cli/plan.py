@@ -98,8 +98,8 @@ def _page(options: Options, found: Excitation, points: np.ndarray, values: dict[
     header = ("parameter", "value", "half-width", "of the value")
     worst = max(found.parameters, key=lambda name: shares[name])
     return page.Page(
-        f"Which {options.seconds:g} s of flight tell the parameters of {options.model.name} best?",
-        f"{options.output}: every parameter to ± {shares[worst]:.1%} or better; {worst} is told worst.",
+        f"Which {options.seconds:g} s of flight identify the parameters of {options.model.name} best?",
+        f"{options.output}: every parameter to ± {shares[worst]:.1%} or better; {worst} is the least certain.",
         page.Table("Expected 95 % intervals", header, rows[:5]),
         [("The flight: from above, and over time", _figure(found, points))],
         said,

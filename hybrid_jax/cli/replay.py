@@ -61,7 +61,7 @@ def run(options: Options) -> int:
     reading = reading_of(first, options)
     logs = lagged(read_flights(options.flight, first.vehicle, first.dt, reading, True, lag > 0).logs, lag)
     if len(logs) > 1:
-        raise ValueError(f"{options.flight}: holds {len(logs)} flights; give one of them")
+        raise ValueError(f"{options.flight}: has {len(logs)} flights; give one of them")
     steps, every = max(1, round(options.ahead / first.dt)), max(1, round(1 / SHOWN / first.dt))
     windows = windows_of(logs, steps, every).windows[: max(1, round(options.seconds * SHOWN))]
     with step(f"predicting and drawing {len(windows)} pictures"):

@@ -9,7 +9,7 @@ from hybrid_jax.cli.estimates import GRAVITY, Estimate
 ARM, MASS = 0.1, 1.0  # m and kg, where they were not given
 LEARN, OF_VELOCITY = ("Ix", "Iy", "Iz", "k_rotors", "rate_damping"), ("drag", "aerodynamic_moment")
 WEIGH = "PLACEHOLDER: weigh it; thrust and inertia grow with it"
-TOP = 1000.0  # rad/s at full command, where speeds are not known: thrust alone matters
+TOP = 1000.0  # rad/s at full command if speeds are unknown: only thrust matters
 
 
 def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | None) -> str:
@@ -23,7 +23,7 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
     k = thrust / top**2 if found.commands else thrust
     lines = [
         "# Written from logs by hybrid-jax inspect. Numbers with a # are explained; those marked",
-        "# PLACEHOLDER are not told by any log: measure them.",
+        "# PLACEHOLDER are not identifiable from logs: measure them.",
         f"learn = {json.dumps([*LEARN, *(OF_VELOCITY if found.moves else ())])}",
         "",
         "[vehicle]",
@@ -72,7 +72,7 @@ def _turning(found: Estimate, thrust: float, places: np.ndarray, k: float, top: 
     torque = (ix + iy) * float(np.abs(found.effect[2]).mean()) * k / thrust
     sure = "" if found.correlations[2] > 0.3 else "; PLACEHOLDER: yaw hardly moves, check it"
     return [
-        f"inertia = [{ix:.4g}, {iy:.4g}, {ix + iy:.4g}]  # kg m²; {why}; Iz = Ix + Iy, as of a flat body",
+        f"inertia = [{ix:.4g}, {iy:.4g}, {ix + iy:.4g}]  # kg m²; {why}; Iz = Ix + Iy, as for a flat body",
         f"torque_coefficient = {torque:.3g}  # N m/(rad/s)²; with that Iz{sure}",
         f"spin = {spin}  # sign of each rotor's reaction torque about z, up{sure}",
     ]
@@ -101,7 +101,10 @@ def _hover(found: Estimate) -> str:
 
 
 def _actuator(found: Estimate, mass: float, thrust: float) -> list[str]:
-    curve, told = np.array([0.0, 0.0, thrust]), "through hover alone, as if thrust grew with the square of the command"
+    curve, told = (
+        np.array([0.0, 0.0, thrust]),
+        "from hover only, assuming that thrust is proportional to the squared command",
+    )
     if found.curve is not None:
         curve, told = mass * found.curve, "from the accelerometer"
     lines = [f'gives = "thrust"  # of a rotor [N], of the command from 0 to 1; {told}',

@@ -173,10 +173,7 @@ def nested(shape: Sequence[int], *body: Statement) -> Statement:
 
 
 def arranged(steps: Sequence[Step], results: frozenset[str], end: Sequence[Statement]) -> tuple[Statement, ...]:
-    """Assemble the body of a function: the steps that its end needs, which reads `results`, and the end.
-
-    Arrays that are no longer read are reused if type and size allow, because compilers keep each on the stack.
-    """
+    """Assemble a function's body: the needed steps and the end. Arrays that are no longer read are reused."""
     steps = _needed(steps, results)
     last = {name: i for i, step in enumerate(steps) for name in step.uses}
     arrays = {step.makes: step.array for step in steps if step.array}

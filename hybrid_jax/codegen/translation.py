@@ -184,7 +184,7 @@ class Translation(ABC, Generic[Column]):
 
 
 def _evaluated(equation: JaxprEqn, inputs: Sequence[Any]) -> list[Any]:
-    """Evaluate an operation on numbers, with NumPy if it is frequent, because JAX compiles each anew."""
+    """Evaluate an operation on numbers, with NumPy if frequent, because JAX compiles each call."""
     if (move := _BY_NUMPY.get(equation.primitive.name)) is not None:
         return [move(equation.params, *map(np.asarray, inputs))]
     found = equation.primitive.bind(*map(jnp.asarray, inputs), **equation.params)

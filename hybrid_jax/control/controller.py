@@ -179,7 +179,7 @@ class Controller:
         if not callable(model):
             raise ValueError(f"model must be a vector field, got {checks.short_repr(model)}")
         if not isinstance(plan, Plan):
-            raise ValueError(f"plan must be begin() or that of the last call, got {checks.short_repr(plan)}")
+            raise ValueError(f"plan must be begin() or the plan of the last call, got {checks.short_repr(plan)}")
         if plan.variables.shape != (shape := (self.steps, self.vehicle.rotors)):
             raise ValueError(f"plan must have variables of shape {shape}, got {plan.variables.shape}")
         x, reference, plan = checked_states("x", x, reference, plan, self.steps)
@@ -227,7 +227,7 @@ class Controller:
         acceleration = -ATTITUDE_GAIN * angle - RATE_GAIN * (x[BODY_RATES] - wanted[BODY_RATES])
         weight = jnp.asarray([vehicle.mass * vehicle.gravity], x.dtype)
         wrench = jnp.concatenate([weight, jnp.asarray(vehicle.inertia, x.dtype) * acceleration])
-        rows = min(4, vehicle.rotors)  # three rotors leave yaw alone
+        rows = min(4, vehicle.rotors)  # three rotors do not affect yaw
         squares = jnp.asarray(np.linalg.pinv(vehicle.mixer[:rows]), x.dtype) @ wrench[:rows]
         share = (jnp.sqrt(jnp.maximum(squares, 0.0)) - middle) / half
         return jnp.arctanh(jnp.clip(share, -math.tanh(VARIABLE_BOUND), math.tanh(VARIABLE_BOUND)))

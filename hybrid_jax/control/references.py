@@ -34,7 +34,7 @@ def sample(path: Path, controller: Controller, duration: float) -> Float[Array, 
         duration: length of the flight [s].
     """
     if not callable(path):
-        raise ValueError(f"path must be a function of time, such as hover(), got {checks.short_repr(path)}")
+        raise ValueError(f"path must be a function of time, for example hover(), got {checks.short_repr(path)}")
     checks.positive("duration", duration, "a positive number of seconds")
     count = round(duration / controller.period) + controller.steps * controller.stride + 1
     times = controller.period * jnp.arange(count)

@@ -16,7 +16,7 @@ from hybrid_jax.vehicle import MOST_ROTORS
 
 DT = 0.01  # s, of logs whose signals have times of their own
 STATES = ("position", "velocity", "attitude", "rates")
-WHOLE = 0.9  # share of the rows of a CSV file that must hold all of a flight, for one at their times
+WHOLE = 0.9  # share of complete rows in a CSV file above which the flight has their times
 # What to log, by format, ready to paste.
 CRAZYFLIE = (
     *(f"stateEstimate.{each}" for each in ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz")),
@@ -27,7 +27,7 @@ CRAZYFLIE = (
 ADVICE = {
     "Crazyflie µSD": f"put below on:fixedFrequency in config.txt of the card: {' '.join(CRAZYFLIE)}",
     "ROS bag": 'record odometry, IMU and motors, and name them: topics={"motors": "/TOPIC:FIELD:UNIT"}',
-    "Betaflight blackbox": "blackbox cannot hold them: it serves to identify thrust, inertia and lag",
+    "Betaflight blackbox": "blackbox has no fields for them; use it to identify thrust, inertia and lag",
     "CSV": 'name the columns in a column map: columns="MAP.toml"',
 }
 # Topics of PX4 with the interval to log them at [ms], 0 for all; and since when those are that came later [version].
@@ -118,10 +118,7 @@ def missing_states(recording: Recording) -> list[str]:
 
 
 def what_to_log(recording: Recording) -> str:
-    """Advise what to log, or say why a logged quantity was left out.
-
-    A topics file replaces PX4's logging profile, so the advice lists all topics that identification needs.
-    """
+    """Advise what to log, or say why a logged quantity was left out; for PX4, its topics file lists all topics."""
     kind, program = (recording.facts.get(name, "") for name in ("format", "program"))
     for note in (note for note in recording.notes if "is not valid" in note):
         return f"{note}; wait for the estimator"

@@ -209,11 +209,7 @@ def read_recording(
 
 
 def reordered(recording: Recording, motor_order: Sequence[int]) -> Recording:
-    """Reorder the motors for the vehicle: rotor i is the log's motor `motor_order[i]`.
-
-    Raises:
-        ValueError: a motor is named twice or does not exist.
-    """
+    """Reorder the motors for the vehicle: rotor i is the log's motor `motor_order[i]`."""
     signals, order = dict(recording.signals), [*motor_order]
     for name in ROTOR_UNITS.keys() & signals.keys():
         signal = signals[name]

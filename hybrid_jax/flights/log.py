@@ -89,7 +89,7 @@ def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
 
 def unlike_one(q: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
     """Whether the norm of each quaternion differs from 1."""
-    with np.errstate(over="ignore", invalid="ignore"):  # an infinite norm is refused too
+    with np.errstate(over="ignore", invalid="ignore"):  # an infinite norm is rejected too
         return ~(np.abs(np.linalg.norm(q, axis=1) - 1) <= NORM_TOLERANCE)
 
 

@@ -101,10 +101,7 @@ def flight_of(log: FlightLog) -> str:
 
 
 def manoeuvre_of(log: FlightLog) -> str:
-    """Return a flight's name without its run number: "chirp_run2" and "chirp-03" give "chirp".
-
-    The number must follow a separator or "run", "flight", "take" or "log", so "figure8" is unchanged.
-    """
+    """Remove the run number from a flight's name: "chirp_run2" and "chirp-03" give "chirp", "figure8" stays."""
     return _RUN.sub("", flight_of(log)) or flight_of(log)
 
 

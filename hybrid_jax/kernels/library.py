@@ -71,10 +71,7 @@ def compiled(source: str, needs_math: bool) -> str:
 
 
 def call(handler: str, results: Results, *arrays, numbers: Sequence[float] = ()):
-    """Call a kernel on arrays, whose number, type and shapes are not checked, and constants.
-
-    Lanes under `vmap` are one call.
-    """
+    """Call a kernel on arrays, whose number, type and shapes are not checked, and constants; `vmap` makes one call."""
     kernel = jax.ffi.ffi_call(handler, results, vmap_method="broadcast_all")
     return kernel(*arrays, numbers=np.array(numbers, np.float32))
 

@@ -19,7 +19,7 @@ from hybrid_jax.kernels.trace import Products, Shape, Split, outputs_of, split, 
 LONGEST = 4000  # statements of a function: GCC takes long for more, and a program of XLA does as well
 CHEAP = {"add", "sub", "mul", "neg", "max", "min", "select_n", "convert_element_type", *LOGICAL}
 INLINED = 12  # operations of an entry that are done again wherever it is needed, at most
-LARGEST = 8192  # numbers of arrays that a function holds for each sample
+LARGEST = 8192  # numbers in a function's arrays per sample
 
 
 class SampleTranslation(CTranslation):

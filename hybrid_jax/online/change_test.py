@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import SPANS, Tuning
 
-NOTHING = 1e-10  # variance of a sum of corrections that are rounding alone
+NOTHING = 1e-10  # variance of a sum of corrections that are only rounding
 
 
 class ChangeTest(eqx.Module):

@@ -40,7 +40,7 @@ from hybrid_jax.runtime import entry
 
 EAGER = 6.0  # squared test, χ² of one degree, from which a disturbance walks faster
 RISE, FALL = 10.0, 0.2  # of the logarithm of how much faster [1/s]
-BREEZE = 0.15  # of a disturbance: walk, in its prior [1/√s], beyond whose effects a parameter must be told
+BREEZE = 0.15  # random walk of a disturbance, in its prior [1/√s], whose effects a parameter's must exceed
 TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a parameter explains
 
 

@@ -18,7 +18,7 @@ from hybrid_jax.online.tuning import MEMORY, Tuning
 
 LARGEST = 1e5  # information of a number beyond which its last digits would count for some
 SHARPER = 5  # passes that make shares zero or one
-TAKES_PART = 0.1  # share from which a parameter is part of what samples do not tell
+TAKES_PART = 0.1  # share above which a parameter is part of a direction that is not excited
 
 
 class Excitation(eqx.Module):

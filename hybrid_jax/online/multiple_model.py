@@ -92,10 +92,7 @@ def with_previous(mixture: Mixture, own: Float[Array | np.ndarray, "h-1 ..."]) -
 
 
 def covariance(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "p p"]:
-    """Covariance of θ: within the mixture's components and between their means.
-
-    A parameter without its own number in a hypothesis has the variance of the filter of all parameters.
-    """
+    """Covariance of θ within the components (from the joint filter for unmodelled parameters) and between them."""
     share, means = weights(mixture), _means(mixture, models, joint)
     effects = with_previous(mixture, models.ahead)
     d = len(joint.z) - effects.shape[1]

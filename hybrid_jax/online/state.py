@@ -124,7 +124,7 @@ def named_priors(
     for name, group in zip(names, groups, strict=True):
         scale = next(disturbed) if group == DISTURBANCE else own.get(name, own.get(group))
         if scale is None:
-            raise ValueError(f"prior: {group} must be given, 0 if it is to stay as it is")
+            raise ValueError(f"prior: {group} must be given, 0 if it should stay constant")
         checks.not_negative(group if group == DISTURBANCE else f"prior of {name}", scale)
         found.append(float(scale))
     if not any(found):

@@ -8,7 +8,7 @@ from hybrid_jax import checks
 # Times in seconds, for `Tuning.pace` 1.
 SPANS = (0.05, 0.5)  # of the two sums of the change test
 PAUSE, SETTLE, HOLD = 0.1, 0.3, 0.6  # least time from an alarm to the next, of a mixture, and to an unexplained one
-WINDOW, TRIAL, MEMORY = 0.2, 10.0, 2.0  # of the mean NIS, of the count of alarms, of what samples tell
+WINDOW, TRIAL, MEMORY = 0.2, 10.0, 2.0  # time constants of the mean NIS, the count of alarms, and the information
 SLOWEST = 0.05  # period up to which a pace of 1 is right
 
 

@@ -87,7 +87,7 @@ def test_a_model_without_parameters_has_no_filter(tmp_path, called):
                 ("noise", ["1", "2"], "--noise must be 1, 4 or 13 numbers, got 2"),
                 ("noise", ["0"], "--noise must be a positive finite number, got 0"),
                 ("disturbance", ["1", "2"], "--disturbance must be 1 or 6 numbers, got 2"),
-                ("prior", ["Ix"], "--prior must be a number, or words such as Ix=0.3, got Ix"),
+                ("prior", ["Ix"], "--prior must be a number, or for example Ix=0.3, got Ix"),
                 ("prior", ["m=1"], "prior: m: must be among Ix, Iy, k"),
             )
         ),

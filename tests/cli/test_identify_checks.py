@@ -66,7 +66,7 @@ def test_what_speeds_do_not_tell_is_refused(folder, ended, learn, rest):
     code, (line,) = ended("--learn", learn)
     assert code == 2
     assert line.startswith("hybrid-jax identify: v.toml: learn: curve")
-    assert line.endswith(f"has rotor speeds alone: give --learn {rest}")
+    assert line.endswith(f"has only rotor speeds: give --learn {rest}")
 
 
 def failed(recording, learn=("k", "Ix"), vehicle=IRIS):

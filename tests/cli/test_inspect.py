@@ -97,7 +97,7 @@ def test_a_folder_is_described_whatever_is_in_it(tmp_path, called):
     assert "chirp_run1.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
     assert "2 of 3 logs are ready for a model" in said
     page = (tmp_path / "report.html").read_text()
-    titles = ("Signals at their own rates", "Checks (? cannot tell;", "What to do")
+    titles = ("Signals at their own rates", "Checks (?: cannot tell;", "What to do")
     assert all(words in page for words in (*titles, "notes.txt: left: no format that is read"))
     assert page.count("data:image/png;base64,") == 2
     results = json.loads((tmp_path / "report.json").read_text())["rows"]
@@ -152,7 +152,7 @@ def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
     ("options", "words"),
     [
         (["--write-vehicle", "flights/chirp_run1.csv.gz"], "exists; name another file"),
-        (["--topics", "/odom"], "--topics must be words such as"),
+        (["--topics", "/odom"], "inspect: --topics must be pairs like"),
         (["--dt", "0"], "--dt must be a positive"),
         (["--vehicle", "none.toml"], "none.toml: not a readable TOML file"),
         (["--vehicle", "mas.toml"], "mas.toml: learn must be names of"),  # which real_flight would refuse later

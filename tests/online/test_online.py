@@ -196,7 +196,7 @@ def test_a_run_beside_others_is_the_run_alone():
     ("options", "said"),
     [
         ({"prior": {"frition": 0.1}}, "prior: frition: must be among friction, idle"),
-        ({"prior": {"friction": 0.1}}, "prior: idle must be given, 0 if it is to stay as it is"),
+        ({"prior": {"friction": 0.1}}, "prior: idle must be given, 0 if it should stay constant"),
         ({"prior": 0.0}, "prior must be positive for a parameter at least, got 0 for all"),
         ({"disturbance": 1.0}, "indices must say"),
         (

@@ -15,14 +15,11 @@ MARGIN = 0.5  # s left out beside time with idle motors where the height is not 
 
 
 def airborne(recording: Recording, told: str = "command") -> list[tuple[float, float]]:
-    """Find the start and end [s] of each time in the air.
+    """Find the start and end [s] of each time in the air, from commands or rotor speeds.
 
     Motors that idle for half a second end a flight. After such a rest, a flight begins once the vehicle is `CLEAR`
     above the height at which it stood or, without a height, once `MARGIN` has passed and the power has reached its
     median.
-
-    Args:
-        told: the quantity to use, "command" or "rotor_speed".
     """
     inputs, position = recording.signals[told], recording.signals.get("position")
     power = (np.asarray(inputs.values) ** 2).sum(axis=1)

@@ -200,7 +200,7 @@ def _spin(log: FlightLog, vehicle: Vehicle, yaw: float) -> Check:
     elif yaw >= OPPOSED:
         turning = (OK, NOTHING) if yaw > YAW_LIMIT else (UNKNOWN, MORE_FLIGHT)
     else:
-        # Of equal Ix and Iy, roll and pitch leave yaw alone. The difference of two estimates may be all there is.
+        # If Ix = Iy, roll and pitch do not affect yaw. The difference of two estimates may be all there is.
         ix, _, iz = vehicle.inertia
         even = respond(log, replace(vehicle, inertia=(ix, ix, iz)))
         sure = even is not None and even.yaw_sign * even.correlations[2] < OPPOSED

@@ -93,8 +93,8 @@ def accelerations(log: FlightLog) -> Pairs:
     stated = {
         NOTHING: (q, v),
         'the log is NED and FRD: set world = "NED" and body = "FRD"': (ned, v @ WORLDS["NED"].T),
-        "attitude alone is NED and FRD: convert it": (ned, v),
-        'position and velocity alone are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
+        "only the attitude is NED and FRD: convert it": (ned, v),
+        'only position and velocity are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
         "height is counted downwards: flip the signs of pz and vz": (q, v * [1, 1, -1]),
         'the body is FRD in a world with z up: set body = "FRD"': (quaternion_from_matrix(frd), v),
         BODY: (q, attitude.apply(v)),

@@ -113,7 +113,7 @@ def _limits(recording: Recording, vehicle: Vehicle | None) -> Check:
             mend = "a 16-bit number wrapped: log it without sign" if wrap else "cut these samples out"
             mend += " or raise max_rotor_speed of the vehicle file" if name == "rotor_speed" and value > 0 else ""
             if share > MOSTLY and not wrap:
-                mend = "most are: are they in another unit, such as PWM in µs? declare it"
+                mend = "most are: are they in another unit, for example PWM in µs? declare it"
             where = f"{name} of motor {column} is {value:.4g} at {signal.t[row]:.4g} s, must be from 0 to {most:.4g}"
             return judged("motors within limits", share, "share of samples", 0.0, f"{where}: {mend}")
     return judged("motors within limits", 0.0, "share of samples", 0.0, "")

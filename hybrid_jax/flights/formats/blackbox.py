@@ -27,11 +27,7 @@ FULL = {True: (48.0, 2047.0), False: (1000.0, 2000.0)}  # motors at rest and at 
 
 
 def read_blackbox(path: str | Path) -> Recording:
-    """Read the longest flight of a file. Commands are in 0 … 1; rotor speeds need bidirectional DShot.
-
-    Raises:
-        ValueError: the file is invalid, or orangebox is not installed.
-    """
+    """Read the longest flight of a file. Commands are in 0 … 1; rotor speeds need bidirectional DShot."""
     try:
         import orangebox  # noqa: F401
     except ImportError as error:
@@ -47,7 +43,7 @@ def read_blackbox(path: str | Path) -> Recording:
     parser, rows, damage = max(flights, key=lambda flight: len(flight[1]), default=(None, np.zeros((0, 0)), ""))
     if parser is None:
         said = f" ({why[0]})" if why else ""
-        raise ValueError(f"{path}: is no blackbox log or is damaged; save it again{said}")
+        raise ValueError(f"{path}: is not a blackbox log or is damaged; save it again{said}")
     if not len(rows):
         raise ValueError(f"{path}: holds no frames; save the log again")
     columns = dict(zip(parser.field_names, rows.T, strict=False))
@@ -98,7 +94,7 @@ def _frames(content: bytes) -> tuple[Any, np.ndarray, str]:
     from orangebox.reader import Reader
     from orangebox.types import FrameType
 
-    with tempfile.NamedTemporaryFile() as file:  # orangebox reads files alone
+    with tempfile.NamedTemporaryFile() as file:  # orangebox only reads files
         file.write(content)
         file.flush()
         parser = _parser()(Reader(file.name, 1))

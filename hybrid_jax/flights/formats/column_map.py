@@ -64,12 +64,7 @@ class Columns:
 
 @dataclass(frozen=True)
 class Format:
-    """The number format of a file.
-
-    Attributes:
-        delimiter: one character between fields.
-        decimal: the decimal mark, a point or a comma.
-    """
+    """The field delimiter and the decimal mark (a point or a comma) of a file."""
 
     delimiter: str = ","
     decimal: str = "."
@@ -165,18 +160,7 @@ def library_map(path: str | Path) -> ColumnMap:
 
 
 def read_mapped(path: str | Path, column_map: ColumnMap | None = None) -> Recording:
-    """Read the mapped quantities of a CSV file, plain or gzip.
-
-    Rows without a time are left out. If a quantity is given in some rows only, for example in joined tables of several
-    rates, it has the times of those rows.
-
-    Args:
-        path: the CSV file.
-        column_map: the meaning of its columns, by default the library's.
-
-    Raises:
-        ValueError: the file is invalid: row, field and what to do.
-    """
+    """Read the mapped quantities of a CSV file; a quantity has the times of the rows in which it is given."""
     column_map = library_map(path) if column_map is None else column_map
     form, stated, frames = column_map.format, column_map.quantities, column_map.frames
     table, notes = read_table(path, column_map.names, delimiter=form.delimiter, decimal=form.decimal)

@@ -105,11 +105,7 @@ Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # variable → its ticks [µ
 
 
 def read_crazyflie(path: str | Path) -> Recording:
-    """Read one log. Commands are the PWM or, without it, the mixer's output, as shares of 65536.
-
-    Raises:
-        ValueError: the file is invalid: variable, time and what to do.
-    """
+    """Read one log. Commands are the PWM or, without it, the mixer's output, as shares of 65536."""
     content = raw.unpacked(path)
     try:
         events, at = _header(path, content)
@@ -145,7 +141,7 @@ def is_crazyflie(head: bytes) -> bool:
 def _header(path, content: bytes) -> tuple[dict[bytes, tuple[list[str], np.dtype]], int]:
     """Return the variables and type of each event by its id, and where the records begin."""
     if not is_crazyflie(content):
-        raise ValueError(f"{path}: is no µSD log of version {VERSION} of a Crazyflie; copy the file again")
+        raise ValueError(f"{path}: is not a µSD log of version {VERSION} of a Crazyflie; copy the file again")
     count, at, events = *struct.unpack_from("<H", content, 3), 5, {}
     for _ in range(count):
         key = content[at : at + 2]
@@ -156,7 +152,9 @@ def _header(path, content: bytes) -> tuple[dict[bytes, tuple[list[str], np.dtype
             text, at = _text(content, at)
             match = _VARIABLE.fullmatch(text)
             if match is None:
-                raise ValueError(f"{path}: byte {at}: {text[:40]!r} is no variable with its type; copy the file again")
+                raise ValueError(
+                    f"{path}: byte {at}: {text[:40]!r} is not a variable with its type; copy the file again"
+                )
             names.append(match[1])
             kinds.append((str(i), f"<{match[2].translate(KINDS)}"))
         events[key] = names, np.dtype(kinds)

@@ -34,9 +34,6 @@ def read_table(
 
     Cells without a number are NaN. Lines before the header that begin with #, % or `sep=;` are skipped; the header
     itself may begin with # or %.
-
-    Raises:
-        ValueError: the file is invalid: row, field and what to do.
     """
     parts, block = [], ""
     try:

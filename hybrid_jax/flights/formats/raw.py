@@ -100,9 +100,6 @@ def record(
 
     These samples are left out, with a note, and become gaps: repeated time stamps, samples up to `LATE` out of order, a
     few with outlying times, and values that are not a number or a rotation. The first of several equal times is kept.
-
-    Raises:
-        ValueError: the log is invalid: file, source, time and what was expected.
     """
     parts = {name: part for name, part in parts.items() if len(part.ticks)}
     if not parts:
@@ -122,7 +119,7 @@ def record(
         t, gone = (part.ticks - start).astype(float) * tick, _lost(name, part)
         beside = ordered.get("attitude", part)
         if part.source.split()[:1] == beside.source.split()[:1] and np.array_equal(part.ticks, beside.ticks):
-            gone |= lost if lost.mean() <= LOST else False  # a message without an attitude tells no position either
+            gone |= lost if lost.mean() <= LOST else False  # a message without an attitude has no position either
         if gone.any() and (name in OPTIONAL or gone.mean() <= LOST):
             why = f"{name} is no {'rotation' if name == 'attitude' else 'number'} in {gone.sum()} samples"
             said.append(f"{part.source}: {why}, the first at {t[gone][0]:.4g} s: left out")

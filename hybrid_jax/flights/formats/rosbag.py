@@ -60,11 +60,7 @@ Messages = dict[str, list[tuple[int, Any]]]  # topic → time [ns] and content o
 
 
 def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Recording:
-    """Read one bag: a folder with metadata.yaml, or a .mcap, .db3 or .bag file.
-
-    Raises:
-        ValueError: the bag is invalid, or rosbags is not installed.
-    """
+    """Read one bag: a folder with metadata.yaml, or a .mcap, .db3 or .bag file."""
     topics = topics or {}
     if unknown := topics.keys() - set(ROLES):
         raise ValueError(f"topics: must name {', '.join(ROLES)}, got {', '.join(sorted(unknown))}")
@@ -114,7 +110,7 @@ def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, t
     except Exception as error:  # a damaged bag makes its libraries raise any exception
         why = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
         raise ValueError(
-            f"{path}: is no bag, or is cut off or damaged: ros2 bag reindex, or copy it again ({why})"
+            f"{path}: is not a bag, or is cut off or damaged: ros2 bag reindex, or copy it again ({why})"
         ) from error
     if empty := [topic for topic, found in messages.items() if not found]:
         raise ValueError(f"{path}: topic {empty[0]} has lost its messages; ros2 bag reindex, or copy it again")

@@ -51,11 +51,7 @@ MOST = 16  # motors or outputs in any topic
 
 
 def read_ulog(path: str | Path) -> Recording:
-    """Read one log. Commands are in 0 … 1; PWM is scaled by the log's minimum and maximum.
-
-    Raises:
-        ValueError: the log is invalid, or pyulog is not installed.
-    """
+    """Read one log. Commands are in 0 … 1; PWM is scaled by the log's minimum and maximum."""
     log, damage = _load(path)
     tables, notes = _instances(log.data_list)
     kinds = {0: "generic"} | OTHERS | {kind: f"multirotor of {count} rotors" for kind, count in ROTORS.items()}
@@ -117,7 +113,7 @@ def _load(path: str | Path) -> tuple[Any, str]:
 def _cut(content: bytes) -> bool:
     """Whether the last message is incomplete, which pyulog does not report."""
     at = 16  # behind the header
-    if content[at + 2 : at + 3] == b"B":  # appended data begin anew at an offset, whatever was cut before it
+    if content[at + 2 : at + 3] == b"B":  # appended data begin at an offset, whatever was cut before it
         at = max(at, *struct.unpack("<3Q", content[at + 19 : at + 43]))
     while at + 3 <= len(content):
         size = int.from_bytes(content[at : at + 2], "little")
@@ -153,7 +149,7 @@ def _table(tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple
     # The time of the measurement where it is recorded, else that of the message.
     use_clock = clock in table and table[clock].min(initial=1) > 0
     ticks = table[clock if use_clock else "timestamp"].astype(np.int64)
-    with np.errstate(invalid="ignore"):  # damaged numbers are refused later
+    with np.errstate(invalid="ignore"):  # damaged numbers are rejected later
         return ticks, np.stack([table[field] for field in fields], axis=1).astype(float)
 
 
