@@ -125,7 +125,7 @@ class Auto(Method):
         jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))  # then the outer program has the options
         fits, judge, conclude = (fit_each, _judge, _conclude) if traced else (_fit_each, _judged, _concluded)
-        # Of the settings these alone matter; as an array, another scale asks for no other program.
+        # Only these settings matter; as an array, another scale needs no other program.
         scale, solver = scale_of(settings.objective, train.x0.shape[-1]), settings.solver
         larger = extended(field, train.x0.shape[1])
         options = self.plausible.sizes(larger, train), solver, scale, self.max_steps
@@ -156,7 +156,7 @@ def _judge(
     start, free = ravel_parameters(larger)[0], np.stack([*free_parameters(larger).values()])
     if own is None:
         return posterior(around, every, start, free, sizes, jnp.zeros_like(start)), jnp.zeros(())
-    # Also where physics alone took its place: by so much two models of the same source differ.
+    # Also if physics replaced the source: the effect is the difference of two models of it.
     added = network_effect(field, train, solver, scale) if has_network(field) else 0.0
     apparent, error = unchanged(own, around, added, larger, learned_from, train)
     return posterior(around, every, start, free, sizes, apparent), error
@@ -176,7 +176,7 @@ def _conclude(
     left_out = found.theta + left_out_steps(equations, held, held @ (found.theta - start), blocks)
     changes = jnp.zeros((len(left_out), 0))
     if method.networks and has_network(larger):
-        removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, where physics stands alone
+        removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, if physics replaced it
         step = fit_anchored(unravel(found.theta), train, starts, found.noise, solver, scale, error, blocks)
         odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
         better = odds > STRONG

@@ -155,7 +155,7 @@ class FineTune(Method):
         config = make_run_config(rates, jnp.arange(n), n, *rule)
         settings = replace(settings, batch_size=min(settings.batch_size, n))
         data, held_out = (settings.objective.prepare(windows, "windows") for windows in (train, validation))
-        # The default is not an argument: an optimiser holds closures, with which a program is not kept.
+        # The default is not an argument: programs with an optimiser's closures are not cached.
         optimiser: dict[str, Any] = {"optimiser": held_at_start(self.l2_sp)} if self.l2_sp else {}
         state = start(marked, jax.random.key(self.seed), **optimiser)
         state, _ = _run(state, config, data, held_out, settings, config.max_epochs, **optimiser)

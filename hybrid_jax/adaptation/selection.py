@@ -30,7 +30,7 @@ BLOCKS = 10
 CLUSTERS = 5  # of windows of one flight, for intervals: in gusts, errors a second apart are still correlated
 FEW = 10  # windows, of which no order is seen
 SHIFTS = 20  # other windows that each is compared with
-SURELY = 2.0  # standard errors by which physics alone predicts the source's motion better, where it takes its place
+SURELY = 2.0  # standard errors by which physics must predict the source's motion better to replace it
 STRONG = 20.0  # odds against no change from which one is believed (Kass and Raftery 1995)
 JOINED = 10  # windows that touch, at most so many, are predicted as one
 TINY = float(np.finfo(np.float32).tiny)
@@ -164,7 +164,7 @@ def dispersion(found: Fit, sizes) -> Float[Array, ""]:
     places, counted = blocks_of(len(found.equations.score), BLOCKS)
     score = jnp.sum(found.equations.score[places] * counted[..., None], axis=1)
     total = jnp.sum(found.equations.gram, axis=0)
-    # A parameter of unit effect; what no window tells apart is held at the source.
+    # A parameter of unit effect; what is not identifiable stays at the source.
     unit = 1 / jnp.sqrt(jnp.diagonal(total) + found.noise / jnp.square(sizes))
     held = unit[:, None] * (total + jnp.diag(found.noise / jnp.square(sizes))) * unit
     matrix = inverse(held).matrix

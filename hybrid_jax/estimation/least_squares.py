@@ -117,7 +117,7 @@ def _fit_and_compare(field: AbstractVectorField, windows: Trajectories, solver: 
     """Run `fit_free` and compute `discretisation` by a Gauss–Newton step to the predictions with half the step."""
     fit, jacobian, errors = fit_and_linearise(field, windows, solver, max_steps, scale)
     n = len(windows)
-    if n > MANY:  # some tell how far a parameter would move; its standard error is that of all
+    if n > MANY:  # some suffice for a parameter's change; its standard error needs all
         windows = windows[np.linspace(0, n - 1, CHUNK).astype(int)]
         theta, unravel = ravel_parameters(fit.field)
         jacobian, errors = _linearised(lambda at, w: prediction_errors(unravel(at), w, solver, scale), theta, windows)

@@ -111,7 +111,7 @@ def inverse(gram: Float[Array, "p p"]) -> Inverse:
     values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(scaled))
     seen = values > RANK * len(gram) * epsilon
     found = (vectors * jnp.where(seen, 1 / values, 0.0)) @ vectors.T
-    # A step of Newton's method has the derivative of the inverse; that of eigenvectors is not always finite.
+    # A step of Newton's method has the derivative of the inverse; eigenvectors' is not always finite.
     found = found @ (2 * jnp.eye(len(gram)) - scaled @ found)
     unseen = jnp.sum(jnp.where(seen, 0.0, jnp.square(vectors)), axis=1)
     return Inverse(found / scales, unseen < jnp.sqrt(epsilon), jnp.sum(seen))

@@ -100,7 +100,7 @@ class Search(NamedTuple):
         one = np.broadcast_to(np.eye(e), (r, e, e))
         total.add(rows[0][p:], one, np.asarray(own)[:, :e], np.asarray(self.spread))
         known = np.zeros((r, p, p))
-        known[0] = np.eye(p)  # what is expected of θ stands with the first record
+        known[0] = np.eye(p)  # the prior of θ is added to the first record
         total.add(np.arange(p), known, known @ (np.asarray(theta) - self.theta), self.deviations)
         return NormalEquations(*map(jnp.asarray, total))
 

@@ -20,7 +20,7 @@ from hybrid_jax.matrices import solve
 from hybrid_jax.trajectories import Trajectories
 
 ORDER = 3  # of the differences
-MOST = 32  # states: with more, such as those of a grid, the measured start is taken as it is
+MOST = 32  # states: with more, for example on a grid, the measured start is used
 
 
 class Starts(NamedTuple):

@@ -42,7 +42,7 @@ OF_VELOCITY = {"drag", "aerodynamic_moment", "velocity_lag", "velocity_gain"}
 FORCE_STEPS = 5  # times as many steps have windows of forces, which no instability limits
 AXES_OF = {"Ix": 0, "Iy": 1, "Iz": 2, "torque_coefficient": 2}
 TOLERANCE = 1e-5  # share of the cost: a step that lowers it by less is slow
-NO_EFFECT = 1.0  # information of a parameter that is not told: its standard error is its own size, or a factor of e
+NO_EFFECT = 1.0  # information below which a parameter is not identifiable: its standard error is its size
 
 
 class Identified(NamedTuple):

@@ -27,7 +27,7 @@ Coefficients = Float[Array, "outputs harmonics 2"]  # of sine and cosine, in uni
 Trajectory = tuple[Float[Array, "n+1 d"], Float[Array, "n m"]]
 
 RAMP = 1.0  # s, from and to hover
-# From 0 to 1 with four continuous derivatives, as torques are those of the fourth derivative of position.
+# From 0 to 1 with four continuous derivatives, since torques depend on the fourth derivative of position.
 SMOOTH = np.polynomial.Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])
 
 
