@@ -70,4 +70,6 @@ def test_its_table_is_that_of_the_reports():
         expected.append([f"{of_each_case(flight, own).mean():.3g}" for own in ("source", "fine_tune", AUTO)])
     load = committed("changes").where(domain="off_centre_load")
     expected.append([f"{of_each_case(load, own).mean():.3g}" for own in ("source", "fine_tune", AUTO)])
-    assert lines[-5:] == expected
+    other = committed("worlds").where(world="hummingbird", change="parameter_shift", flight="moving")
+    expected.append([f"{other.where(method=own).spread('test_mse').mean:.3g}" for own in ("source", "fine_tune", AUTO)])
+    assert lines[-6:] == expected
