@@ -16,11 +16,11 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
     """Return the text of a TOML file; unidentified numbers are placeholders with a comment."""
     own_mass, own_arm = mass or MASS, arm or ARM
     places = found.positions(own_arm) if found.placed else _even(len(found.hover), own_arm)
-    thrust = own_mass * GRAVITY / float((found.hover**2).sum())  # N per squared motor
+    thrust = level = own_mass * GRAVITY / float((found.hover**2).sum())  # N per squared motor
     if found.curve is not None:  # its slope at hover
         thrust = own_mass * float(found.curve[1] / (2 * found.hover.mean()) + found.curve[2])
     top = TOP if found.commands else 1.2 * found.largest
-    k = thrust / top**2 if found.commands else thrust
+    k = level / top**2 if found.commands else thrust
     lines = [
         "# Written from logs by hybrid-jax inspect. Numbers with a # are explained; those marked",
         "# PLACEHOLDER are not identifiable from logs: measure them.",

@@ -66,6 +66,8 @@ def test_what_a_log_tells_is_found(commanded, tmp_path):
     assert found.lag == pytest.approx(LAG, rel=0.15)  # of a grid in steps of 17 %
     (tmp_path / "v.toml").write_text(vehicle_text(found, "twin", MASS, ARM))
     vehicle = load_vehicle(tmp_path / "v.toml")
+    lift = vehicle.thrust_coefficient * np.square(vehicle.max_rotor_speed * found.hover).sum()
+    assert lift == pytest.approx(MASS * vehicle.gravity, rel=0.01)
     np.testing.assert_allclose(vehicle.inertia[:2], INERTIA, rtol=0.15)
     np.testing.assert_allclose(vehicle.rotor_positions, PLACES, atol=1e-4)
     text = (tmp_path / "v.toml").read_text()
