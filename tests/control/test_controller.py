@@ -160,7 +160,7 @@ def test_invalid_weights_and_shapes_are_refused(still):
         CONTROLLER(BODY, reference, x.at[0].set(jnp.nan), CONTROLLER.begin())
     with pytest.raises(ValueError, match="model must be a vector field, got None"):
         CONTROLLER(None, reference, x, CONTROLLER.begin())
-    with pytest.raises(ValueError, match=r"plan must be begin\(\) or that of the last call, got None"):
+    with pytest.raises(ValueError, match=r"plan must be begin\(\) or the plan of the last call, got None"):
         CONTROLLER(BODY, reference, x, None)
     with pytest.raises(ValueError, match=r"plan must have variables of shape \(20, 4\), got \(10, 4\)"):
         CONTROLLER(BODY, reference, x, Controller(VEHICLE, steps=10).begin())
