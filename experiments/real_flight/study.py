@@ -124,9 +124,9 @@ def of_fold(
     score(names.PHYSICS_ONLY, source.physics.field)
     score(LEARNED, source.field)
     for n in config.n if adapts else ():
-        found = adapted(source.field, train, n)
+        found = adapted(source.field, train, source.windows, n)
         score(ADAPTED, found.field, n, found)
-        scratch = adapted(physics, train, n)
+        scratch = adapted(physics, train, None, n)
         score(names.SCRATCH, scratch.field, n, scratch)
     return rows, curves
 

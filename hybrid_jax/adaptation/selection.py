@@ -173,11 +173,14 @@ def dispersion(found: Fit, sizes) -> Float[Array, ""]:
 
 
 def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Trajectories) -> Float[Array, ""]:
-    """Return the largest share of samples, over quantities, outside the known 1 to 99 % range; it compiles."""
+    """Return the largest share of samples outside the known 1 to 99 % range, over quantities of the state; it compiles.
+
+    Inputs do not count: a vehicle that has changed, for example by a load, needs other ones for the same motion.
+    """
     space, t = state_space(field, known.x0.shape[-1]), min(known.horizon, asked.horizon)
 
     def features(windows: Trajectories) -> dict[str, Any]:
-        parts: Any = (jnp.asarray(each)[:, :t] for each in (windows.x, windows.u))
+        parts: Any = (jnp.asarray(each)[:, :t] for each in (windows.x, 0 * windows.u))
         return space.features(*(each.reshape(-1, each.shape[-1]) for each in parts))
 
     ends = {name: jnp.quantile(values, jnp.asarray(RANGE)) for name, values in features(known).items()}

@@ -55,7 +55,7 @@ def run(options: Options) -> int:
     known = known_of(options.source, model)
     flights = flights_for(known, options.after, options, changed=True)
     with step("adapting") as told:
-        found = adapted(known.field, flights.logs)
+        found = adapted(known.field, flights.logs, known.windows)
         told(f"{found.windows} windows, chose {found.chosen}")
     changed = _changed(known, found)
     different = bool(changed) or found.alone or found.candidates["source"] < UNLIKELY

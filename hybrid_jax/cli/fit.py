@@ -111,6 +111,7 @@ def _about(options: Options, model: VehicleModel, flights: Flights, found: Learn
         "polynomial": list(options.polynomial),
         "lag": found.lag,
         "learned_from": flights.contents,
+        "windows": {part: getattr(found.windows, part).tolist() for part in ("x0", "u", "x")},
         "motion": {name: np.quantile(values, QUANTILES).tolist() for name, values in features.items()},
         "chosen": found.chosen,
         "expected": ends,

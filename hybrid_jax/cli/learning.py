@@ -23,7 +23,7 @@ from hybrid_jax.training import Settings, fit, rates_by_group
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.trajectories import Trajectories
 
-TRAINED, VALIDATED, ADAPTED, OF_LAG = 2000, 500, 600, 300  # windows at most
+TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
 FOLDS = 3  # at most so many groups of flights are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
 PHYSICS, OUTPUTS = "theta_least_squares", "accelerations"
@@ -39,6 +39,7 @@ class Learned(NamedTuple):
         chosen: one of CANDIDATES.
         lag: rotor lag relative to the logged motors [s].
         left_out: RMSE of FROZEN and each candidate on held-out flights, after each interval.
+        windows: some of those that it was learned from, by which `adapt` judges its errors without any change.
         expected: expected error on a new flight, in `errors.UNITS`: value, low, high.
     """
 
@@ -47,6 +48,7 @@ class Learned(NamedTuple):
     chosen: str
     lag: float
     left_out: dict[str, Float[np.ndarray, "flights t 4"]]
+    windows: Trajectories
     expected: Float[np.ndarray, "3 4"]
 
 
@@ -73,12 +75,16 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
     windows = windows_of(logs, STEPS, STEPS, TRAINED).windows
     physics = adapt(model.physics(), windows, method=PHYSICS, settings=settings)
     field = physics.field if chosen == "physics" else _hybrid(physics.field, logs, seed, settings)
-    return Learned(field, physics, chosen, lag, found, expected(np.log(ends[chosen])))
+    kept = windows_of(logs, STEPS, STEPS, KEPT).windows
+    return Learned(field, physics, chosen, lag, found, kept, expected(np.log(ends[chosen])))
 
 
-def adapted(field: AbstractVectorField, logs: Sequence[FlightLog], most: int = ADAPTED) -> Adaptation:
+def adapted(
+    field: AbstractVectorField, logs: Sequence[FlightLog], learned_from: Trajectories | None, most: int = ADAPTED
+) -> Adaptation:
     """Adapt the physics of a model, not its network, to at most `most` windows of flights after a change."""
-    return adapt(field, windows_of(logs, STEPS, STEPS, most).windows, method=Auto(networks=False))
+    windows = windows_of(logs, STEPS, STEPS, most).windows
+    return adapt(field, windows, method=Auto(networks=False), learned_from=learned_from)
 
 
 def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:

@@ -14,6 +14,7 @@ from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.export.program import vehicle_in
 from hybrid_jax.extrapolation import WARN, shares_outside
 from hybrid_jax.io.models import Model
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 
@@ -32,13 +33,19 @@ class Known(NamedTuple):
     def steps(self) -> int:
         return self.about["steps"]
 
+    @property
+    def windows(self) -> Trajectories:
+        """Some of the windows that the model was learned from."""
+        x0, u, x = (np.asarray(self.about["windows"][part], "f4") for part in ("x0", "u", "x"))
+        return Trajectories(x0, u, x, self.dt)
+
 
 def known_of(path: Path, model: Model) -> Known:
     """Convert a model from a file; raise ValueError if `fit` or `adapt` did not write it."""
     vehicle = vehicle_in(model.field)
     if "identified" in model.about:
         raise ValueError(f"{path}: was identified without states, which replay draws; hybrid-jax check predicts logs")
-    if vehicle is None or not {"dt", "steps", "learned_from", "motion"} <= model.about.keys():
+    if vehicle is None or not {"dt", "steps", "learned_from", "motion", "windows"} <= model.about.keys():
         raise ValueError(f"{path}: is not a model written by hybrid-jax fit or adapt")
     return Known(model.field, vehicle, model.about)
 

@@ -78,8 +78,9 @@ def written(folder, domain, flights, seed, seconds=11.0):
 
 def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_changed(tmp_path, monkeypatch, called):
     body, n = rigid_body(IRIS), 30
-    save(tmp_path / "m.npz", body, {"dt": 0.01, "steps": 10, "learned_from": {}, "motion": {}})
     x = np.tile([0, 0, 1.5, 1, *[0.0] * 9], (n, 1)) + np.arange(n)[:, None] * np.eye(13)[0]  # none is a repeated sample
+    windows = {"x0": x[:1].tolist(), "u": [[[500.0] * 4] * 10], "x": [x[1:11].tolist()]}
+    save(tmp_path / "m.npz", body, {"dt": 0.01, "steps": 10, "learned_from": {}, "motion": {}, "windows": windows})
     flown = FlightLog(0.01 * np.arange(n), x, np.full((n, 4), 500.0))
     none = dict.fromkeys(("disturbance", "without_intervals"))
     numbers = {"mse_before": 1.0, "mse_after": 1.0, "windows": 2, "steps": 0, "level": 0.95}
@@ -201,7 +202,7 @@ def test_a_flight_that_the_model_learned_from_is_refused(fitted, called):
     shutil.copy(fitted / "before" / "flight0.csv.gz", fitted / "copy.csv.gz")
     code, _, said = called("check", fitted / "source.npz", fitted / "copy.csv.gz", "--out", fitted / "check")
     assert code == BAD_INPUT
-    assert "copy.csv.gz: the same flight as flight0.csv.gz, which the model learned from" in said
+    assert "copy.csv.gz: the same flight as flight0.csv.gz, which the model was trained on" in said
 
 
 @pytest.mark.slow
@@ -246,14 +247,14 @@ def test_hover_tells_nothing(fitted, tmp_path, called):
     (tmp_path / "hover.csv.gz").write_bytes(csv_of(0.01 * np.arange(n), x, u))
     files = ["-o", tmp_path / "adapted.npz", "--out", tmp_path]
     code, said, _ = called("adapt", fitted / "source.npz", tmp_path / "hover.csv.gz", *files)
-    assert code == NOTHING_CHANGED
+    assert code == NOTHING_CHANGED, said
     assert "These flights show no change." in said
     assert not (tmp_path / "adapted.npz").exists()
 
 
 @pytest.mark.slow
 def test_without_a_vehicle_file_one_is_written_first(fitted, tmp_path, called, monkeypatch):
-    monkeypatch.setattr("hybrid_jax.cli.fit._learning", mock.Mock(side_effect=ValueError("learning")))
+    monkeypatch.setattr("hybrid_jax.cli.fit.learn", mock.Mock(side_effect=ValueError("learning")))
     code, said, why = called("fit", fitted / "before", "-o", tmp_path / "m.npz", "--out", tmp_path / "fit")
     assert (code, why.splitlines()[-1]) == (BAD_INPUT, "hybrid-jax fit: learning")
     assert "vehicle.toml: written" in said
