@@ -27,7 +27,6 @@ from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.flights.checks.airborne import airborne, within
-from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording
@@ -120,7 +119,7 @@ def fitted_to(start, recordings: list[Recording], field: Actuated, stride: int =
 
 def run(options: Options) -> None:
     runtime.configure()
-    console, columns = Console(width=150), load_column_map(Path(__file__).with_suffix(".toml"))
+    console, columns = Console(width=150), Path(__file__).with_suffix(".toml")
     flown = OF_A.split(), OF_B.split()
     a, b = ([read_recording(options.folder / f"{name}.csv.gz", columns) for name in part] for part in flown)
     aware, constant = thrust_of(a), thrust_of(a, voltage=False)

@@ -89,7 +89,7 @@ def adapted(
 
 def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:
     """Apply a rotor lag [s] to the motors of flights."""
-    return [lag_motors(log, lag)[0] for log in logs] if lag else list(logs)
+    return [lag_motors(log, lag) for log in logs] if lag else list(logs)
 
 
 def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:

@@ -8,49 +8,16 @@ Its steps can be taken one by one. Split by flight before cutting, since windows
     windows = cut_windows(train, steps=10).windows
 """
 
-from hybrid_jax.flights.checks.cleaning import (
-    Cleaning,
-    clean,
-    delay_motors,
-    in_flight,
-    lag_motors,
-    resample,
-)
+from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.checks.consistency import Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import to_flight
-from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map
 from hybrid_jax.flights.load import find_logs, load_log, load_logs, read_recording
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
 from hybrid_jax.flights.windows import LogWindows, cut_windows, folds, hold_out, load_windows
 
-__all__ = [
-    "Check",
-    "Cleaning",
-    "ColumnMap",
-    "FlightErrors",
-    "FlightLog",
-    "LogWindows",
-    "Recording",
-    "Signal",
-    "check_log",
-    "check_recording",
-    "clean",
-    "cut_windows",
-    "delay_motors",
-    "find_logs",
-    "flight_errors",
-    "folds",
-    "hold_out",
-    "in_flight",
-    "lag_motors",
-    "load_column_map",
-    "load_log",
-    "load_logs",
-    "load_windows",
-    "read_recording",
-    "resample",
-    "to_flight",
-]
+__all__ = ["Check", "Cleaning", "FlightErrors", "FlightLog", "LogWindows", "Recording", "Signal"]
+__all__ += ["check_log", "check_recording", "clean", "cut_windows", "find_logs", "flight_errors", "folds", "hold_out"]
+__all__ += ["load_log", "load_logs", "load_windows", "read_recording", "to_flight"]

@@ -16,13 +16,7 @@ BODIES = {"FLU": np.eye(3), "FRD": np.diag([1.0, -1, -1])}
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of the vectors in a log: north-east-down (NED) or z up; forward-right-down (FRD) or forward-left-up.
-
-    Attributes:
-        world: "ENU", which stands for any world with z up, or "NED".
-        body: "FLU" or "FRD".
-        velocity: frame of the velocities, "world" or "body".
-    """
+    """The frames of a log: a world of `WORLDS`, a body of `BODIES`, and that of velocities ("world" or "body")."""
 
     world: str
     body: str

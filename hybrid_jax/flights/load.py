@@ -14,7 +14,7 @@ from hybrid_jax.flights.checks.consistency import FAILS, WARNS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import flight_at, own_interval
 from hybrid_jax.flights.formats.blackbox import read_blackbox
-from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map, read_mapped
+from hybrid_jax.flights.formats.column_map import read_mapped
 from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
 from hybrid_jax.flights.formats.raw import GZIP, readable
 from hybrid_jax.flights.formats.rosbag import read_rosbag
@@ -46,7 +46,7 @@ Failed = Literal["refuse", "warn"]
 def load_log(
     path: str | Path,
     *,
-    columns: ColumnMap | str | Path | None = None,
+    columns: str | Path | None = None,
     polynomial: tuple[float, ...] = (),
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
@@ -71,7 +71,7 @@ def load_log(
 def load_logs(
     folder: str | Path,
     *,
-    columns: ColumnMap | str | Path | None = None,
+    columns: str | Path | None = None,
     polynomial: tuple[float, ...] = (),
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
@@ -105,7 +105,6 @@ def load_logs(
         others = "; ".join(f"{path.name}: {why}" for path, why in [*left.items()][:5])
         found = f"; it holds {others}" if left else ""
         raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
-    columns = load_column_map(columns) if isinstance(columns, str | Path) else columns
     raws = [read_recording(path, columns, topics, motor_order) for path in paths]
     report([(raw.name, c) for raw in raws for c in check_recording(raw, vehicle, dt or own_interval(raw))], failed)
 
@@ -176,7 +175,7 @@ def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
 
 def read_recording(
     path: str | Path,
-    columns: ColumnMap | str | Path | None = None,
+    columns: str | Path | None = None,
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
 ) -> Recording:
@@ -184,7 +183,7 @@ def read_recording(
 
     Args:
         path: a file, or the folder of a ROS bag.
-        columns: column map (or its TOML file) of CSV logs; by default the library's columns and units.
+        columns: see `load_windows`.
         topics: topics of a ROS bag by quantity: see `hybrid_jax.flights.formats.rosbag`.
         motor_order: index in the log of each rotor's motor; by default the vehicle's order.
 
@@ -195,7 +194,7 @@ def read_recording(
     if not Path(path).exists():
         raise ValueError(f"{path}: no such file")
     if kind == CSV:
-        found = read_mapped(path, load_column_map(columns) if isinstance(columns, str | Path) else columns)
+        found = read_mapped(path, columns)
     elif kind == ROSBAG and Path(path).is_file() and _head(path, unpack=False).startswith(GZIP):
         raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
     elif kind == ROSBAG:

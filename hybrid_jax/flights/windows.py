@@ -11,7 +11,6 @@ import numpy as np
 from hybrid_jax import checks
 from hybrid_jax.flights.checks.cleaning import Cleaning, lag_motors
 from hybrid_jax.flights.checks.consistency import check_log
-from hybrid_jax.flights.formats.column_map import ColumnMap
 from hybrid_jax.flights.load import Failed, load_logs, report
 from hybrid_jax.flights.log import FlightLog, even_segments, segments
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
@@ -47,7 +46,7 @@ def load_windows(
     dt: float | None = None,
     steps: int = 10,
     stride: int = 1,
-    columns: ColumnMap | str | Path | None = None,
+    columns: str | Path | None = None,
     polynomial: tuple[float, ...] = (),
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
@@ -68,7 +67,8 @@ def load_windows(
             whose signals have times of their own get 0.01.
         steps: intervals per window.
         stride: samples between the starts of two windows.
-        columns: column map (or its TOML file) of CSV logs; by default the library's columns and units.
+        columns: TOML file that names the columns of CSV logs, see `hybrid_jax.flights.formats.column_map`; by default
+            the library's columns and units.
         polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for logs with commands (0 to 1) but no speeds.
         topics: topics of a ROS bag by quantity: see `hybrid_jax.flights.formats.rosbag`.
         motor_order: index in the log of each rotor's motor, from 0.
@@ -84,6 +84,7 @@ def load_windows(
     """
     checks.count("steps", steps)
     checks.count("stride", stride)
+    checks.not_negative("motor_time_constant", motor_time_constant)
     if dt is not None:
         checks.positive("dt", dt, "a positive number of seconds")
     given = {"columns": columns, "polynomial": polynomial, "topics": topics, "motor_order": motor_order}
@@ -91,7 +92,7 @@ def load_windows(
     report([(log.name, check) for log in logs for check in check_log(log, vehicle)], failed)
     require_common_interval(logs)
     if motor_time_constant:
-        logs = [lag_motors(log, motor_time_constant)[0] for log in logs]
+        logs = [lag_motors(log, motor_time_constant) for log in logs]
     return cut_windows(logs, steps, stride).windows
 
 

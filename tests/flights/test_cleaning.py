@@ -5,14 +5,7 @@ import pytest
 from recorded import LOGS
 from surface import refusal
 
-from hybrid_jax.flights.checks.cleaning import (
-    Cleaning,
-    clean,
-    delay_motors,
-    in_flight,
-    lag_motors,
-    resample,
-)
+from hybrid_jax.flights.checks.cleaning import Cleaning, clean, delay, in_flight, lag_motors, resample
 from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.trajectories import check
@@ -116,7 +109,7 @@ def test_motors_that_turn_before_take_off_carry_nothing(flight):
 
 @pytest.mark.parametrize("steps", [-3, 0, 4])
 def test_a_shift_by_whole_samples_moves_rows(flight, steps):
-    log, done = delay_motors(flight, steps * 0.01)
+    log, done = delay(flight, steps * 0.01)
     at = np.searchsorted(flight.t, log.t + 1e-6) - 1
     assert len(log) == len(flight) - abs(steps)
     np.testing.assert_allclose(log.u, flight.u[at - steps], rtol=1e-6)
@@ -126,19 +119,18 @@ def test_a_shift_by_whole_samples_moves_rows(flight, steps):
 
 def test_step_response_of_the_lag_is_exponential(flight):
     u = np.where(np.arange(len(flight))[:, None] < 100, 400.0, 500.0) * np.ones(4)
-    log, done = lag_motors(FlightLog(flight.t, flight.x, u), 0.05)
+    log = lag_motors(FlightLog(flight.t, flight.x, u), 0.05)
     edges = 500 - 100 * np.exp(-np.arange(31) * 0.01 / 0.05)
     area = 500 * 0.01 + 0.05 * np.diff(500 - edges)  # of each interval, in closed form
     np.testing.assert_allclose(log.u[100:130, 0], area / 0.01, rtol=1e-9)
     np.testing.assert_allclose(log.u[:100], 400)
-    assert "50.0 ms" in done
 
 
 def test_lag_recovers_rotor_speeds_from_commands(flight):
     speeds, step = flight.u, flight.dt / 0.04
     commands = speeds[:-1] + np.diff(speeds, axis=0) / (1 - np.exp(-step))
     commanded = FlightLog(flight.t[:-1], flight.x[:-1], np.maximum(commands, 0))
-    np.testing.assert_allclose(lag_motors(commanded, 0.04)[0].u[50:], 0.5 * (speeds[50:-1] + speeds[51:]), rtol=0.01)
+    np.testing.assert_allclose(lag_motors(commanded, 0.04).u[50:], 0.5 * (speeds[50:-1] + speeds[51:]), rtol=0.01)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_jax.flights.checks.cleaning import delay_motors
+from hybrid_jax.flights.checks.cleaning import delay
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, NOTHING, OK, UNKNOWN, WARNS, check_log
 from hybrid_jax.flights.checks.motor_response import orders
 from hybrid_jax.flights.log import FlightLog
@@ -147,7 +147,7 @@ def test_time_on_the_ground_is_found_and_not_compared(flight):
 def test_the_suggested_shift_repairs_the_lag(flight):
     late = with_parts(flight[:-5], u=flight.u[5:])
     assert table(late)[LAG].value == pytest.approx(50, abs=2)
-    repaired, _ = delay_motors(late, table(late)[LAG].value / 1000)
+    repaired, _ = delay(late, table(late)[LAG].value / 1000)
     assert table(repaired)[LAG].verdict == OK
 
 
@@ -156,7 +156,7 @@ def test_motors_that_are_sampled_at_the_start_of_an_interval_are_told_from_means
     check = table(noisy(sampled, np.random.default_rng(3)))[LAG]
     assert (check.verdict, "motors are samples, not held" in check.suggestion) == (WARNS, True), check
     assert check.value == pytest.approx(-5, abs=1.5)
-    assert table(delay_motors(sampled, check.value / 1000)[0])[LAG].verdict == OK
+    assert table(delay(sampled, check.value / 1000)[0])[LAG].verdict == OK
 
 
 def test_gaps_and_repeats_hide_no_other_mistake(flight):

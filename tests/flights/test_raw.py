@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hybrid_jax.flights.formats.column_map import load_column_map, read_mapped
+from hybrid_jax.flights.formats.column_map import read_mapped
 from hybrid_jax.flights.formats.raw import own_samples
 
 
@@ -64,7 +64,7 @@ def test_a_mapped_csv_says_which_columns_were_lines(tmp_path):
         'body_rates = { columns = ["p", "q", "r"], unit = "rad/s" }\n'
         'motors = { columns = ["u0", "u1", "u2", "u3"], unit = "pwm" }\n'
     )
-    found = read_mapped(tmp_path / "log.csv", load_column_map(tmp_path / "map.toml"))
+    found = read_mapped(tmp_path / "log.csv", tmp_path / "map.toml")
     assert len(found.signals["command"]) == 51
     assert len(found.signals["rates"]) == 501
     (note,) = found.notes

@@ -16,7 +16,7 @@ from surface import refusal
 import hybrid_jax as hj
 from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
-from hybrid_jax.flights import load_column_map
+from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.io.archive import HEADER, load_archive
 from hybrid_jax.io.datasets import load_dataset
 from hybrid_jax.io.files import read_json, write_atomic

@@ -1,6 +1,5 @@
 """Changes to a log; each returns the new log and one line that describes the change."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +20,7 @@ class Cleaning:
 
     Attributes:
         in_flight: cut out the time on the ground: half a second or longer with hardly any thrust.
-        resample: new interval between samples [s].
+        resample: new interval between samples [s]: states are interpolated, motors averaged.
         longest_gap: with resample, interpolate across gaps and repeated samples up to this long [s].
         delay: delay [s] to add to the motors: the gyro's lag that `check_log` reports.
 
@@ -53,34 +52,21 @@ def clean(log: FlightLog, cleaning: Cleaning) -> tuple[FlightLog, list[str]]:
     Raises:
         ValueError: a change is impossible.
     """
-    changes: dict[str, Callable[[FlightLog], tuple[FlightLog, str]]] = {
-        "in_flight": in_flight,
-        "resample": lambda log: resample(log, cleaning.resample or log.dt, cleaning.longest_gap),
-        "delay": lambda log: delay_motors(log, cleaning.delay),
-    }
+    resampling = cleaning.resample or log.dt, cleaning.longest_gap
+    changes = ("in_flight", in_flight, ()), ("resample", resample, resampling), ("delay", delay, (cleaning.delay,))
     done: list[str] = []
-    for name in (name for name in changes if getattr(cleaning, name)):
-        try:
-            log, line = changes[name](log)
-        except ValueError as error:
-            raise ValueError(f"{log.name}: {name}: {str(error).removeprefix(f'{log.name}: ')}") from error
-        done.append(line)
+    for name, change, numbers in changes:
+        if getattr(cleaning, name):
+            try:
+                log, line = change(log, *numbers)
+            except ValueError as error:
+                raise ValueError(f"{log.name}: {name}: {error}") from error
+            done.append(line)
     return log, done
 
 
 def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[FlightLog, str]:
-    """Resample each segment at multiples of dt [s]: states linearly, attitudes spherically, motors as means.
-
-    Args:
-        log: the flight.
-        dt: new interval between samples [s].
-        longest_gap: interpolate across gaps and repeated samples up to this long [s].
-
-    Raises:
-        ValueError: dt is not positive, or all segments are shorter than dt.
-    """
-    if not dt > 0:
-        raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
+    """Resample each segment at multiples of dt [s]: states linearly, attitudes spherically, motors as means."""
     fresh, parts = log[~repeats(log)], []
     for part in runs_of(np.diff(fresh.t) <= max(1.5 * log.dt, longest_gap), 1):
         piece = fresh[part]
@@ -90,75 +76,46 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
             t = np.clip(dt * np.arange(first, last + 1), piece.t[0], piece.t[-1])
             x = interpolate(t, piece.t, piece.x)
             x[:, QUATERNION] = interpolate_attitude(t, piece.t, piece.x[:, QUATERNION])
-            parts.append(FlightLog(t, x, mean_of_held(t, piece.t, piece.u), log.name))
+            parts.append((t, x, mean_of_held(t, piece.t, piece.u)))
     if not parts:
-        raise ValueError(f"{log.name}: no segment without gaps is as long as dt = {dt} s")
+        raise ValueError(f"no segment without gaps is as long as dt = {dt} s")
     # Without last samples of segments that would make a gap too short to be recognised as one.
-    ends = [following.t[0] - GAP * dt for following in parts[1:]] + [np.inf]
-    parts = [part[part.t < end] for part, end in zip(parts, ends, strict=True) if (part.t < end).any()]
-    t, x, u = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "x", "u"))
-    done = f"resampled {len(log)} samples to {len(t)} at {dt} s in {len(parts)} segments"
+    ends = [following[0][0] - GAP * dt for following in parts[1:]] + [np.inf]
+    parts = [[each[part[0] < end] for each in part] for part, end in zip(parts, ends, strict=True)]
+    t, x, u = map(np.concatenate, zip(*parts, strict=True))
+    done = f"resampled {len(log)} samples to {len(t)} at {dt} s in {sum(len(part[0]) > 0 for part in parts)} segments"
     return FlightLog(t, x, u, log.name), f"{done}, bridging gaps up to {longest_gap} s"
 
 
 def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
-    """Cut out the time on the ground (see `airborne`).
-
-    Args:
-        log: the flight.
-
-    Raises:
-        ValueError: no samples remain.
-    """
+    """Cut out the time on the ground (see `airborne`)."""
     flying = ~on_ground(log)
     if not flying.any():
-        raise ValueError(f"{log.name}: the vehicle stays on the ground; leave the file out")
+        raise ValueError("the vehicle stays on the ground; leave the file out")
     return log[flying], f"{len(log) - flying.sum()} samples on the ground cut out"
 
 
-def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
-    """Delay the motor values by `lag` [s]; samples that would need unknown values are cut.
-
-    Args:
-        log: the flight.
-        lag: delay [s]; negative shifts the motors to earlier times.
-
-    Raises:
-        ValueError: no segment is longer than the lag.
-    """
+def delay(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
+    """Shift the motors to later times by `lag` [s]; samples that would need unknown values are cut."""
     parts = []
-    for part in segments(log):
-        piece = log[part]
+    for piece in (log[part] for part in segments(log)):
         end = piece.t[-1] + log.dt  # the last value is held for one interval
         inside = (piece.t - lag >= piece.t[0] - 1e-9) & (piece.t + log.dt - lag <= end + 1e-9)
         if inside.sum() > 1:
             at = np.append(piece.t[inside], piece.t[inside][-1] + log.dt) - lag
-            parts.append((piece.t[inside], piece[inside].x, mean_of_held(at, piece.t, piece.u)[:-1]))
+            parts.append((piece.t[inside], piece.x[inside], mean_of_held(at, piece.t, piece.u)[:-1]))
     if not parts:
-        raise ValueError(f"{log.name}: no segment without gaps is longer than the lag of {lag} s")
+        raise ValueError(f"no segment without gaps is longer than the lag of {lag} s")
     t, x, u = map(np.concatenate, zip(*parts, strict=True))
     return FlightLog(t, x, u, log.name), f"motors shifted by {1000 * lag:.1f} ms, {len(log) - len(t)} samples cut"
 
 
-def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
-    """Replace motors u by the mean over each interval of w with τ ẇ = u − w; segments start in equilibrium.
-
-    Args:
-        log: an evenly sampled flight.
-        time_constant: τ [s], at least 0.
-
-    Raises:
-        ValueError: the time constant is negative, or samples are not evenly spaced.
-    """
-    if not 0 <= time_constant < np.inf:
-        raise ValueError(f"time_constant must be a number of seconds of at least 0, got {time_constant!r}")
-    parts, u = even_segments(log), log.u.copy()
-    if time_constant > 0:
-        step = log.dt / time_constant
-        kept = np.exp(-step)
-        for part in parts:
-            held = log.u[part]
-            speed, _ = scipy.signal.lfilter([0.0, 1 - kept], [1.0, -kept], held, axis=0, zi=held[:1])
-            u[part] = held + (speed - held) * (1 - kept) / step
-    done = f"rotors follow the log's motors with a time constant of {1000 * time_constant:.1f} ms"
-    return FlightLog(log.t, log.x, u, log.name), done
+def lag_motors(log: FlightLog, time_constant: float) -> FlightLog:
+    """Replace motors u by the mean over each interval of w with τ ẇ = u − w; segments start in equilibrium."""
+    u, step = log.u.copy(), log.dt / time_constant
+    kept = np.exp(-step)
+    for part in even_segments(log):
+        held = log.u[part]
+        speed, _ = scipy.signal.lfilter([0.0, 1 - kept], [1.0, -kept], held, axis=0, zi=held[:1])
+        u[part] = held + (speed - held) * (1 - kept) / step
+    return FlightLog(log.t, log.x, u, log.name)

@@ -49,13 +49,7 @@ COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3, "specific_fo
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of one quantity.
-
-    Attributes:
-        columns: names in the header of the file.
-        unit: one of `SCALES`.
-        polynomial: coefficients c0, c1, … that map motor commands to rotor speeds [rad/s].
-    """
+    """The columns of one quantity, their unit, and a polynomial from motor commands to rotor speeds [rad/s]."""
 
     columns: tuple[str, ...]
     unit: str
@@ -78,23 +72,7 @@ class Format:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """The meaning of the columns of a CSV log: the tables of the TOML file, with a quantity for each key of `SCALES`.
-
-    Attributes:
-        frames: frames of the vectors.
-        time: time of each row.
-        position: position in the world.
-        attitude: rotation body → world, as a quaternion or as roll, pitch and yaw.
-        velocity: velocity in the frame given by `frames`.
-        body_rates: angular velocity of the body.
-        specific_force: specific force in the body frame, as an accelerometer measures it.
-        voltage: battery voltage.
-        motors: rotor speeds or commands, in the vehicle's order.
-        format: delimiter and decimal mark of the file.
-
-    Raises:
-        ValueError: a table or key is invalid.
-    """
+    """The tables of the TOML file, with a quantity for each key of `SCALES`."""
 
     frames: Frames
     time: Columns
@@ -126,14 +104,6 @@ class ColumnMap:
 
 
 def load_column_map(path: str | Path) -> ColumnMap:
-    """Read a column map.
-
-    Args:
-        path: the TOML file.
-
-    Raises:
-        ValueError: the file, a table or a key is invalid.
-    """
     tables, parts = read_tables(path), {}
     require_known(str(path), tables, [*ColumnMap.__dataclass_fields__])
     for name, table in tables.items():
@@ -159,16 +129,16 @@ def library_map(path: str | Path) -> ColumnMap:
     )
 
 
-def read_mapped(path: str | Path, column_map: ColumnMap | None = None) -> Recording:
+def read_mapped(path: str | Path, columns: str | Path | None = None) -> Recording:
     """Read the mapped quantities of a CSV file; a quantity has the times of the rows in which it is given."""
-    column_map = library_map(path) if column_map is None else column_map
+    column_map = library_map(path) if columns is None else load_column_map(columns)
     form, stated, frames = column_map.format, column_map.quantities, column_map.frames
     table, notes = read_table(path, column_map.names, delimiter=form.delimiter, decimal=form.decimal)
-    columns = dict(zip(column_map.names, table.T, strict=True))
+    named = dict(zip(column_map.names, table.T, strict=True))
     clock, found = stated.pop("time"), {}
-    t = columns[clock.columns[0]] * SCALES["time"][clock.unit]
+    t = named[clock.columns[0]] * SCALES["time"][clock.unit]
     for name, each in stated.items():
-        values, source = np.stack([columns[column] for column in each.columns], axis=1), " ".join(each.columns)
+        values, source = np.stack([named[column] for column in each.columns], axis=1), " ".join(each.columns)
         told = np.isfinite(t) & np.isfinite(values).all(axis=1)
         partly = f"columns {source}: {name} stands in {told.sum()} of {len(t)} rows"
         notes += () if told.all() else (partly,)
