@@ -17,7 +17,7 @@ from hybrid_jax import rotation
 from hybrid_jax.adaptation.expert_augmentation import expert_augmented
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.rigid_body import perturbed, perturbed_by
+from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, perturbed
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.networks.mlp import InputScaling
@@ -69,7 +69,8 @@ def _fresh_hybrids(
         if isinstance(guess, tuple):
             physics = perturbed(vehicle, _key(seed, PHYSICS), low=guess[0], high=guess[1])
         else:
-            physics = perturbed_by(vehicle, _key(seed, PHYSICS), guess)
+            signs = jax.random.rademacher(_key(seed, PHYSICS), (len(LEARNED),), float)
+            physics = RigidBody(dict(zip(LEARNED, np.log(1 + guess) * signs, strict=True)), vehicle)
         return Hybrid(replace(physics, wrench=forced), make_residual(_key(seed, NETWORK), vehicle=vehicle, **options))
 
     return eqx.filter_vmap(build)(seeds)

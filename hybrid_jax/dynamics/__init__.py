@@ -3,19 +3,19 @@
 from hybrid_jax.dynamics.actuators import Actuated, Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.dynamics.composition import Blend, Frozen, Hybrid, unfreeze
+from hybrid_jax.dynamics.composition import Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, with_disturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.grids import Diffusion, Grid, check_grid, diffusion
-from hybrid_jax.dynamics.hidden import Delay, Lag, LinearDynamics, Oscillator, RandomWalk, WithHidden, with_hidden
+from hybrid_jax.dynamics.hidden import Delay, Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
 from hybrid_jax.dynamics.outputs import StateSpaceModel
-from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body, with_vehicle
+from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 
-__all__ = ["AbstractVectorField", "Blend", "Frozen", "FrozenRates", "HoldState", "Hybrid", "trainable", "unfreeze"]
+__all__ = ["AbstractVectorField", "Frozen", "FrozenRates", "HoldState", "Hybrid", "trainable", "unfreeze"]
 __all__ += ["Actuated", "Actuator", "Diffusion", "Grid", "actuated", "check_grid", "diffusion", "rotor_speeds"]
 __all__ += ["AbstractEstimator", "ConstantDisturbance", "disturbed", "with_disturbance"]
-__all__ += ["RigidBody", "Terms", "VehicleModel", "load_vehicle_model", "perturbed", "rigid_body", "with_vehicle"]
-__all__ += ["Delay", "Lag", "LinearDynamics", "Oscillator", "RandomWalk", "WithHidden", "with_hidden"]
+__all__ += ["RigidBody", "Terms", "VehicleModel", "load_vehicle_model", "rigid_body"]
+__all__ += ["Delay", "Lag", "LinearDynamics", "Oscillator", "RandomWalk", "with_hidden"]
 __all__ += ["StateSpaceModel"]

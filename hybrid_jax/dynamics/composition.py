@@ -1,4 +1,4 @@
-"""Fields made of fields: physics plus a residual, a mean of models, a view of the state, a frozen field."""
+"""Fields made of fields: physics plus a residual, a view of the state, a frozen field."""
 
 from abc import abstractmethod
 from collections.abc import Iterable
@@ -101,26 +101,6 @@ class Hybrid(AbstractComposite):
         theta, at = ravel_learned(self.physics)
         mapped = jax.jacfwd(lambda theta: as_field(at(theta)).apply_residual(x, value))(theta)
         return jnp.concatenate([physics.parameter_columns(x, u) + mapped, moved], axis=1)
-
-
-class Blend(AbstractComposite):
-    """ẋ = the mean of several fields, for example models between which the data cannot decide.
-
-    Attributes:
-        fields: one or more, of the same state and input.
-    """
-
-    fields: tuple[AbstractVectorField, ...]
-
-    @property
-    def inside(self) -> tuple[AbstractVectorField, ...]:
-        return self.fields
-
-    def write(self, x, *inside):
-        return sum(inside[1:], start=inside[0]) / len(inside)
-
-    def apply_residual(self, x, residual):
-        return self.write(x, *(field.apply_residual(x, residual) for field in self._parts))
 
 
 class AbstractWrapper(AbstractComposite):

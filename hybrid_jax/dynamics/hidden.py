@@ -181,12 +181,7 @@ class LinearDynamics(AbstractHidden):
 
 
 class WithHidden(AbstractVectorField):
-    """A field with hidden parts; the states of the parts follow those of the field.
-
-    Attributes:
-        field: the field that the parts act on.
-        parts: the hidden parts; the first receives the inputs, each further one the output of the one before.
-    """
+    """A field with hidden parts; the states of the parts follow those of the field."""
 
     field: AbstractVectorField
     parts: tuple[AbstractHidden, ...]
@@ -203,11 +198,12 @@ class WithHidden(AbstractVectorField):
 
 
 def with_hidden(field: AbstractVectorField, *parts: AbstractHidden) -> WithHidden:
-    """A field with hidden parts, any number of each kind.
+    """A field with hidden parts, any number of each kind; the states of the parts follow those of the field.
 
     Args:
         field: the field that the parts act on.
-        parts: for example `Lag`, `Delay`, `RandomWalk`, `Oscillator` and `LinearDynamics`.
+        parts: for example `Lag`, `Delay`, `RandomWalk`, `Oscillator` and `LinearDynamics`; the first receives the
+            inputs, each further one the output of the one before.
 
     Raises:
         ValueError: no part, or something else.

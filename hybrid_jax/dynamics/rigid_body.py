@@ -171,56 +171,20 @@ def rigid_body(
 
 
 def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
-    """The rigid body with each of θ_p at nominal times a random factor, log-uniform from low to high.
-
-    Args:
-        vehicle: its constants, which are the nominal values.
-        low: smallest factor, above 0.
-        high: largest factor.
-
-    Raises:
-        ValueError: unless 0 < low <= high.
-    """
+    """The rigid body with each of θ_p at nominal times a random factor, log-uniform from low to high."""
     if not 0 < low <= high < np.inf:
         raise ValueError(f"low and high must be two factors, 0 < low <= high, got {low} and {high}")
     factors = jax.random.uniform(key, (len(LEARNED),), minval=np.log(low), maxval=np.log(high))
     return RigidBody(dict(zip(LEARNED, factors, strict=True)), vehicle)
 
 
-def perturbed_by(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
-    """The rigid body with each of θ_p at nominal × (1 + off) or nominal / (1 + off), at random."""
-    signs = jax.random.rademacher(key, (len(LEARNED),), float)
-    return RigidBody(dict(zip(LEARNED, np.log(1 + off) * signs, strict=True)), vehicle)
-
-
-def with_vehicle(field: RigidBody, vehicle: Vehicle) -> RigidBody:
-    """The field on another vehicle, for example the same one with a payload, with the same θ_p in SI units.
-
-    The deviations change, since they are relative to the vehicle's nominal values, weight and arm.
-
-    Args:
-        field: the rigid body on the vehicle that it was learned on.
-        vehicle: constants of the other vehicle.
-    """
-    units, known = units_of(vehicle), nominal_values(vehicle, field.terms)
-
-    def deviation(name: str, value: Array) -> Array:
-        middle = jnp.asarray(known[name], value.dtype).reshape(shape_of(vehicle, name))
-        return jnp.log(value / middle) if name in LOGARITHMIC else (value - middle) / units[name]
-
-    deviations = {name: deviation(name, value) for name, value in field.theta().items()}
-    return replace(field, deviations=deviations, vehicle=vehicle)
-
-
 def corrected(field: AbstractVectorField) -> AbstractVectorField:
     """The field with corrections of its rigid bodies, initially without effect, unless it has them already."""
 
     def larger(body: RigidBody) -> RigidBody:
-        if body.deviations.keys() & CORRECTIONS:
-            return body
         dtype = jnp.result_type(*jax.tree.leaves(body) or [float])
         zero = {name: jnp.zeros(shape_of(body.vehicle, name), dtype) for name in CORRECTIONS}
-        return replace(body, deviations=body.deviations | zero)
+        return body if body.deviations.keys() & CORRECTIONS else replace(body, deviations=body.deviations | zero)
 
     return _with_bodies(field, larger)
 
@@ -229,19 +193,16 @@ def uncorrected(field: AbstractVectorField) -> AbstractVectorField:
     """The field without the corrections that are zero; outside of compiled code."""
 
     def smaller(body: RigidBody) -> RigidBody:
-        if any(np.any(body.deviations.get(name, 0)) for name in CORRECTIONS):
-            return body
         kept = {name: value for name, value in body.deviations.items() if name not in CORRECTIONS}
-        return replace(body, deviations=kept)
+        used = any(np.any(body.deviations.get(name, 0)) for name in CORRECTIONS)
+        return body if used else replace(body, deviations=kept)
 
     return _with_bodies(field, smaller)
 
 
 def _with_bodies(field: AbstractVectorField, change: Callable[[RigidBody], RigidBody]) -> AbstractVectorField:
-    def is_body(node) -> bool:
-        return isinstance(node, RigidBody)
-
-    return jax.tree.map(lambda node: change(node) if is_body(node) else node, field, is_leaf=is_body)
+    bodies = {"is_leaf": lambda node: isinstance(node, RigidBody)}
+    return jax.tree.map(lambda node: change(node) if isinstance(node, RigidBody) else node, field, **bodies)
 
 
 def nominal(vehicle: Vehicle) -> dict[str, float]:

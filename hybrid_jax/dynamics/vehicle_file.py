@@ -6,7 +6,6 @@ instead of rotor speeds, `[actuator]` with values of `Actuator`, whose names you
 terms above the tables, for example `purpose = { cable_pull = "the load hangs on a cable" }`.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from hybrid_jax.dynamics.terms import Terms, check_names
 from hybrid_jax.vehicle import TABLES, Vehicle, from_table, read_tables, require_known, vehicle_of
 
 LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.checks.cleaning`
-NEED_PURPOSE = ("cable_pull",)  # what a change alone explains; without one, they would absorb other effects
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,8 @@ class VehicleModel:
 
     def physics(self) -> RigidBody:
         """The field at its nominal values, driven by rotor speeds."""
-        return rigid_body(self.vehicle, learned_by_field(self.learn), self.terms)
+        learned = tuple(name for name in self.learn if name != LAG and name not in NAMES)
+        return rigid_body(self.vehicle, learned, self.terms)
 
     def commanded(self) -> Actuated:
         """The field at its nominal values, driven by commands; ValueError without `[actuator]`."""
@@ -60,11 +59,6 @@ def check_learned(learn: tuple[str, ...], actuator: Actuator | None = None) -> N
         check_actuator_names(tuple(name for name in learn if name in NAMES), actuator, learn)
 
 
-def learned_by_field(learn: tuple[str, ...]) -> tuple[str, ...]:
-    """The learned names except the actuators'."""
-    return tuple(name for name in learn if name != LAG and name not in NAMES)
-
-
 def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleModel:
     """Read a TOML file of `[vehicle]`, `learn` and `[terms]`; by default a rigid body that learns Ix, Iy and k.
 
@@ -75,25 +69,16 @@ def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleM
     Raises:
         ValueError: one line with the file, the key and what was expected.
     """
-    return vehicle_model_of(read_tables(path), path, variant)
-
-
-def vehicle_model_of(tables: Mapping[str, Any], path: str | Path, variant: str | None = None) -> VehicleModel:
-    """`load_vehicle_model` on the tables of a file that has already been read."""
+    tables = read_tables(path)
     require_known(str(path), tables, TABLES)
-    vehicle, terms = tables.get("vehicle"), tables.get("terms", {})
-    if isinstance(vehicle, dict) and "learn" in vehicle:
+    if isinstance(vehicle := tables.get("vehicle"), dict) and "learn" in vehicle:
         raise ValueError(f"{path}: [vehicle]: learn must stand above all tables")
-    if not isinstance(terms, dict):
-        raise ValueError(f"{path}: terms must be a table [terms], got {checks.short_repr(terms)}")
-    parts: dict[str, Any] = {
-        "vehicle": vehicle_of(tables, path, variant),
-        "terms": from_table(Terms, terms, f"{path}: [terms]"),
-    }
-    if (actuator := tables.get("actuator")) is not None:
-        if not isinstance(actuator, dict):
-            raise ValueError(f"{path}: actuator must be a table [actuator], got {checks.short_repr(actuator)}")
-        parts["actuator"] = from_table(Actuator, actuator, f"{path}: [actuator]")
+    parts: dict[str, Any] = {"vehicle": vehicle_of(tables, path, variant)}
+    for name, kind in (("terms", Terms), ("actuator", Actuator)):
+        if not isinstance(table := tables.get(name, {}), dict):
+            raise ValueError(f"{path}: {name} must be a table [{name}], got {checks.short_repr(table)}")
+        if name in tables:
+            parts[name] = from_table(kind, table, f"{path}: [{name}]")
     purpose = tables.get("purpose", {})
     if not isinstance(purpose, dict) or not all(isinstance(words, str) and words.strip() for words in purpose.values()):
         raise ValueError(f'{path}: purpose must be {{ cable_pull = "why" }}, got {checks.short_repr(purpose)}')

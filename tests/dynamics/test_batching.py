@@ -9,7 +9,7 @@ from evaluations import infer_batch, train_batch
 
 from hybrid_jax.dynamics import base
 from hybrid_jax.dynamics.batching import like
-from hybrid_jax.dynamics.composition import Blend, Frozen, Hybrid, check_batch_norm
+from hybrid_jax.dynamics.composition import Frozen, Hybrid, check_batch_norm
 from hybrid_jax.integrate import RK4
 from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.rollouts import rollout_minibatch
@@ -84,19 +84,6 @@ def test_a_wrapped_network_is_trained_as_the_bare_one(how):
 
 def test_nested_wrappers_and_several_networks_are_trained_as_their_hybrid():
     assert_trained_alike(Sum([Gain(Gain(network(1))), network(2)]), Hybrid(network(1), network(2)))
-
-
-def test_a_blend_is_the_mean_of_its_fields():
-    (x, u), fields = batch(), (Hybrid(network(1), network(2)), Gain(network(3)))
-    blend = Blend(fields)
-    for evaluate in (train_batch, infer_batch):
-        parts = [evaluate(field, x, u[0]) for field in fields]
-        np.testing.assert_allclose(evaluate(blend, x, u[0]), np.mean(parts, axis=0), rtol=1e-11)
-    at, ways = (x[:, 0], u[0, :, 0]), (jnp.eye(STATES), jnp.zeros((INPUTS, STATES)))
-    parts = zip(*(base.as_field(field).linearize(*at, *ways) for field in fields), strict=True)
-    for found, part in zip(base.as_field(blend).linearize(*at, *ways), parts, strict=True):
-        np.testing.assert_allclose(found, np.mean(part, axis=0), rtol=1e-11)
-    assert_trained_alike(Blend((network(), network())), Blend((Gain(network()), network())))
 
 
 def test_a_frozen_network_in_a_wrapper_stays_in_inference_mode():

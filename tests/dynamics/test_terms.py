@@ -16,7 +16,7 @@ from hybrid_jax.dynamics.base import state_space, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody, rigid_body, with_vehicle
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.integrate import rollout_batch
@@ -158,14 +158,6 @@ def test_a_body_that_does_not_turn_tells_where_its_cable_pulls():
     level = jnp.zeros(13).at[3].set(1.0)
     derivative = field(level, jnp.sqrt(lifts / IRIS.thrust_coefficient))
     np.testing.assert_allclose(IRIS.mass * derivative[VELOCITY], pull, atol=1e-12)
-
-
-def test_what_is_learned_goes_with_the_vehicle_to_another():
-    field = moved(rigid_body(IRIS, ALL, KNOWN))
-    heavy = with_vehicle(field, replace(IRIS, mass=2.0, inertia=(0.03, 0.04, 0.06), thrust_coefficient=9e-6))
-    for name, value in field.theta().items():
-        np.testing.assert_allclose(heavy.theta()[name], value, rtol=1e-12, atol=1e-15)
-    assert heavy.vehicle.mass == 2.0
 
 
 def test_a_learned_mass_is_that_of_a_heavier_vehicle():

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.dynamics.composition import Blend, Frozen, Hybrid
+from hybrid_jax.dynamics.composition import Frozen, Hybrid
 from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, Terms
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
@@ -83,7 +83,6 @@ FIELDS = {
     "linear residual": lambda: Hybrid(body(), moved(LinearResidual(jnp.zeros((13, 17)), jnp.zeros(13)))),
     "frozen rates": lambda: FrozenRates(per_rotor()),
     "frozen": lambda: Frozen(body()),
-    "blend": lambda: Blend((body(), with_residual("body_motion", "angular_acceleration"))),
     "hold": HoldState,
     "one's own": lambda: Dragged(body(), jnp.asarray(0.3)),
     "function": lambda: plain,

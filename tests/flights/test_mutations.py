@@ -122,7 +122,7 @@ NAMES = (
     "x" * 200_000,
     "hybrid_jax:Hybrid",
 )
-NAMES += ("hybrid_jax.dynamics.composition:Blend", "hybrid_jax.vehicle:Vehicle", "equinox.nn._linear:Linear")
+NAMES += ("hybrid_jax.dynamics.composition:Frozen", "hybrid_jax.vehicle:Vehicle", "equinox.nn._linear:Linear")
 DEEP = json.loads("[" * 300 + "]" * 300)
 VALUES = (
     DEEP,

@@ -8,7 +8,6 @@ import surface
 from pendulum import pendulum
 
 from hybrid_jax import IRIS, Hybrid, load, residual_network, rollout_batch, save
-from hybrid_jax.dynamics.composition import Blend
 from hybrid_jax.dynamics.rigid_body import perturbed
 from hybrid_jax.io import models
 from hybrid_jax.io.archive import save_archive, to_numpy
@@ -19,7 +18,6 @@ KEY = jax.random.key(0)
 PHYSICS = perturbed(IRIS, KEY)
 NETWORK = residual_network(13, 4, KEY, hidden=6, scaling=InputScaling(IRIS.hover_speed, 65.6))
 FIELDS = {"physics": PHYSICS, "network": NETWORK, "hybrid": Hybrid(PHYSICS, NETWORK)}
-FIELDS["blend"] = Blend((PHYSICS, FIELDS["hybrid"]))
 _direct = eqx.filter_jit(rollout_batch)
 
 
