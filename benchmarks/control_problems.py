@@ -19,7 +19,7 @@ from hybrid_jax.control.references import Path
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.terms import Terms
-from hybrid_jax.networks import make_residual
+from hybrid_jax.networks import multirotor_network
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.trajectories import Trajectories
 
@@ -69,7 +69,7 @@ VEHICLE = hj.rigid_body(hj.IRIS, (), Terms(drag=(0.5, 0.5, 0.2)))  # the truth: 
 def trained(activation: str, epochs: int, hidden: int = 64, **options) -> AbstractVectorField:
     """A hybrid of rigid body and network, trained on flights of `VEHICLE`."""
     key, windows = jax.random.key(0), flights(VEHICLE, 1200, seed=0)
-    network = make_residual(key, hidden=hidden, scaling=SCALING, activation=activation, **options)
+    network = multirotor_network(hj.IRIS, key, hidden=hidden, scaling=SCALING, activation=activation, **options)
     model = hj.Hybrid(hj.rigid_body(hj.IRIS), network)
     rates = hj.Hybrid(1e-2, 1e-3)  # pyright: ignore[reportArgumentType]
     return hj.fit(model, windows[:1000], windows[1000:], key, rates=rates, max_epochs=epochs, min_epochs=1).best

@@ -21,7 +21,7 @@ from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, perturbed
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.networks.mlp import InputScaling
-from hybrid_jax.networks.views import make_residual
+from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.flight import permutation
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, VELOCITY
@@ -34,7 +34,7 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 FORCES = 6  # v̇ and ω̇ are the last outputs of every residual network
-FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # outputs of `make_residual` that are forces
+FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # outputs of `multirotor_network` that are forces
 PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # purposes of a seed's keys
 
 
@@ -71,7 +71,7 @@ def _fresh_hybrids(
         else:
             signs = jax.random.rademacher(_key(seed, PHYSICS), (len(LEARNED),), float)
             physics = RigidBody(dict(zip(LEARNED, np.log(1 + guess) * signs, strict=True)), vehicle)
-        return Hybrid(replace(physics, wrench=forced), make_residual(_key(seed, NETWORK), vehicle=vehicle, **options))
+        return Hybrid(replace(physics, wrench=forced), multirotor_network(vehicle, _key(seed, NETWORK), **options))
 
     return eqx.filter_vmap(build)(seeds)
 

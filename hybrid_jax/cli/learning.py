@@ -18,7 +18,7 @@ from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.networks.views import make_residual
+from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.training import Settings, fit, rates_by_group
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.trajectories import Trajectories
@@ -122,8 +122,8 @@ def _hybrid(physics: Any, logs: Sequence[FlightLog], seed: int, settings: Settin
     learned, validating = (logs[:-1], logs[-1:]) if len(logs) > 2 else (logs, logs)
     vehicle, key = physics.vehicle, jax.random.key(seed)
     scaling = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
-    options: dict[str, Any] = {"hidden": HIDDEN, "norm": "none", "scaling": scaling, "vehicle": vehicle}
-    residual = zero_output(make_residual(key, inputs="body_motion", outputs=OUTPUTS, **options))
+    options: dict[str, Any] = {"hidden": HIDDEN, "norm": "none", "scaling": scaling}
+    residual = zero_output(multirotor_network(vehicle, key, inputs="body_motion", outputs=OUTPUTS, **options))
     field = Hybrid(physics, residual)
     train, validation = _windows(learned, TRAINED), _windows(validating, VALIDATED)
     rates = rates_by_group(field, {"residual": RATE})

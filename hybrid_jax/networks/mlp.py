@@ -146,7 +146,7 @@ class ResidualNetwork(AbstractVectorField):
         """The sum of this network and a linear map of z as one module, or None if the normalisation is not affine.
 
         Args:
-            linear: the map A of z (d, m).
+            linear: the map (d, m).
         """
         if not isinstance(self.norm, AbstractAffineNorm):
             return None
@@ -177,10 +177,6 @@ class LinearSkip(AbstractVectorField):
     """ẋ = A z + f_d(x, u), z = [x, scaled u]: a linear skip connection around a network.
 
     It represents, for example, linear drag exactly and extrapolates it beyond the data; hidden units do not.
-
-    Attributes:
-        weight: A (d, m), with the m numbers of z.
-        field: the network f_d, which also scales z.
     """
 
     accepts_batch: ClassVar[bool] = True

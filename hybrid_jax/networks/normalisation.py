@@ -81,33 +81,16 @@ class AbstractNorm(eqx.Module):
 
     @abstractmethod
     def infer(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
-        """The normalised W z of each sample in inference mode.
-
-        Args:
-            weight: W (h, m).
-            z: scaled states and inputs (m, …).
-        """
+        """The normalised W z of each sample in inference mode."""
 
     def train_layers(
         self, activation: Activation, weight_in, weight_out, bias_out, z: Float[Array, "m b"]
     ) -> Float[Array, "d b"]:
-        """W₂ σ(normalised W₁ z) + b₂ on a minibatch z (m, b) in training mode.
-
-        Args:
-            activation: σ, a function of each hidden unit.
-            weight_in: W₁ (h, m).
-            weight_out: W₂ (d, h).
-            bias_out: b₂ (d,).
-            z: scaled states and inputs, a column for each sample (m, b).
-        """
+        """W₂ σ(normalised W₁ z) + b₂ on a minibatch z, a column for each sample, in training mode."""
         return affine(weight_out, bias_out, activation(self.infer(weight_in, z)))
 
     def observed(self, hidden: Float[Array, "h b"]) -> Self:
-        """The normalisation with running statistics updated by a training batch.
-
-        Args:
-            hidden: W₁ z, a column for each sample (h, b).
-        """
+        """The normalisation with running statistics updated by a training batch W₁ z."""
         return self
 
 
@@ -116,11 +99,7 @@ class AbstractAffineNorm(AbstractNorm):
 
     @abstractmethod
     def fold(self, weight: Float[Array, "h m"]) -> tuple[Float[Array, "h m"], Float[Array, " h"]]:
-        """(W', c) such that W' z + c is the normalised W z in inference mode.
-
-        Args:
-            weight: W (h, m).
-        """
+        """(W', c) such that W' z + c is the normalised W z in inference mode."""
 
     def infer(self, weight, z):
         weight, bias = self.fold(weight)
@@ -132,13 +111,6 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
     """Batch normalisation of the hidden pre-activations h = W z, with gain γ and shift β (Ioffe and Szegedy 2015).
 
     Training uses the minibatch's mean and variance, inference running ones, which can be folded into the weights.
-
-    Attributes:
-        gain: γ of each hidden unit (h,).
-        shift: β of each hidden unit (h,).
-        running: mean and variance of each hidden unit, for inference.
-        momentum: fraction by which a training batch moves `running`.
-        epsilon: added to the variance before the square root.
     """
 
     gain: Float[Array, " h"]
@@ -159,11 +131,6 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
         return self.moved(RunningStats(mean, row_means(jnp.square(hidden - mean[:, None]))))
 
     def training_mode(self, seen: Moments):
-        """The layer for one sample of a minibatch.
-
-        Args:
-            seen: the moments of the minibatch.
-        """
         return MinibatchNorm(self.gain, self.shift, seen, self.epsilon)
 
 
@@ -182,13 +149,7 @@ class MinibatchNorm(AbstractNorm):
 
 
 class LayerNorm(AbstractNorm):
-    """Layer normalisation: the h units of a sample to mean 0 and variance 1, then gain and shift (Ba et al. 2016).
-
-    Attributes:
-        gain: factor on each hidden unit (h,).
-        shift: added to each hidden unit (h,).
-        epsilon: added to the variance before the square root.
-    """
+    """Layer normalisation: the h units of a sample to mean 0 and variance 1, then gain and shift (Ba et al. 2016)."""
 
     gain: Float[Array, " h"]
     shift: Float[Array, " h"]
@@ -202,11 +163,7 @@ class LayerNorm(AbstractNorm):
 
 
 class Bias(AbstractAffineNorm):
-    """No normalisation: the pre-activations plus a bias, as in a plain linear layer.
-
-    Attributes:
-        shift: the bias of each hidden unit (h,).
-    """
+    """No normalisation: the pre-activations plus a bias, as in a plain linear layer."""
 
     shift: Float[Array, " h"]
 

@@ -1,4 +1,4 @@
-"""Residual networks on part of a multirotor's state, chosen by name: `make_residual`."""
+"""Residual networks on part of a multirotor's state, chosen by name: `multirotor_network`."""
 
 from typing import ClassVar
 
@@ -13,30 +13,29 @@ from hybrid_jax.dynamics.composition import AbstractWrapper, Hybrid
 from hybrid_jax.dynamics.equations import dot
 from hybrid_jax.networks.mlp import LinearSkip, residual_network, zero_output
 from hybrid_jax.networks.normalisation import AbstractScaling
-from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.vehicle import IRIS, Vehicle
 
 # Name → how many numbers the network reads besides u (and one of each rotor near the ground), or returns.
 INPUTS = {"all": STATE_SIZE, "no_xy": STATE_SIZE - 2, "no_xy_yaw": 10, "near_ground": 10, "body": 10, "body_motion": 9}
 OUTPUTS = {"all": STATE_SIZE, "accelerations": 6, "rotors": 6, "angular_acceleration": 3, "motion": 12}
-FROM_THE_BODY, OF_ROTORS = ("body", "body_motion"), ("near_ground", "rotors")
+FROM_THE_BODY = ("body", "body_motion")
 GO_WITH = {"motion": FROM_THE_BODY}  # outputs → the inputs that they go with, where these are not all
 
 
-def _check(inputs: str, outputs: str, vehicle: Vehicle | None) -> None:
+def _check(inputs: str, outputs: str, vehicle: Vehicle) -> None:
     for name, value, known in (("inputs", inputs, INPUTS), ("outputs", outputs, OUTPUTS)):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
     if inputs not in (needed := GO_WITH.get(outputs, tuple(INPUTS))):
         raise ValueError(f"outputs {outputs!r} needs inputs of {' or '.join(needed)}, got {inputs!r}")
-    if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
-        raise ValueError(f"{needing[0]!r} needs vehicle=, for the ground effect, got None")
-    if vehicle is not None and inputs == "near_ground":
+    checks.instance("vehicle", vehicle, Vehicle)
+    if inputs == "near_ground":
         checks.positive("vehicle.rotor_radius", vehicle.rotor_radius)
 
 
 class View(AbstractWrapper):
-    """The field inside reads some features of a multirotor's state and returns some derivatives; see `make_residual`.
+    """The field inside reads some features of a multirotor's state and returns some derivatives.
 
     Other derivatives are zero: the physics ṗ = v and q̇ = ½ q ⊗ [0, ω] is exact, unless the state is an estimate.
     In the body frame it returns ṗ, v̇ and the quaternion r of q̇ = q ⊗ r, which makes it equivariant to yaw and to
@@ -45,10 +44,10 @@ class View(AbstractWrapper):
 
     inputs: str = eqx.field(static=True, default="all")
     outputs: str = eqx.field(static=True, default="all")
-    vehicle: Vehicle | None = eqx.field(static=True, default=None)
+    vehicle: Vehicle = eqx.field(static=True, default=IRIS)
 
     state_size: ClassVar[int] = STATE_SIZE
-    input_size = property(lambda self: INPUT_SIZE if self.vehicle is None else self.vehicle.rotors)
+    input_size = property(lambda self: self.vehicle.rotors)
 
     def __check_init__(self):
         _check(self.inputs, self.outputs, self.vehicle)
@@ -58,7 +57,7 @@ class View(AbstractWrapper):
             return x if self.inputs == "all" else x[2:]
         up, height, rates = _up(x), x[2:3], x[BODY_RATES]
         if self.inputs not in FROM_THE_BODY:
-            near = [_nearness(x, self.vehicle)] if self.inputs == "near_ground" and self.vehicle else []
+            near = [_nearness(x, self.vehicle)] if self.inputs == "near_ground" else []
             return jnp.concatenate([height, *near, up, x[VELOCITY], rates])
         velocity = rotation.rotate(rotation.conjugate(x[QUATERNION]), x[VELOCITY])
         return jnp.concatenate([height, -up, velocity, rates] if self.inputs == "body" else [velocity, rates, up])
@@ -76,7 +75,8 @@ class View(AbstractWrapper):
         return jnp.concatenate([position, rotation.multiply(q, inside[QUATERNION]), velocity, inside[BODY_RATES]])
 
 
-def make_residual(
+def multirotor_network(
+    vehicle: Vehicle,
     key: PRNGKeyArray,
     *,
     inputs: str = "all",
@@ -86,11 +86,11 @@ def make_residual(
     activation: str = "relu",
     scaling: AbstractScaling | None = None,
     linear: bool = False,
-    vehicle: Vehicle | None = None,
 ) -> AbstractVectorField:
     """A residual network that reads and returns part of a multirotor's state; by default all of it (paper).
 
     Args:
+        vehicle: its number of rotors; for "near_ground" and "rotors" also where they are, and their radius.
         inputs: what it reads besides u. "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw": p_z, the world's up in
             the body frame Rᵀe_z, v and ω, in world axes, in which a wind keeps its direction when the vehicle yaws;
             "near_ground", these and R / h of each rotor after p_z, in which ground effect is nearly linear (Cheeseman
@@ -104,20 +104,19 @@ def make_residual(
         activation: see `residual_network`.
         scaling: see `residual_network`.
         linear: add a linear skip connection (`LinearSkip`); the output is then initially zero.
-        vehicle: gives the number of rotors, by default four; required for "near_ground" and "rotors".
 
     Raises:
-        ValueError: an unknown name, incompatible outputs and inputs (see `GO_WITH`), or no vehicle or rotor radius.
+        ValueError: an unknown name, incompatible outputs and inputs (see `GO_WITH`), or no rotor radius.
     """
     _check(inputs, outputs, vehicle)
-    rotors = INPUT_SIZE if vehicle is None else vehicle.rotors
-    reads, writes = INPUTS[inputs] + rotors * (inputs == "near_ground"), OUTPUTS[outputs]
+    rotors, writes = vehicle.rotors, OUTPUTS[outputs]
+    reads = INPUTS[inputs] + rotors * (inputs == "near_ground")
     options: dict = {"hidden": hidden, "scaling": scaling, "activation": activation}
     network = residual_network(reads, rotors, key, norm=norm, outputs=writes, **options)
     field = zero_output(LinearSkip(jnp.zeros((writes, reads + rotors)), network)) if linear else network
     if (inputs, outputs) != ("all", "all"):
         field = View(field, inputs, outputs, vehicle)
-    if vehicle is None or outputs != "rotors":
+    if outputs != "rotors":
         return field
     thrust = residual_network(1, 1, jax.random.fold_in(key, 1), norm="none", **options)
     return Hybrid(zero_output(RotorThrust(thrust, vehicle)), field)
@@ -128,14 +127,7 @@ class RotorThrust(AbstractVectorField):
 
     By dimensional analysis, the ground effect on a rotor in hover is a function of its radius R over its altitude h
     (Cheeseman and Bennett 1955). One network learns it from the data of all rotors; force and torque follow from the
-    vehicle's geometry. The other derivatives are exactly zero.
-
-    Attributes:
-        field: f, from one state and one input to one number, without batch normalisation.
-        vehicle: provides rotor positions, radius, and nominal constants.
-
-    Raises:
-        ValueError: the vehicle's rotor radius is unknown.
+    vehicle's geometry. The other derivatives are exactly zero. f must have no batch normalisation.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -147,38 +139,25 @@ class RotorThrust(AbstractVectorField):
         checks.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
-        return self.write(x, u, self.share(self.read(x), u))
+        return self.write(x, u, self.share(_nearness(x, self.vehicle), u))
 
     def fuse_for_inference(self):
         return RotorThrust(as_field(self.field).fuse_for_inference(), self.vehicle)
 
     def linearize(self, x, u, dx, du):
         """Two derivatives of the network for each rotor, whatever the number of directions."""
-        near, d_near = jvp_columns(self.read, (x,), (dx,))
+        near, d_near = jvp_columns(lambda x: _nearness(x, self.vehicle), (x,), (dx,))
         share, pullback = jax.vjp(self.share, near, u)
         by_near, by_u = pullback(jnp.ones_like(share))
         d_share = by_near[:, None] * d_near + by_u[:, None] * du
         return jvp_columns(self.write, (x, u, share), (dx, du, d_share))
 
-    def read(self, x: Float[Array, " 13 *b"]) -> Float[Array, " rotors *b"]:
-        """R / h of each rotor."""
-        return _nearness(x, self.vehicle)
-
     def share(self, near: Float[Array, " rotors *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " rotors *b"]:
-        """f of each rotor.
-
-        Args:
-            near: R / h of each rotor (rotors,).
-            u: speed of each rotor [rad/s].
-        """
+        """f of each rotor, for its R / h and its speed [rad/s]."""
         return jax.vmap(self.field)(near[:, None], u[:, None])[:, 0]
 
     def write(self, x, u, share: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
-        """ẋ from the additional thrust of each rotor.
-
-        Args:
-            share: additional thrust of each rotor as a fraction of k u² (rotors,).
-        """
+        """ẋ from the additional thrust of each rotor as a fraction of k u²."""
         vehicle = self.vehicle
         thrust = vehicle.thrust_coefficient * u * u * share
         x_moment, y_moment = (dot(arms, thrust) for arms in zip(*vehicle.rotor_positions, strict=True))

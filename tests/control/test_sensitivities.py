@@ -20,7 +20,7 @@ from hybrid_jax.control.sensitivities import (
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
-from hybrid_jax.networks.views import make_residual
+from hybrid_jax.networks.views import multirotor_network
 
 DT = 0.05
 SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
@@ -29,7 +29,7 @@ SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
 def network(inputs="all", outputs="all", norm="batch", linear=False):
     """A network in which every parameter matters."""
     known = {"hidden": 8, "scaling": SCALING, "vehicle": hj.IRIS}
-    made = make_residual(jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
+    made = multirotor_network(key=jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
     return jax.tree.map(lambda leaf: leaf + 0.3 + 0.2 * jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape), made)
 
 

@@ -18,7 +18,7 @@ from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.normal_equations import left_out, normal_equations
 from hybrid_jax.estimation.uncertainty import select_disturbance
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.networks.views import make_residual
+from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.sweep.lanes import stack
 
@@ -29,7 +29,9 @@ NOISE = np.repeat(np.array([0.001, 0.0, 0.02, 0.02], np.float32), [3, 4, 3, 3]) 
 
 @cache
 def network():
-    made = make_residual(jax.random.key(0), inputs="no_xy_yaw", outputs="accelerations", hidden=8, norm="none")
+    made = multirotor_network(
+        hj.IRIS, jax.random.key(0), inputs="no_xy_yaw", outputs="accelerations", hidden=8, norm="none"
+    )
     return jax.tree.map(lambda leaf: 0.1 * leaf, made)
 
 

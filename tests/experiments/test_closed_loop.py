@@ -25,7 +25,7 @@ from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
 from hybrid_jax.control import Controller, Hardware, fly, performance, sample
 from hybrid_jax.networks.mlp import InputScaling
-from hybrid_jax.networks.views import make_residual
+from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.runtime import cores
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 
@@ -59,7 +59,7 @@ def test_calls_are_timed_on_one_core():
 @pytest.fixture(scope="module")
 def models():
     """Models of three structures by agent, and the hybrid among them."""
-    network = make_residual(jax.random.key(1), hidden=8, scaling=SCALING, vehicle=hj.IRIS)
+    network = multirotor_network(hj.IRIS, jax.random.key(1), hidden=8, scaling=SCALING)
     hybrid = hj.Hybrid(BODY, eqx.tree_at(lambda n: n.weight_out, network, 0.01 * network.weight_out))
     stacked = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), hybrid)
     nominal, true = as_stack(hj.rigid_body(hj.IRIS)), as_stack(true_field(PARAMETER_SHIFT, hj.IRIS))

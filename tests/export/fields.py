@@ -16,7 +16,7 @@ from hybrid_jax.dynamics.composition import Frozen, Hybrid
 from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, Terms
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
-from hybrid_jax.networks.views import make_residual
+from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
 
@@ -45,7 +45,7 @@ def moved(field, size=0.1):
 
 
 def network(**options):
-    return moved(make_residual(KEY, hidden=5, scaling=SCALING, vehicle=IRIS, **options))
+    return moved(multirotor_network(IRIS, KEY, hidden=5, scaling=SCALING, **options))
 
 
 def plain(x, u):

@@ -12,7 +12,8 @@ import hybrid_jax as hj
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.export import export_c
 from hybrid_jax.integrate import rk4_step
-from hybrid_jax.networks import make_residual, smoothed
+from hybrid_jax.networks import multirotor_network, smoothed
+from hybrid_jax.vehicle import IRIS
 
 pytestmark = needs_compiler
 DT = 0.02
@@ -59,7 +60,7 @@ def test_it_is_the_field(name, tmp_path):
 
 def wide(norm="batch", **options):
     """A network of the paper's size, whose layers are loops."""
-    return Hybrid(body(), make_residual(KEY, hidden=64, norm=norm, **options))
+    return Hybrid(body(), multirotor_network(IRIS, KEY, hidden=64, norm=norm, **options))
 
 
 WIDE = {

@@ -18,7 +18,7 @@ from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import RK4, integrate, rollout_batch
 from hybrid_jax.kernels import library
-from hybrid_jax.networks import make_residual
+from hybrid_jax.networks import multirotor_network
 from hybrid_jax.networks.mlp import LinearSkip, residual_network
 from hybrid_jax.networks.normalisation import ChannelScaling
 from hybrid_jax.runtime import FAST_COMPILE
@@ -57,7 +57,9 @@ FIELDS = {
     ),
     "a skip around a norm": Hybrid(RigidBody(THETA, ODD), LinearSkip(jnp.ones((13, 17)) / 10, network(13, 4))),
     "layer norm": network(4, 1, norm="layer", activation="silu"),
-    "a view of the state": Hybrid(RigidBody(THETA, ODD), make_residual(jax.random.key(2), inputs="no_xy", hidden=32)),
+    "a view of the state": Hybrid(
+        RigidBody(THETA, ODD), multirotor_network(IRIS, jax.random.key(2), inputs="no_xy", hidden=32)
+    ),
 }
 FIELD = FIELDS["the paper's"]
 

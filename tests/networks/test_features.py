@@ -15,7 +15,7 @@ from hybrid_jax.dynamics import base
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.networks import views
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.networks.views import View, make_residual
+from hybrid_jax.networks.views import View, multirotor_network
 from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
@@ -29,8 +29,8 @@ FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in views.FROM_THE_BODY]
 
 
 def view(inputs="all", outputs="all", **options):
-    known = {"hidden": 9, "scaling": HOVER, "vehicle": IRIS}
-    return make_residual(KEY, inputs=inputs, outputs=outputs, **(known | options))
+    known = {"vehicle": IRIS, "hidden": 9, "scaling": HOVER}
+    return multirotor_network(key=KEY, inputs=inputs, outputs=outputs, **(known | options))
 
 
 def samples(count=7, seed=0):
@@ -59,15 +59,15 @@ def network_of(field):
 @pytest.mark.parametrize("norm", ["batch", "layer", "none"])
 def test_by_default_the_network_is_the_paper_s(norm):
     plain = residual_network(13, 4, KEY, hidden=20, scaling=HOVER, norm=norm)
-    assert eqx.tree_equal(make_residual(KEY, hidden=20, scaling=HOVER, norm=norm), plain)
-    assert eqx.tree_equal(make_residual(KEY), residual_network(13, 4, KEY))
+    assert eqx.tree_equal(multirotor_network(IRIS, KEY, hidden=20, scaling=HOVER, norm=norm), plain)
+    assert eqx.tree_equal(multirotor_network(IRIS, KEY), residual_network(13, 4, KEY))
 
 
 @pytest.mark.parametrize("options", [{"inputs": "world"}, {"outputs": "v"}, {"norm": "group"}], ids=str)
 def test_an_unknown_name_is_refused(options):
     (name, value), *_ = options.items()
     with pytest.raises(ValueError, match=rf"{name} must be one of .*'{value}'"):
-        make_residual(KEY, **options)
+        multirotor_network(IRIS, KEY, **options)
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(pair for pair in VIEWS if pair[0] != "all"))
@@ -121,8 +121,6 @@ def test_near_the_ground_each_rotor_is_as_high_as_in_the_simulator():
 
 @pytest.mark.parametrize("options", [{"inputs": "near_ground"}, {"outputs": "rotors"}], ids=str)
 def test_rotors_of_an_unknown_vehicle_are_refused(options):
-    with pytest.raises(ValueError, match="needs vehicle=, for the ground effect, got None"):
-        make_residual(KEY, **options)
     with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
         view(**options, vehicle=replace(IRIS, rotor_radius=0.0))
 

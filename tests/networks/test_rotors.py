@@ -15,7 +15,7 @@ from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.networks.mlp import InputScaling, ResidualNetwork, residual_network
 from hybrid_jax.networks.normalisation import ChannelScaling
 from hybrid_jax.networks.standardise import with_scaling
-from hybrid_jax.networks.views import INPUTS, RotorThrust, make_residual
+from hybrid_jax.networks.views import INPUTS, RotorThrust, _nearness, multirotor_network
 from hybrid_jax.sim.forces import ground_effect, parameters_of
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.trajectories import Trajectories
@@ -83,9 +83,9 @@ def test_rotors_are_alike():
 
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow((inputs, "rotors") for inputs in INPUTS))
 def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, outputs, tmp_path):
-    known = {"inputs": inputs, "hidden": 5, "scaling": HOVER, "vehicle": IRIS}
-    (x, u), field = samples(), make_residual(KEY, outputs=outputs, **known)
-    alone = make_residual(KEY, outputs="accelerations", **known)
+    known = {"inputs": inputs, "hidden": 5, "scaling": HOVER}
+    (x, u), field = samples(), multirotor_network(IRIS, KEY, outputs=outputs, **known)
+    alone = multirotor_network(IRIS, KEY, outputs="accelerations", **known)
     np.testing.assert_array_equal(deployed(field, x, u), deployed(alone, x, u))
     slope = eqx.filter_jit(eqx.filter_grad(lambda residual: jnp.sum(residual.train_batch(x, u))))(field)
     assert (slope.physics.field.weight_out != 0).any()
@@ -97,11 +97,11 @@ def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, 
 def test_what_all_rotors_read_is_scaled_by_windows():
     x, u = samples()
     windows = Trajectories(x.T, u.T[:, None], x.T[:, None], 0.01)
-    field = with_scaling(make_residual(KEY, outputs="rotors", hidden=5, vehicle=IRIS), windows)
+    field = with_scaling(multirotor_network(IRIS, KEY, outputs="rotors", hidden=5), windows)
     assert isinstance(field, Hybrid)
     assert isinstance(field.physics, RotorThrust)
     assert isinstance(field.physics.field, ResidualNetwork)
     scaling = field.physics.field.scaling
     assert isinstance(scaling, ChannelScaling)
     assert scaling.offset is not None
-    np.testing.assert_allclose(scaling.offset, [shared().read(x).mean(), u.mean()], rtol=1e-5)
+    np.testing.assert_allclose(scaling.offset, [_nearness(x, IRIS).mean(), u.mean()], rtol=1e-5)
