@@ -20,8 +20,8 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.windows import count_windows, flight_of, folds, manoeuvre_of
+from hybrid_jax.flights.log import FlightLog, segments
+from hybrid_jax.flights.windows import flight_of, folds, manoeuvre_of
 
 LEARNED, ADAPTED = "learned", "adapted"
 BASELINES = (names.HOLD, names.THRUST, names.LINEAR_RESIDUAL)
@@ -71,7 +71,7 @@ def run_folds(
         if not adapts and len(fold.train) < 2:
             raise ValueError(f"--source: without {fold.name} one flight is left; two at least, one for validation")
         for log in fold.test:
-            if not count_windows([log], max(config.horizon)):
+            if all(part.stop - part.start <= max(config.horizon) for part in segments(log)):
                 raise ValueError(f"--horizon: no window of {max(config.horizon)} intervals without gaps in {log.name}")
 
     @cache

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import reduce
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from hybrid_jax import checks
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held, rotation_of
@@ -78,7 +78,10 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
     else:
         v = rotation_of(q).apply(interpolate(t, signals["body_velocity"].t, signals["body_velocity"].values))
     u = mean_of_held(t, motors.t, _speeds(recording, motors, polynomial))
-    known = np.logical_and.reduce([_is_known(t, signal.t, dt) for signal in used])
+    known = np.ones(len(t), bool)
+    for signal in used:  # between two samples without a gap; the start of a gap counts as known
+        inside = np.clip(np.searchsorted(signal.t, t, side="right") - 1, 0, len(signal) - 2)
+        known &= ~(np.diff(signal.t) > GAP * max(signal.interval, dt))[inside] | (t == signal.t[inside])
     x = np.concatenate([p, q, v, omega], axis=1)
     return FlightLog(t[known] - first, x[known], u[known], recording.name)
 
@@ -87,12 +90,6 @@ def flight_at(recording: Recording, dt: float | None = None, polynomial: Sequenc
     """Return the flight at the times of its rows if it has such rows, else at intervals of dt [s]: see `to_flight`."""
     rows = own_rows(recording)
     return to_flight(recording, dt or DT, polynomial) if rows is None else rows
-
-
-def own_interval(recording: Recording) -> float:
-    """Return the sample interval of `flight_at` [s]."""
-    rows = own_rows(recording)
-    return DT if rows is None else rows.dt
 
 
 def own_rows(recording: Recording) -> FlightLog | None:
@@ -161,11 +158,3 @@ def _speeds(recording: Recording, motors: Signal, polynomial: Sequence[float]) -
     # A motor at command 0 stands still, whatever the polynomial says.
     speeds = np.polynomial.polynomial.polyval(motors.values, polynomial)
     return np.where(motors.values > 0, np.maximum(speeds, 0.0), 0.0)
-
-
-def _is_known(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], dt: float) -> Bool[np.ndarray, " m"]:
-    """Whether t lies between two samples without a gap; the start of a gap counts as known."""
-    intervals = np.diff(at)
-    lost = intervals > GAP * max(float(np.median(intervals)), dt)
-    inside = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(intervals) - 1)
-    return ~lost[inside] | (t == at[inside])

@@ -12,7 +12,7 @@ import numpy as np
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.checks.consistency import FAILS, WARNS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
-from hybrid_jax.flights.conversion import flight_at, own_interval
+from hybrid_jax.flights.conversion import DT, flight_at, own_rows
 from hybrid_jax.flights.formats.blackbox import read_blackbox
 from hybrid_jax.flights.formats.column_map import read_mapped
 from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
@@ -106,7 +106,9 @@ def load_logs(
         found = f"; it holds {others}" if left else ""
         raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
     raws = [read_recording(path, columns, topics, motor_order) for path in paths]
-    report([(raw.name, c) for raw in raws for c in check_recording(raw, vehicle, dt or own_interval(raw))], failed)
+    intervals = [dt or getattr(own_rows(raw), "dt", DT) for raw in raws]
+    found = [(raw.name, check_recording(raw, vehicle, own)) for raw, own in zip(raws, intervals, strict=True)]
+    report([(name, check) for name, checks in found for check in checks], failed)
 
     def cleaned(log: FlightLog) -> FlightLog:
         fits = dt is None or (log.dt == dt and not unevenness(log).any())

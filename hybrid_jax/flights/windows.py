@@ -184,21 +184,11 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWi
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
     """Return the logs with at least one window of `steps` intervals; raise ValueError if there are none."""
-    long = [log for log in logs if max(_intervals(log), default=0) >= steps]
-    if not long:
+    longest = [max((part.stop - part.start - 1 for part in segments(log)), default=0) for log in logs]
+    if not (long := [log for log, length in zip(logs, longest, strict=True) if length >= steps]):
         names = ", ".join(map(flight_of, logs))
-        longest = max((length for log in logs for length in _intervals(log)), default=0)
         raise ValueError(
-            f"no window of {steps} intervals without gaps in {names}; the longest segment has {longest}: "
-            "bridge gaps or use shorter windows"
+            f"no window of {steps} intervals without gaps in {names}; the longest segment has "
+            f"{max(longest, default=0)}: bridge gaps or use shorter windows"
         )
     return long
-
-
-def count_windows(logs: Sequence[FlightLog], steps: int) -> int:
-    """Count the windows of `cut_windows` with a stride of 1."""
-    return sum(max(0, length - steps + 1) for log in logs for length in _intervals(log))
-
-
-def _intervals(log: FlightLog) -> list[int]:
-    return [part.stop - part.start - 1 for part in segments(log)]

@@ -126,23 +126,19 @@ def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
         still = "the vehicle stays on the ground: check a log in flight"
         return Check(RATIO, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
     ratio = float(along.mean() / thrust.mean())
-    if 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT:
-        return judged(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, "")
-    check = judged(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, _thrust_advice(ratio, log, vehicle))
-    return replace(check, verdict=WARNS) if CHANGED in check.suggestion else check
-
-
-def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
-    if ratio <= 0:
-        return "body z points down: correct the frames first"
+    possible = 1 / POSSIBLE < ratio < POSSIBLE
+    advice = f"multiply thrust_coefficient by {ratio:.3g}, or divide mass by it, whichever is less sure"
+    advice += f"; {CHANGED}" * possible
     units = {"rpm": np.pi / 30, "rev/s": 2 * np.pi, "deg/s": np.pi / 180, "rad/s, read as rpm": 30 / np.pi}
-    for unit, factor in units.items():
-        if 0.7 < ratio / factor**2 < 1.4:
-            return f"rotor speeds are in {unit}: declare it"
-    if log.u.max() < 0.02 * vehicle.hover_speed:
-        return "rotor speeds are normalised commands: give the polynomial that maps them to rad/s"
-    scaled = f"multiply thrust_coefficient by {ratio:.3g}, or divide mass by it, whichever is less sure"
-    return f"{scaled}; {CHANGED}" if 1 / POSSIBLE < ratio < POSSIBLE else scaled
+    if ratio <= 0:
+        advice = "body z points down: correct the frames first"
+    elif found := [unit for unit, factor in units.items() if 0.7 < ratio / factor**2 < 1.4]:
+        advice = f"rotor speeds are in {found[0]}: declare it"
+    elif log.u.max() < 0.02 * vehicle.hover_speed:
+        advice = "rotor speeds are normalised commands: give the polynomial that maps them to rad/s"
+    fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT
+    check = judged(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else advice)
+    return replace(check, verdict=WARNS) if CHANGED in check.suggestion else check
 
 
 def _columns(log: FlightLog) -> Check:
@@ -155,16 +151,12 @@ def _columns(log: FlightLog) -> Check:
     alike = [(a, b) for a, b in combinations(moving, 2) if a[0] == b[0] == "u" and (columns[a] == columns[b]).all()]
     problems = [f"{a} and {b} are equal in every sample" for a, b in alike]
     problems += [f"{name} never changes" for name in columns if name[0] in kinds and name not in moving]
-    gyros = [name for name in moving if name[0] == "w"]
-    problems += [f"{name} saturates: widen its range" for name in gyros if _saturates(columns[name])]
+    for name in (name for name in moving if name[0] == "w"):
+        values, usual = columns[name], AT_LIMIT * len(log) / len(np.unique(columns[name]))
+        at_an_end = max((values == values.max()).sum(), (values == values.min()).sum())
+        problems += [f"{name} saturates: widen its range"] * bool(at_an_end > max(AT_LIMIT, usual))
     advice = f"{'; '.join(problems)}: log what was measured, or name its columns"
     return _at_most("columns", float(len(problems)), "suspect", 0.0, advice)
-
-
-def _saturates(values: np.ndarray) -> bool:
-    """Whether the largest or smallest value occurs far more often than others."""
-    usual = AT_LIMIT * len(values) / len(np.unique(values))
-    return max((values == values.max()).sum(), (values == values.min()).sum()) > max(AT_LIMIT, usual)
 
 
 def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
@@ -234,7 +226,7 @@ def _compare_means(log: FlightLog, name: str, pairs: Pairs, least: float, span: 
     if name == THRUST and advice == UNUSUAL:
         advice = f"{UNUSUAL}; {CHANGED}"
     elif name != THRUST:
-        advice = advice or _axes_apart(a, b, least) or _other_scale(a, b)
+        advice = advice or _apart(a, b, least)
     check = judged(name, value, "relative error", limit, advice)
     return replace(check, verdict=WARNS) if advice and doubtful else check
 
@@ -250,14 +242,12 @@ def _nearer(pairs: Pairs, limit: float, least: float) -> str:
     return best if nearer and _relative_error(*pairs[best]) <= limit else ""
 
 
-def _axes_apart(a: Vectors, b: Vectors, least: float) -> str:
+def _apart(a: Vectors, b: Vectors, least: float) -> str:
+    """Return what is wrong with one axis, or with the scale of all; empty if nothing is."""
     pairs = {axis: (a[:, [i]], b[:, [i]]) for i, axis in enumerate("xyz")}
     moving = {axis: pair for axis, pair in pairs.items() if max(map(_size, pair)) > CLEAR * least}
-    apart = [axis for axis, pair in moving.items() if _relative_error(*pair) > AXIS_LIMIT]
-    return f"{' and '.join(apart)} alone: {UNUSUAL}" if apart else ""
-
-
-def _other_scale(a: Vectors, b: Vectors) -> str:
+    if apart := [axis for axis, pair in moving.items() if _relative_error(*pair) > AXIS_LIMIT]:
+        return f"{' and '.join(apart)} alone: {UNUSUAL}"
     gain = float((a * b).sum() / (b * b).sum())
     if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT:
         return ""

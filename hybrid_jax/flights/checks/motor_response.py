@@ -53,7 +53,10 @@ def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
     yaw = around[np.abs(around).argmax()]
     sign = -1 if yaw < 0 else 1
     found = [*table[at, best, :2].tolist(), float(abs(yaw))]
-    lag = (at - reach + _vertex(score[:, best], int(at))) * log.dt
+    left, top, right = score[[max(at - 1, 0), at, min(at + 1, 2 * reach)], best]
+    inside, curve = 0 < at < 2 * reach, left - 2 * top + right
+    vertex = 0.5 * (left - right) / curve if inside and curve < 0 else 0.0  # of a parabola through the peak
+    lag = (at - reach + vertex) * log.dt
     order = orders(len(arms))[best]
     turning = squares @ mix[:2, np.argsort(order)].T
     change = float(np.sqrt((np.diff(turning, axis=0) ** 2).mean() / (turning**2).mean()))
@@ -99,12 +102,3 @@ def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], 
         bands.append(smooth[slow // 2 :][: len(trend)] - trend)
     whole = moving_mean(sound[:, None].astype(float), fast + slow - 1) > 1 - 1e-9
     return np.where(whole, bands[0], 0.0), np.where(whole, bands[1], 0.0)
-
-
-def _vertex(score: Float[np.ndarray, " l"], at: int) -> float:
-    """Refine a peak by a parabola; returns an offset of −0.5 … 0.5 samples."""
-    if not 0 < at < len(score) - 1:
-        return 0.0
-    left, top, right = score[at - 1 : at + 2]
-    curve = left - 2 * top + right
-    return float(0.5 * (left - right) / curve) if curve < 0 else 0.0
