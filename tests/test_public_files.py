@@ -1,6 +1,6 @@
 """Whatever a file contains, it is read completely or refused in one line that names it; its code never runs.
 
-The generated cases are those of test_public_surface.py, for files.
+The generated cases are those of test_public_surface.py, for files; test_mutations.py damages and forges sound ones.
 """
 
 import dataclasses
@@ -17,20 +17,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pendulum import pendulum, swings
-from surface import cases, is_finite, outcome, spoiled
+from surface import cases, outcome
 
 import hybrid_jax as hj
-from hybrid_jax.export import Program, export_program, load_program
+from hybrid_jax.export import load_program
 from hybrid_jax.export.stablehlo import FORMAT as PROGRAM
-from hybrid_jax.io.archive import named_leaves, save_archive
 from hybrid_jax.io.datasets import FORMAT as DATASET
-from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
+from hybrid_jax.io.datasets import load_dataset
 from hybrid_jax.io.models import FORMAT as MODEL
 
 KEY = jax.random.key(0)
-MIXED = hj.Hybrid(pendulum(), hj.residual_network(2, 1, KEY, hidden=4))
-WINDOWS = jax.tree.map(np.asarray, swings(12, steps=3))
 
 
 @pytest.fixture(scope="module")
@@ -97,79 +93,6 @@ def test_a_value_is_saved_and_loaded_or_refused(folder, held, about):
             for field in (hj.load(path).field, Anything(held))
         )
         assert eqx.tree_equal(loaded, saved)
-
-
-@pytest.fixture(scope="module")
-def files(folder):
-    """Loader → the bytes of a sound file."""
-    hj.save(folder / "model.npz", MIXED, {"n": 1})
-    save_dataset(folder / "set.npz", Dataset({"train": WINDOWS}, {"config": {"seed": 1}}))
-    export_program(folder / "program.npz", MIXED, state_size=2, input_size=1)
-    names = {hj.load: "model", load_dataset: "set", load_program: "program"}
-    return {load: (folder / f"{name}.npz").read_bytes() for load, name in names.items()}
-
-
-def content(found):
-    if isinstance(found, Program):
-        return np.asarray(found(np.ones(2), np.ones(1)))
-    return named_leaves(found.field if isinstance(found, hj.Model) else dict(found.splits))
-
-
-@cases(0.05)
-@given(
-    load=st.sampled_from([hj.load, load_dataset, load_program]),
-    damage=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 40), st.binary(max_size=40)), min_size=1, max_size=3),
-)
-def test_a_damaged_file_is_refused_or_unchanged(folder, files, load, damage):
-    path, damaged = folder / "damaged.npz", files[load]
-    path.write_bytes(damaged)
-    sound = content(load(path))
-    for share, length, bytes_there in damage:
-        place = int(share * len(damaged))
-        damaged = damaged[:place] + bytes_there + damaged[place + length :]
-    path.write_bytes(damaged)
-    found = outcome(load, path, naming=str(path))
-    assert found is None or eqx.tree_equal(content(found), sound)
-
-
-# Headers with a correct checksum that `save` did not write.
-HYBRID = "hybrid_jax.dynamics.base:Hybrid"
-KINDS = st.sampled_from(["RigidBody", "Vehicle", "InputScaling", "BatchNorm", "os.system", HYBRID, "os:system"])
-NAMES = st.sampled_from(
-    ["physics", "residual", "deviations", "vehicle", "mass", "field", "scale", "k", "Ix", "Iy", "about"]
-)
-FORGED = st.recursive(
-    st.one_of(st.none(), st.integers(-2, 2), st.text(max_size=3), st.just({"array": "a"}), st.just({"array": "gone"})),
-    lambda inner: st.one_of(
-        st.fixed_dictionaries({"kind": KINDS, "fields": st.dictionaries(NAMES, inner, max_size=3)}),
-        st.fixed_dictionaries({"class": KINDS, "fields": st.dictionaries(NAMES, inner, max_size=3)}),
-        st.fixed_dictionaries({"items": st.dictionaries(NAMES, inner, max_size=3)}),
-        st.dictionaries(st.sampled_from(["tuple", "list"]), st.lists(inner, max_size=3), max_size=1),
-        st.dictionaries(st.sampled_from(["named", "static", "dtype", "float"]), inner, max_size=1),
-        st.fixed_dictionaries({"field": inner, "about": inner, "splits": st.dictionaries(NAMES, inner, max_size=2)}),
-        st.fixed_dictionaries(
-            {"class": st.just(HYBRID), "fields": st.fixed_dictionaries({"physics": inner, "residual": inner})}
-        ),
-    ),
-    max_leaves=8,
-)
-
-
-@cases(0.05)
-@given(
-    header=st.one_of(FORGED, st.fixed_dictionaries({"field": FORGED, "about": FORGED})), array=spoiled(np.ones((2, 3)))
-)
-def test_a_forged_file_is_refused_or_predicts_finite_states(folder, header, array):
-    path, arrays = folder / "forged.npz", {"a": array} if isinstance(array, np.ndarray) else {}
-    for form, load in ((MODEL, hj.load), (DATASET, load_dataset), (PROGRAM, load_program)):
-        path.unlink(missing_ok=True)
-        outcome(save_archive, path, form, header, arrays)
-        if not path.exists():
-            continue
-        found = outcome(load, path, naming=str(path))
-        if isinstance(found, hj.Model):
-            prediction = outcome(found.predict, np.zeros(2), np.zeros((3, 1)), 0.01)
-            assert prediction is None or is_finite(prediction)
 
 
 def npy(descr="<f8", shape="(2,)", data=bytes(16), version=1):

@@ -9,11 +9,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from experiments.runner.run_record import backup_path
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive
 from hybrid_jax.io.datasets import Dataset, content_hash, versions
-from hybrid_jax.io.files import backup_path, json_value
-from hybrid_jax.io.models import describe
+from hybrid_jax.io.files import json_value
+from hybrid_jax.io.structure import Structure
 from hybrid_jax.training.fitting import FitState, RunConfig
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
 
@@ -63,7 +64,7 @@ def identity_of(*inputs: Any) -> str:
     for value in inputs:
         match value:
             case AbstractVectorField():
-                fixed.append(describe(value))
+                fixed.append(Structure(value).tree)
                 arrays |= {f"{len(fixed)}.{name}": leaf for name, leaf in named_leaves(value).items()}
             case Dataset():
                 fixed.append(content_hash(value))
@@ -80,7 +81,7 @@ def sweep_identity(states: FitState, plans: RunConfig, settings: Settings, data:
     if not isinstance(objective, TrajectoryLoss):
         shared += [type(objective).__name__, asdict(objective)]
     # Array leaves do not include a field's static data, such as the vehicle or the scaling of inputs.
-    fixed = [RECIPE, *shared, describe(states.field), content_hash(data)]
+    fixed = [RECIPE, *shared, Structure(states.field).tree, content_hash(data)]
     return digest(fixed, named_leaves({"start": states, "plan": plans}))
 
 

@@ -1,6 +1,7 @@
 """A run's environment, and run.json with its configuration, so that only the same run can resume."""
 
 import hashlib
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -12,7 +13,7 @@ from experiments.runner.options import Run
 from hybrid_jax import kernels
 from hybrid_jax.cli.command import ChecksFailed, Explained
 from hybrid_jax.io.datasets import versions
-from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_atomic
+from hybrid_jax.io.files import json_text, json_value, read_json, write_atomic
 from hybrid_jax.runtime import cores, hardware
 
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax")
@@ -94,6 +95,13 @@ def _differences(old: Mapping[str, Any], new: Mapping[str, Any], parts: tuple[st
         for name in sorted(before.keys() | now.keys())
         if before.get(name) != now.get(name)
     ]
+
+
+def backup_path(path: Path, reason: str) -> Path:
+    """Return an unused name beside a path with the reason and the time (UTC), to rename it instead of deleting it."""
+    stem = f"{path.name}.{reason}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    names = itertools.chain([stem], (f"{stem}-{i}" for i in itertools.count(2)))
+    return next(free for free in map(path.with_name, names) if not free.exists())
 
 
 def _move_aside(folder: Path, say: Callable[[str], None]) -> None:

@@ -1,6 +1,5 @@
 """Atomic writes, and strict JSON."""
 
-import itertools
 import json
 import math
 import os
@@ -8,7 +7,6 @@ import secrets
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +34,6 @@ def write_atomic(path: str | Path, content: str | bytes) -> None:
         raise OSError(f"{path}: cannot be saved: {error.strerror}; what was saved before is intact") from error
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def backup_path(path: Path, reason: str) -> Path:
-    """An unused name beside `path` with the reason and the time (UTC), to rename a file instead of deleting it."""
-    stem = f"{path.name}.{reason}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
-    names = itertools.chain([stem], (f"{stem}-{i}" for i in itertools.count(2)))
-    return next(free for free in map(path.with_name, names) if not free.exists())
 
 
 def json_text(value: Any) -> str:

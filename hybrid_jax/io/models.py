@@ -146,17 +146,3 @@ def check_savable(field: Any) -> str | None:
         return Structure(field).problem
     except ValueError as error:
         return str(error)
-
-
-def describe(field: eqx.Module) -> Any:
-    """The structure of a field as JSON values, without its arrays.
-
-    Args:
-        field: any Equinox module.
-
-    Raises:
-        ValueError: a part has no name for a file.
-    """
-    if (structure := Structure(field)).problem is not None:
-        raise ValueError(structure.problem)
-    return structure.tree

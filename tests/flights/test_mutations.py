@@ -7,6 +7,7 @@ import resource
 import subprocess
 import time
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -16,12 +17,14 @@ from writers import bag, blackbox, crazyflie, escs, ulog
 import hybrid_jax as hj
 from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
+from hybrid_jax.export import Program, export_program, load_program
+from hybrid_jax.export.stablehlo import FORMAT as PROGRAM
 from hybrid_jax.flights.checks.consistency import check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import COLUMNS
-from hybrid_jax.io.archive import load_archive, save_archive
+from hybrid_jax.io.archive import load_archive, named_leaves, save_archive
 from hybrid_jax.io.datasets import FORMAT as DATASET
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.files import json_text, read_json, write_atomic
@@ -29,7 +32,13 @@ from hybrid_jax.io.models import FORMAT as MODEL
 from hybrid_jax.vehicle import IRIS
 
 LOGS = ("flight.csv", "flight.ulg", "flight.bbl", "log00", "log00.gz", "flight.bag", "flight.db3", "flight.mcap")
-LOADERS = {"model.npz": hj.load, "set.npz": load_dataset, "vehicle.toml": load_vehicle_model, "report.json": read_json}
+LOADERS = {
+    "model.npz": hj.load,
+    "set.npz": load_dataset,
+    "program.npz": load_program,
+    "vehicle.toml": load_vehicle_model,
+    "report.json": read_json,
+}
 LIBRARY = {"flight.ulg": "pyulog", "flight.bbl": "orangebox", "flight.bag": "rosbags"}
 SECONDS, MEMORY = 10.0, 1 << 20  # of one file, s; kB
 COUNTS = pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
@@ -52,9 +61,9 @@ def wholes(flight, topics, tmp_path_factory):
     for plugin, suffix in (("ROS1", "bag"), ("SQLITE3", "db3"), ("MCAP", "mcap")):
         path = bag(folder / suffix, few, plugin)
         made[f"flight.{suffix}"] = next(iter(path.glob(f"*.{suffix}") if path.is_dir() else [path])).read_bytes()
-    hj.save(
-        folder / "model.npz", hj.Hybrid(hj.rigid_body(IRIS), hj.residual_network(13, 4, jax.random.key(0), hidden=4))
-    )
+    model = hj.Hybrid(hj.rigid_body(IRIS), hj.residual_network(13, 4, jax.random.key(0), hidden=4))
+    hj.save(folder / "model.npz", model)
+    export_program(folder / "program.npz", model, state_size=13, input_size=4)
     windows = hj.Trajectories(few.x[:1], few.u[None, :5], few.x[None, 1:6], 0.01)
     save_dataset(folder / "set.npz", Dataset({"train": windows}, {"config": {"vehicle": "iris"}}))
     write_atomic(folder / "report.json", json_text({"rows": [{"test_mse": 0.5, "seed": i} for i in range(9)]}))
@@ -79,10 +88,19 @@ def mutated(content, rng):
     return bytes(content[: int(rng.integers(1, len(content)))] if rng.random() < 0.2 else content)
 
 
-def went_through(path):
-    """Reads, checks and converts, and looks at what each says."""
+def content(found):
+    if isinstance(found, Program):
+        return np.asarray(found(np.eye(13)[3], np.full(4, 600.0)))
+    return named_leaves(found.field if isinstance(found, hj.Model) else dict(found.splits))
+
+
+def went_through(path, whole):
+    """Reads, checks and converts, and looks at what each says; an archive is whole or refused."""
     if path.name in LOADERS:
-        outcome(LOADERS[path.name], path, naming=str(path))
+        found = outcome(LOADERS[path.name], path, naming=str(path))
+        if found is not None and path.suffix == ".npz":
+            path.write_bytes(whole)
+            assert eqx.tree_equal(content(found), content(LOADERS[path.name](path)))
         return
     recording = outcome(
         read_recording, path, topics={} if path.name.endswith(".ulg") else {"motors": "/rotors:data:rpm"}
@@ -105,7 +123,7 @@ def test_a_mutated_file_is_read_or_ends_in_a_line(tmp_path, wholes, capfd, rng, 
     for _ in range(count):
         path.write_bytes(mutated(wholes[name], rng))
         began = time.monotonic()
-        went_through(path)
+        went_through(path, wholes[name])
         slowest = max(slowest, time.monotonic() - began)
     assert slowest < SECONDS
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MEMORY
@@ -171,19 +189,19 @@ def forged(metadata, arrays, rng):
 
 
 @COUNTS
-@pytest.mark.parametrize("name", ["model.npz", "set.npz"])
+@pytest.mark.parametrize("name", ["model.npz", "set.npz", "program.npz"])
 def test_a_forged_archive_is_refused_or_holds_finite_numbers(tmp_path, wholes, monkeypatch, rng, name, count):
     for module, function in ((os, "system"), (subprocess, "Popen")):
         monkeypatch.setattr(module, function, pytest.fail)
     path = tmp_path / name
     path.write_bytes(wholes[name])
-    form = {"model.npz": MODEL, "set.npz": DATASET}[name]
+    form = {"model.npz": MODEL, "set.npz": DATASET, "program.npz": PROGRAM}[name]
     whole = load_archive(path, form)
     for _ in range(count):
         tree, arrays = forged(*whole, rng)
         outcome(save_archive, path, form, tree, arrays)
         found = outcome(LOADERS[name], path, naming=str(path))
-        assert found is None or is_finite(found.field if name == "model.npz" else dict(found.splits))
+        assert found is None or name == "program.npz" or is_finite(getattr(found, "field", None) or dict(found.splits))
 
 
 def test_what_is_said_of_a_file_is_short(tmp_path):

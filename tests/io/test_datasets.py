@@ -53,13 +53,6 @@ def test_equal_content_gives_equal_bytes(file, dataset, tmp_path, monkeypatch):
     assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
-def test_truncated_files_are_refused(file, share):
-    content = file.read_bytes()
-    file.write_bytes(content[: int(share * len(content))])
-    assert "truncated" in refusal(file)
-
-
 @pytest.mark.parametrize("missing", [False, True])
 def test_an_altered_or_missing_array_fails_the_checksum(file, missing):
     with zipfile.ZipFile(file) as archive:
@@ -74,17 +67,11 @@ def test_an_altered_or_missing_array_fails_the_checksum(file, missing):
     assert "checksum differs" in refusal(file)
 
 
-@pytest.mark.parametrize("content", [b"hello", {"a": np.zeros(3)}, np.zeros(3)], ids=["text", "npz", "npy"])
-def test_other_files_are_refused(content, tmp_path):
+def test_other_files_are_refused(tmp_path):
     path = tmp_path / "stranger.npz"
-    with path.open("wb") as file:
-        if isinstance(content, bytes):
-            file.write(content)
-        else:
-            np.savez(file, **content) if isinstance(content, dict) else np.save(file, content)
-    assert "not a hybrid_jax dataset" in refusal(path)
-    assert "not a hybrid_jax dataset" in refusal(tmp_path)
-    assert "no such file" in refusal(tmp_path / "none.npz")
+    for write in (lambda: path.write_bytes(b"hello"), lambda: np.savez(path, a=np.zeros(3))):
+        write()
+        assert "not a hybrid_jax dataset" in refusal(path)
 
 
 def test_another_configuration_names_the_fields_that_differ(file):

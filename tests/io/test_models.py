@@ -110,27 +110,6 @@ def test_a_vehicle_in_a_file_is_checked(tmp_path):
     assert "mass must be a positive" in refusal(tmp_path / "model.npz")
 
 
-SHAPES = [((13,), (3, 5, 4)), ((3, 13), (5, 4)), ((3, 13), (2, 5, 4)), ((13,), (4,)), ((2, 3, 13), (2, 3, 5, 4))]
-
-
-@pytest.mark.parametrize("shapes", SHAPES, ids=str)
-def test_inconsistent_shapes_are_refused(shapes):
-    with pytest.raises(ValueError, match="expected, got"):
-        models.Model(PHYSICS).predict(np.zeros(shapes[0]), np.zeros(shapes[1]), 0.01)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_numbers_that_are_not_finite_and_steps_that_are_not_positive_are_refused(bad):
-    for which in (0, 1):
-        inputs = flight()
-        inputs[which][0, 2] = bad
-        with pytest.raises(ValueError, match="is not finite"):
-            models.Model(PHYSICS).predict(*inputs, 0.01)
-    for dt in (0.0, -0.01, bad):
-        with pytest.raises(ValueError, match="dt must be a positive"):
-            models.Model(PHYSICS).predict(*flight(), dt)
-
-
 def test_about_is_a_mapping(tmp_path):
     with pytest.raises(ValueError, match=r"^about must be a Mapping, got 'hello'"):
         save(tmp_path / "model.npz", pendulum(), about="hello")
