@@ -12,6 +12,7 @@ from jaxtyping import Array
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from experiments.flying.changes import CHANGES
 from experiments.paper import study
 from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, OneFlight, preset_like
@@ -38,7 +39,6 @@ from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
-from hybrid_jax.sim.changes import CHANGES
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.sweep import hosts

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from experiments.flying.changes import CHANGES
 from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
 from experiments.paper.known_body import coverage, known_body_table
@@ -35,7 +36,6 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.estimation.uncertainty import covariance_of
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
-from hybrid_jax.sim.changes import CHANGES
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sweep import hosts
 from hybrid_jax.training.objective import Settings

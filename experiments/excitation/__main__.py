@@ -28,6 +28,7 @@ from experiments.excitation.results import (
     margins,
     tables,
 )
+from experiments.flying.changes import CHANGES
 from experiments.paper.conditions import Noise, measure
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.plots import save_figures
@@ -46,7 +47,6 @@ from hybrid_jax.estimation.uncertainty import covariance_of, intervals
 from hybrid_jax.planning import Excitation, FlightBounds, excitation
 from hybrid_jax.planning.fisher_information import information_of
 from hybrid_jax.sim import flight as random_flight
-from hybrid_jax.sim.changes import CHANGES
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sweep import hosts
 from hybrid_jax.trajectories import Trajectories

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from experiments.flying.changes import weak_rotor
 from hybrid_jax.control.loop import Plant
 from hybrid_jax.sim.domain import Domain, Quadrotor
-from hybrid_jax.sim.forces import Parameters, Wrench, drag, ground_effect, parameters_of, weak_rotor, wind
+from hybrid_jax.sim.forces import Parameters, Wrench, drag, ground_effect, parameters_of, wind
 from hybrid_jax.vehicle import IRIS
 
 FORCES = (drag, ground_effect, wind, weak_rotor)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from experiments.flying.changes import DOUBLED_DRAG, LOST_THRUST, OFF_CENTRE_LOAD, WEAK_ROTOR, weak_rotor
 from experiments.flying.plant import wind_force
 from hybrid_jax.control import Hardware, Observer, advance
 from hybrid_jax.control.observer import MOTION
@@ -21,9 +22,8 @@ from hybrid_jax.dynamics.terms import Terms, units_of
 from hybrid_jax.online.estimator import OnlineAdaptation
 from hybrid_jax.online.hypotheses import Hypothesis
 from hybrid_jax.rotation import body_z
-from hybrid_jax.sim.changes import DOUBLED_DRAG, OFF_CENTRE_LOAD, WEAK_ROTOR
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
-from hybrid_jax.sim.forces import DRAG_COEFFICIENT, LOST_THRUST, weak_rotor
+from hybrid_jax.sim.forces import DRAG_COEFFICIENT
 from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import IRIS
 

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from experiments.flying.changes import loaded
 from experiments.worlds.world import DT, Flown, Kind, Reference, draw_reference, flown, starting_state
 from hybrid_jax import rotation
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
-from hybrid_jax.sim.changes import loaded
 from hybrid_jax.sim.flight import CLOCK
 from hybrid_jax.sim.forces import Scalar
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY

@@ -16,12 +16,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.io.datasets import Dataset, versions
-from hybrid_jax.rotation import tilt
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import CHUNK, Domain, Quadrotor
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.state import POSITION, VELOCITY
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import IRIS, Vehicle
 
@@ -33,8 +32,6 @@ CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), at any phase of
 MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
 RECIPE = 1  # increment when the same configuration no longer gives the same flights
 SECONDS = 11.0  # length of a flight
-LOW = (0.5, 0.2)  # m, mean altitudes over a window below which ground effect adds at least 0.4 % and 2.6 % of thrust
-PERCENTILES = (1, 50, 99)
 SPARE = 2  # fly this many times the requested windows, so that few of those kept are neighbours
 
 
@@ -184,7 +181,6 @@ def make_dataset(
         "config": configuration(domain, splits, seed),
         "versions": versions("jax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax"),
         "tallies": {name: dict(tally) for name, tally in tallies.items()},
-        "statistics": {name: survey(split) for name, split in windows.items()},
     }
     return Dataset(windows, metadata)
 
@@ -235,26 +231,6 @@ def cut(flights: Flights, steps: int, tally: Counter[str], vehicle: Vehicle = IR
         parts.append(windows[sound])
         tally.update(windows=int(sound.sum()), rejected_windows=int((~sound).sum()))
     return parts
-
-
-def survey(windows: Trajectories) -> dict[str, float]:
-    """Percentiles over all states and fractions of speeds, tilts, altitudes …, by name and unit."""
-    x = np.asarray(windows.x)
-    altitude, q, rates = x[..., POSITION][..., 2], x[..., QUATERNION], np.abs(x[..., BODY_RATES])
-    height = altitude.mean(axis=1)
-    channels = {
-        "speed [m/s]": np.linalg.norm(x[..., VELOCITY], axis=-1),
-        "tilt [deg]": np.degrees(tilt(q)),
-        "altitude [m]": altitude,
-        "distance from home [m]": np.linalg.norm(x[..., POSITION][..., :2], axis=-1),
-        **{f"|{axis} rate| [rad/s]": rates[..., i] for i, axis in enumerate(("roll", "pitch", "yaw"))},
-        "rotor speed [rad/s]": np.asarray(windows.u),
-    }
-    return {f"windows below {limit} m": float((height < limit).mean()) for limit in LOW} | {
-        f"{name} p{percentile}": float(np.percentile(values, percentile))
-        for name, values in channels.items()
-        for percentile in PERCENTILES
-    }
 
 
 def configuration(domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> dict[str, Any]:

@@ -22,8 +22,6 @@ WIND_MEAN = -4.0  # N
 WIND_AMPLITUDE = 1.0  # N
 WIND_ANGULAR_FREQUENCY = 2 / 3 * math.pi  # rad/s
 
-LOST_THRUST = 0.15  # of the weak rotor
-
 
 class Wrench(NamedTuple):
     """A force and a torque on the body at its centre of mass, in the world frame (MuJoCo's xfrc_applied)."""
@@ -70,23 +68,6 @@ def wind(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
     sideways = WIND_MEAN + WIND_AMPLITUDE * jnp.sin(WIND_ANGULAR_FREQUENCY * t)
     none = jnp.zeros_like(x[VELOCITY])
     return Wrench(none.at[1].set(sideways), none)
-
-
-def gusty_wind(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
-    """A slanted wind with gusts: a mean force and two sines in each direction [N], t [s]."""
-    mean = jnp.array([2.0, -2.5, 0.6], x.dtype)
-    amplitude = jnp.array([[0.8, 0.5], [0.8, 0.5], [0.3, 0.2]], x.dtype)
-    frequency = jnp.array([[1.3, 3.1], [0.9, 4.3], [2.2, 3.7]], x.dtype)  # rad/s, no two alike
-    force = mean + jnp.sum(amplitude * jnp.sin(frequency * t), axis=1)
-    return Wrench(force, jnp.zeros_like(force))
-
-
-def weak_rotor(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
-    """The first rotor gives 15 % less thrust and reaction torque than nominal at its speed."""
-    lost, up, q = LOST_THRUST * u[0] ** 2, jnp.array([0.0, 0.0, 1.0], x.dtype), normalise(x[QUATERNION])
-    thrust, reaction = lost * parameters.thrust_coefficient * up, lost * parameters.torque_coefficient * up
-    torque = jnp.cross(parameters.rotor_positions[0], thrust) + parameters.spin[0] * reaction
-    return Wrench(-rotate(q, thrust), -rotate(q, torque))
 
 
 def ground_effect(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:

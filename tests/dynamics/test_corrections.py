@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
+from experiments.flying.changes import DOUBLED_DRAG, LOADED, WEAK_ROTOR, loaded
 from hybrid_jax.dynamics.disturbance import with_disturbance, without_zeros
 from hybrid_jax.dynamics.rigid_body import corrected, uncorrected
 from hybrid_jax.rotation import from_axis_angle
-from hybrid_jax.sim.changes import DOUBLED_DRAG, LOADED, WEAK_ROTOR, loaded
 from hybrid_jax.sim.domain import SOURCE
 from hybrid_jax.state import BODY_RATES, VELOCITY
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from systems import ODD
 
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.rotation import conjugate, rotate
 from hybrid_jax.rotation import derivative as quaternion_derivative
-from hybrid_jax.rotation import rotate
 from hybrid_jax.sim.domain import Quadrotor
 from hybrid_jax.sim.forces import drag, ground_effect, parameters_of, wind
 from hybrid_jax.sim.scene import build_model
@@ -21,27 +22,10 @@ from hybrid_jax.vehicle import IRIS
 ALL = (drag, ground_effect, wind)
 
 
-def newton_euler(x, u, vehicle, force=None, torque=None, np=np):
-    """Eq. 10 a second time, for NumPy or jax.numpy: [v̇ (world), ω̇ (body)] with an added wrench (world)."""
-    w, a, b, c = x[3:7]
-    turn = np.array(
-        [
-            [1 - 2 * (b * b + c * c), 2 * (a * b - c * w), 2 * (a * c + b * w)],
-            [2 * (a * b + c * w), 1 - 2 * (a * a + c * c), 2 * (b * c - a * w)],
-            [2 * (a * c - b * w), 2 * (b * c + a * w), 1 - 2 * (a * a + b * b)],
-        ]
-    )
-    thrusts = vehicle.thrust_coefficient * u**2
-    reaction = vehicle.torque_coefficient * np.array(vehicle.spin) * u**2
-    arm_x, arm_y = np.array(vehicle.rotor_positions).T
-    body_torque = np.array([(arm_y * thrusts).sum(), -(arm_x * thrusts).sum(), reaction.sum()])
-    inertia, rates = np.array(vehicle.inertia), x[10:]
-    total = turn[:, 2] * thrusts.sum() + (0 if force is None else force)
-    if torque is not None:
-        body_torque = body_torque + turn.T @ torque
-    gravity = np.array([0.0, 0.0, -vehicle.gravity])
-    spin_up = (body_torque - np.cross(rates, inertia * rates)) / inertia
-    return np.concatenate([total / vehicle.mass + gravity, spin_up])
+def analytic(x, u, vehicle, force, torque):
+    """Eq. 10, which tests/dynamics compares with matrices, with a wrench of the world added."""
+    turned = rotate(conjugate(x[3:7]), torque) / jnp.array(vehicle.inertia)
+    return rigid_body(vehicle, ())(x, u).at[7:10].add(force / vehicle.mass).at[10:].add(turned)
 
 
 def quadrotor(vehicle, *forces):
@@ -67,11 +51,12 @@ def test_mjx_is_newton_euler_and_c_mujoco(vehicle, states, derivative):
         turning = quaternion_derivative(jnp.asarray(x[3:7]), jnp.asarray(x[10:]))
         np.testing.assert_allclose(slope[3:7], turning, atol=1e-15)
         found = slope[7:]
-        force, torque = map(np.asarray, total_wrench(vehicle, jnp.asarray(x), jnp.asarray(u), jnp.asarray(0.7)))
+        x, u = jnp.asarray(x), jnp.asarray(u)
+        force, torque = total_wrench(vehicle, x, u, jnp.asarray(0.7))
         data.qpos, data.qvel, data.ctrl = x[:7], x[7:], u**2
         data.xfrc_applied[1] = np.concatenate([force, torque])
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(found, newton_euler(x, u, vehicle, force, torque), rtol=1e-13, atol=4e-13)
+        np.testing.assert_allclose(found, analytic(x, u, vehicle, force, torque)[7:], rtol=1e-13, atol=4e-13)
         np.testing.assert_allclose(found, data.qacc, rtol=1e-13, atol=4e-13)
 
 
@@ -126,8 +111,7 @@ def reference_flight(x0, u, t0, duration):
     def slope(t, x, _):
         force, torque = total_wrench(IRIS, x, u, t)
         unit = x.at[3:7].set(x[3:7] / jnp.linalg.norm(x[3:7]))
-        acceleration = newton_euler(unit, u, IRIS, force, torque, np=jnp)
-        return jnp.concatenate([x[7:10], quaternion_derivative(x[3:7], x[10:]), acceleration])
+        return analytic(unit, u, IRIS, force, torque).at[3:7].set(quaternion_derivative(x[3:7], x[10:]))
 
     term, control = diffrax.ODETerm(slope), diffrax.PIDController(rtol=1e-12, atol=1e-12)
     end = t0 + duration

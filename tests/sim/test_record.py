@@ -61,7 +61,7 @@ def test_a_small_vehicle_flies_as_well_as_the_iris():
 
 def test_flights_are_lively_and_partly_in_ground_effect(source):
     """What the paper's claims rest on: without low flight there is no residual, without rotation no inertia."""
-    statistics = source.metadata["statistics"]["train"]
+    statistics = make_flights.survey(source.splits["train"])
     assert statistics["windows below 0.5 m"] > 0.15
     assert statistics["windows below 0.2 m"] > 0.05
     assert 3.5 < statistics["speed [m/s] p99"] < 7
