@@ -17,7 +17,7 @@ from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, label
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
-from experiments.reporting.statistics import Interval, mean_interval
+from experiments.reporting.statistics import Estimate, mean_interval
 from experiments.reporting.tables import print_tables
 from experiments.runner import command
 from experiments.runner.run_record import environment
@@ -148,12 +148,12 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
     write_report(out, report)
 
 
-def effects(rows: Results) -> dict[tuple[str, str], dict[str, Interval]]:
+def effects(rows: Results) -> dict[tuple[str, str], dict[str, Estimate]]:
     """Return the error after fine-tuning at the smallest N over the default's, by choice, value and domain.
 
     Geometric means over seeds, paired, with a 95 % interval without diverged seeds.
     """
-    found: dict[tuple[str, str], dict[str, Interval]] = {}
+    found: dict[tuple[str, str], dict[str, Estimate]] = {}
     tuned = rows.where(mode=FINE_TUNED)
     for (choice, domain), group in (
         tuned.where(n_train=min(tuned["n_train"], default=0)).group("choice", "domain").items()
@@ -162,7 +162,7 @@ def effects(rows: Results) -> dict[tuple[str, str], dict[str, Interval]]:
             with np.errstate(all="ignore"):
                 errors, others = np.log(ours.paired(group.where(default=True), "test_mse"))
                 ends = np.exp(mean_interval(errors - others, ours["seed"]))
-            found.setdefault((choice, value), {})[domain] = Interval(*map(float, ends))
+            found.setdefault((choice, value), {})[domain] = Estimate(*map(float, ends))
     return found
 
 

@@ -4,14 +4,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks, rotation
+from hybrid_jax.checks import Numbers
 
-Numbers = jax.Array | np.ndarray
 Change = Float[Array, " e"]  # of a state or a quantity, in the tangent space
 
 

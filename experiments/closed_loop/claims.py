@@ -15,7 +15,7 @@ from experiments.flying.scenario import REFERENCES
 from experiments.reporting.claims import Claim, Part, Undecided, all_of, every
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
 from experiments.reporting.results import Results
-from experiments.reporting.statistics import Interval
+from experiments.reporting.statistics import Estimate
 
 RMSE = uncrashed("position_rmse", 100.0)  # cm
 WIND_FACTOR, GAP_SHARE, COST_TOLERANCE, AWAY_FACTOR = 4.0, 0.9, 0.1, 1.1
@@ -52,7 +52,7 @@ class Evidence:
         """Return the position RMSE [cm] of each seed of a `group`; infinite for a crash."""
         return self.group(*place).numbers(RMSE)
 
-    def difference(self, first: tuple[Any, ...], second: tuple[Any, ...], times: float = 1.0) -> Interval:
+    def difference(self, first: tuple[Any, ...], second: tuple[Any, ...], times: float = 1.0) -> Estimate:
         """Return the mean RMSE [cm] of the first `group` minus `times` the second's, paired by seed."""
         return self.group(*first).interval(RMSE, self.group(*second), times)
 
@@ -98,7 +98,7 @@ def _none_worse(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
 
 
 def _cost_predicted(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
-    def error(*place: Any) -> Interval:
+    def error(*place: Any) -> Estimate:
         return e.group(*place).interval(uncrashed("excess", 100.0))
 
     for reference in e.references(adapted):

@@ -10,7 +10,7 @@ import numpy as np
 from experiments.flying.scenario import REFERENCES
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
 from experiments.reporting.results import Results, Row
-from experiments.reporting.statistics import Interval, share_of_gap
+from experiments.reporting.statistics import Estimate, share_of_gap
 from experiments.reporting.tables import EMPTY, Cell, Table, cross_table, mean_over_seeds, spread_text
 
 DOMAINS = {name: LABELS[name] for name in (UNCHANGED, PARAMETER_SHIFT, EXTERNAL_FORCE)}
@@ -128,9 +128,9 @@ def gap_tables(rows: Results) -> list[Table]:
     return made
 
 
-def gaps(rows: Results, domain: str) -> dict[Agent, dict[str, Interval]]:
+def gaps(rows: Results, domain: str) -> dict[Agent, dict[str, Estimate]]:
     """Return the share of the gap that each adapted or observed hybrid closes at home, by reference."""
-    shares: dict[Agent, dict[str, Interval]] = {}
+    shares: dict[Agent, dict[str, Estimate]] = {}
     for reference in REFERENCES if domain != UNCHANGED else ():
         flown = by_agent(rows.where(domain=domain, reference=reference, distance=0.0))
         for agent, group in flown.items():
@@ -167,7 +167,7 @@ def cost_text(rows: Results) -> str:
     return f"{sound.spread('promised').mean:.3g}; {spread_text(error, '+.1f', '.0f')}"
 
 
-def _share_text(share: Interval | None) -> str:
+def _share_text(share: Estimate | None) -> str:
     if share is None:
         return EMPTY
     value, low, high = (100 * number for number in share)

@@ -14,7 +14,7 @@ from experiments.reporting.claims import Claim, Part, all_of
 from experiments.reporting.names import HYBRID
 from experiments.reporting.plots import COLOURS, PAGE, STYLE, name_lines, subplots, tick_errors
 from experiments.reporting.results import Results
-from experiments.reporting.statistics import Interval, mean_interval
+from experiments.reporting.statistics import Estimate, mean_interval
 from experiments.reporting.tables import Table, cross_table, over_seeds, tabulate
 from hybrid_jax.planning import Excitation, FlightBounds
 from hybrid_jax.rotation import heading
@@ -49,12 +49,12 @@ def worst(rows: Results, column: str) -> dict[int, float]:
     return {seed: float(own.numbers(column).max()) for seed, own in rows.group("seed").items()}
 
 
-def ratio(rows: Results, name: str, column: str = "half_width") -> Interval:
+def ratio(rows: Results, name: str, column: str = "half_width") -> Estimate:
     """Geometric mean over seeds of the designed flight's worst interval over another flight's."""
     ours, theirs = (worst(rows.where(flight=flight), column) for flight in (DESIGNED, name))
     with np.errstate(divide="ignore"):  # nothing beside an infinite interval
         logs = [float(np.log(ours[seed] / theirs[seed])) for seed in ours]
-    return Interval(*map(math.exp, mean_interval(logs, list(ours))))
+    return Estimate(*map(math.exp, mean_interval(logs, list(ours))))
 
 
 def _halves(evidence: Evidence) -> Part:

@@ -42,8 +42,8 @@ HYPOTHESES = (
 
 
 def _iris(integral, x: State, seen: State, push: Float[Array, "3"]):
-    plan = pilot.Plan(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(()), jnp.zeros(4))
-    integral, u = pilot.act(integral, seen, plan, parameters_of(IRIS), IRIS, pilot.scale_of(IRIS))
+    course = pilot.Course(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(()), jnp.zeros(4))
+    integral, u = pilot.act(integral, seen, course, parameters_of(IRIS), IRIS, pilot.scale_of(IRIS))
     truth = SOURCE.quadrotor()
     moved = type(truth)(truth.parameters, (lambda x, u, t, p: Wrench(p.mass * push, jnp.zeros(3)),))
     return integral, moved.step(x, u, jnp.zeros(()), DT), u

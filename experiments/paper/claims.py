@@ -12,7 +12,7 @@ from experiments.reporting import names
 from experiments.reporting.claims import Claim, Part, Undecided, Verdict, all_of, evaluate, every
 from experiments.reporting.names import EXTERNAL_FORCE, FINE_TUNED, HYBRID, NO_PHYSICS, TARGET_ONLY, label
 from experiments.reporting.results import Column, Results, Row
-from experiments.reporting.statistics import Interval, Spread, ratio_of_stds
+from experiments.reporting.statistics import Estimate, Spread, ratio_of_stds
 
 COMPARISON = "comparison"  # the experiment on both domains (Table 2)
 DOMAINS_OF = {"param_shift": DOMAINS[:1], "external_force": DOMAINS[1:], COMPARISON: DOMAINS}
@@ -47,7 +47,7 @@ class Evidence:
 
     def difference(
         self, first: tuple[Any, ...], second: tuple[Any, ...], times: float = 1.0, column: Column = "test_mse"
-    ) -> Interval:
+    ) -> Estimate:
         """Return the mean of the first cell minus `times` the second's, paired by seed and draw."""
         try:
             return self.rows(*first).interval(column, self.rows(*second), times)
@@ -164,7 +164,7 @@ def ratio(above: Spread, below: Spread) -> float:
     return above.mean / below.mean
 
 
-def _minus(difference: Interval, times: float = 1.0) -> str:
+def _minus(difference: Estimate, times: float = 1.0) -> str:
     return f"difference {difference.text()}" if times == 1 else f"first − {times} × second {difference.text()}"
 
 

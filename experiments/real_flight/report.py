@@ -14,7 +14,7 @@ from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evalua
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
-from experiments.reporting.statistics import Interval, mean_interval, spread
+from experiments.reporting.statistics import Estimate, mean_interval, spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, spread_text, tabulate
 from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages
@@ -200,7 +200,7 @@ def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Map
         for horizon, quantity in product(found[cell][0]["scores"], errors.UNITS):
             ratios = [_log_ratio(found[cell], rows, f"scores.{horizon}.{quantity}") for rows in known]
             outcomes += [ratio.below(0.0) for ratio in ratios]
-            worst = Interval(*np.exp(max(ratios, key=lambda ratio: ratio.value)))
+            worst = Estimate(*np.exp(max(ratios, key=lambda ratio: ratio.value)))
             words.append(f"step {horizon} {quantity} {worst.text('.3f')}")
         return every(outcomes), f"error over that of the best of them: {', '.join(words)}"
 
@@ -208,7 +208,7 @@ def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Map
     return Claim(name, f"{text} (95 % interval of the geometric mean ratio, over test flights and seeds).", predicate)
 
 
-def _log_ratio(rows: Results, others: Results, column: str) -> Interval:
+def _log_ratio(rows: Results, others: Results, column: str) -> Estimate:
     """log(error / other error), of the same flight and seed; a baseline, without seeds, of the same flight."""
     theirs = {(row["flight"], row["seed"]): error for row, error in zip(others, others.numbers(column), strict=True)}
     pairs = [(row["flight"], row["seed"] if len(others.unique("seed")) > 1 else others[0]["seed"]) for row in rows]

@@ -10,7 +10,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from experiments.reporting.statistics import Interval, Spread, mean_interval, spread
+from experiments.reporting.statistics import Estimate, Spread, mean_interval, spread
 from hybrid_jax.io.files import json_value
 
 Row = Mapping[str, Any]  # JSON values by column; a nested column, such as theta, is a mapping
@@ -114,7 +114,7 @@ class Results:
             raise ValueError(f"other must have the same seeds, {where} is missing")
         return self.numbers(column), np.array([theirs[run] for run in self._runs()])
 
-    def interval(self, column: Column, minus: "Results | None" = None, times: float = 1.0) -> Interval:
+    def interval(self, column: Column, minus: "Results | None" = None, times: float = 1.0) -> Estimate:
         """The mean of a column, or of its difference from `times` another table's paired rows."""
         first, second = (self.numbers(column), 0.0) if minus is None else self.paired(minus, column)
         with np.errstate(invalid="ignore"):  # ∞ − ∞ says nothing

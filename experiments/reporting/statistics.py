@@ -23,7 +23,7 @@ class Spread(NamedTuple):
     non_finite: int
 
 
-class Interval(NamedTuple):
+class Estimate(NamedTuple):
     """An estimate and the ends of its confidence interval, NaN if the seeds cannot bound it."""
 
     value: float = math.nan
@@ -35,7 +35,7 @@ class Interval(NamedTuple):
         return True if self.high < limit else False if self.low > limit else None
 
     def above(self, limit: float) -> bool | None:
-        return Interval(-self.value, -self.high, -self.low).below(-limit)
+        return Estimate(-self.value, -self.high, -self.low).below(-limit)
 
     def text(self, form: str = ".3g") -> str:
         known = f"{self.low:{form}} … {self.high:{form}}" if self.low < self.high else "no interval"
@@ -52,7 +52,7 @@ def spread(values: Values) -> Spread:
     return Spread(mean, std, median, float(np.min(array)), len(array), non_finite)
 
 
-def mean_interval(values: Values, seeds: Labels, draws: Labels | None = None) -> Interval:
+def mean_interval(values: Values, seeds: Labels, draws: Labels | None = None) -> Estimate:
     """The mean of the values of runs, with a confidence interval over seeds and draws of flights.
 
     The variance is clustered by seed and by draw, V_seed + V_draw − V_both (Cameron, Gelbach, Miller, "Robust inference
@@ -65,9 +65,9 @@ def mean_interval(values: Values, seeds: Labels, draws: Labels | None = None) ->
     ways = [list(seeds), list(seeds if draws is None else draws)]
     clusters = [count for way in ways if (count := len(set(way))) > 1]
     if len(set(ways[0])) < 2 or math.isnan(mean):
-        return Interval(mean)
+        return Estimate(mean)
     if math.isinf(mean):
-        return Interval(mean, mean, mean)
+        return Estimate(mean, mean, mean)
 
     def variance(labels: Labels) -> float:
         sums = np.bincount(np.unique(labels, return_inverse=True)[1].ravel(), array - mean)
@@ -76,26 +76,26 @@ def mean_interval(values: Values, seeds: Labels, draws: Labels | None = None) ->
     one, other, both = map(variance, (*ways, np.arange(len(array))))
     t = float(scipy.special.stdtrit(min(clusters) - 1, (1 + LEVEL) / 2))
     half = t * math.sqrt(max(one + other - both, one, other))
-    return Interval(mean, mean - half, mean + half)
+    return Estimate(mean, mean - half, mean + half)
 
 
-def ratio_of_stds(first: Values, second: Values) -> Interval:
+def ratio_of_stds(first: Values, second: Values) -> Estimate:
     """The ratio of paired standard deviations, with the interval of Pitman and Morgan's test (1939)."""
     above, below = spread(first).std, spread(second).std
     if math.isnan(above + below) or (above == below and above in (0.0, math.inf)):
-        return Interval()
+        return Estimate()
     if 0 in (above, below) or math.inf in (above, below):
         ratio = math.inf if below == 0 or above == math.inf else 0.0
-        return Interval(ratio, ratio, ratio)
+        return Estimate(ratio, ratio, ratio)
     if len(first) < 3:
-        return Interval(above / below)
+        return Estimate(above / below)
     t, freedom = float(scipy.special.stdtrit(len(first) - 2, (1 + LEVEL) / 2)), len(first) - 2
     k = 1 + 2 * max(0.0, 1 - float(np.corrcoef(first, second)[0, 1]) ** 2) * t**2 / freedom
     reach = math.sqrt(k + math.sqrt(k * k - 1))
-    return Interval(above / below, above / below / reach, above / below * reach)
+    return Estimate(above / below, above / below / reach, above / below * reach)
 
 
-def share_of_gap(before: Values, after: Values, reachable: Values, level: float = LEVEL) -> Interval:
+def share_of_gap(before: Values, after: Values, reachable: Values, level: float = LEVEL) -> Estimate:
     """(before − after) / (before − reachable), of the means over the seeds where all three are finite.
 
     The interval is Fieller's ("Some problems in interval estimation", 1954): all shares s for which a paired t test
@@ -105,19 +105,19 @@ def share_of_gap(before: Values, after: Values, reachable: Values, level: float 
     start, end, best = _finite(before, after, reachable)
     closed, gap = start - end, start - best
     if len(gap) == 0 or gap.mean() <= 0:
-        return Interval()
+        return Estimate()
     value = float(closed.mean() / gap.mean())
     if len(gap) < 2:
-        return Interval(value)
+        return Estimate(value)
     t = float(scipy.special.stdtrit(len(gap) - 1, (1 + level) / 2))
     covariance = np.cov(closed, gap) * t**2 / len(gap)
     a = gap.mean() ** 2 - covariance[1, 1]
     b = closed.mean() * gap.mean() - covariance[0, 1]
     c = closed.mean() ** 2 - covariance[0, 0]
     if a <= 0:
-        return Interval(value)
+        return Estimate(value)
     half = math.sqrt(max(b * b - a * c, 0.0))
-    return Interval(value, float((b - half) / a), float((b + half) / a))
+    return Estimate(value, float((b - half) / a), float((b + half) / a))
 
 
 def _finite(*samples: Values) -> list[np.ndarray]:

@@ -39,7 +39,7 @@ else:
     ChangeName = Literal[CHANGES]
 
 
-class Flight(NamedTuple):
+class Manner(NamedTuple):
     """A flight to adapt to: one of `world.KINDS`, with noise relative to the usual and possibly a burst of outliers."""
 
     kind: str = "moving"
@@ -49,13 +49,13 @@ class Flight(NamedTuple):
 
 
 USUAL: FlightName = "moving"
-FLIGHTS: dict[str, Flight] = {
-    USUAL: Flight(),
-    "hover": Flight("hover"),
-    "near_ground": Flight("near_ground"),
-    "short": Flight(seconds=3.0),
-    "noisy": Flight(noise=3.0),
-    "outliers": Flight(burst=True),
+FLIGHTS: dict[str, Manner] = {
+    USUAL: Manner(),
+    "hover": Manner("hover"),
+    "near_ground": Manner("near_ground"),
+    "short": Manner(seconds=3.0),
+    "noisy": Manner(noise=3.0),
+    "outliers": Manner(burst=True),
 }
 
 

@@ -66,11 +66,11 @@ def _fly(
         own, start = jax.random.split(key)
         reference = draw_reference(own, kind, steps)
         no_dither = jnp.zeros((steps, 4))
-        plan = pilot.Plan(reference.position, reference.velocity, reference.heading, no_dither)
+        course = pilot.Course(reference.position, reference.velocity, reference.heading, no_dither)
         x = starting_state(reference)
         if random:
-            plan = pilot.draw_plan(own, steps, scale)
-            x = pilot.starting_state(start, plan, scale)
+            course = pilot.draw_course(own, steps, scale)
+            x = pilot.starting_state(start, course, scale)
 
         def interval(carry, now):
             integral, x, u, t = carry
@@ -81,7 +81,7 @@ def _fly(
 
         hover = jnp.full(4, IRIS.hover_speed) + like(jnp.zeros(4), x)
         begun = like(jnp.zeros(3), x), x, hover, CLOCK * jax.random.uniform(start)
-        _, (states, u) = jax.lax.scan(interval, begun, plan)
+        _, (states, u) = jax.lax.scan(interval, begun, course)
         return jnp.concatenate([x[None], states]), u, u
 
     return jax.vmap(one)(keys)

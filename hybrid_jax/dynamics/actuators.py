@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
+from hybrid_jax.checks import Numbers
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
 from hybrid_jax.state import STATE_SIZE
@@ -28,7 +29,6 @@ GIVES = ("speed", "thrust")
 UNITS = {"time_constant": "s", "time_constants": "s", "delay": "s"}
 EXCLUSIVE = {"curve": ("mass", "k", "k_rotors"), "time_constants": ("time_constant",)}
 SLOWEST_SHARE = 1e-3  # of the speed of hover: below, the root of a thrust has no slope
-Numbers = Array | np.ndarray
 QUICKEST = 1e-3  # s, least time constant that is learned
 
 

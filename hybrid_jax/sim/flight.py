@@ -95,9 +95,9 @@ def _fly_chunk(
     scale = pilot.scale_of(vehicle)
 
     def one_flight(number: UInt[Array, ""]) -> Flights:
-        key_plan, key_start, key_clock = jax.random.split(jax.random.fold_in(key, number), 3)
-        plan = pilot.draw_plan(key_plan, steps, scale)
-        x0 = pilot.starting_state(key_start, plan, scale)
+        key_course, key_start, key_clock = jax.random.split(jax.random.fold_in(key, number), 3)
+        course = pilot.draw_course(key_course, steps, scale)
+        x0 = pilot.starting_state(key_start, course, scale)
         start = jax.random.uniform(key_clock, maxval=CLOCK)
 
         def decide(carry, now):
@@ -106,7 +106,7 @@ def _fly_chunk(
             x = truth.step(x, u, t, DT)
             return (integral, x, t + DT), (x, u)
 
-        _, (x, u) = jax.lax.scan(decide, (like(jnp.zeros(3), x0), x0, start), plan)
+        _, (x, u) = jax.lax.scan(decide, (like(jnp.zeros(3), x0), x0, start), course)
         states = jnp.concatenate([x0[None], x])
         altitudes = jax.vmap(rotor_altitudes, in_axes=(0, None))(states, truth.parameters.rotor_positions)
         return Flights(states, u, altitudes.min(axis=1), start)

@@ -65,7 +65,7 @@ def scale_of(vehicle: Vehicle) -> Scale:
     return Scale(length, time, length / time, length / time**2)
 
 
-class Plan(NamedTuple):
+class Course(NamedTuple):
     """The reference and the dither at each decision of one flight."""
 
     position: Float[Array, "*t 3"]  # m, world
@@ -74,7 +74,7 @@ class Plan(NamedTuple):
     dither: Float[Array, "*t 4"]  # angular acceleration [rad/s², body], acceleration along the thrust [m/s²]
 
 
-def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
+def draw_course(key: PRNGKeyArray, steps: int, scale: Scale) -> Course:
     key_targets, key_dither = jax.random.split(key)
     target, limit = _draw_waypoints(key_targets, steps, scale)
     hardest = jnp.array(ACCELERATION) * np.array([*[scale.acceleration] * 3, 1 / scale.time**2])
@@ -88,7 +88,7 @@ def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
         return (place, rate), (place, rate)
 
     _, (place, rate) = jax.lax.scan(follow, (target[0], jnp.zeros(4)), (target, limit))
-    return Plan(place[:, :3], rate[:, :3], place[:, 3], _draw_dither(key_dither, steps, scale))
+    return Course(place[:, :3], rate[:, :3], place[:, 3], _draw_dither(key_dither, steps, scale))
 
 
 def _shorten(velocity: Float[Array, "4"], fastest: Vector) -> Float[Array, "4"]:
@@ -127,22 +127,22 @@ def _draw_dither(key: PRNGKeyArray, steps: int, scale: Scale) -> Float[Array, "t
 
 
 def act(
-    integral: Vector, x: State, plan: Plan, nominal: Parameters, vehicle: Vehicle, scale: Scale
+    integral: Vector, x: State, course: Course, nominal: Parameters, vehicle: Vehicle, scale: Scale
 ) -> tuple[Vector, Input]:
-    """Feasible rotor speeds [rad/s] for the current entry of the plan, and the new integral [m/s², world frame]."""
+    """Feasible rotor speeds [rad/s] for the current entry of the course, and the new integral [m/s², world frame]."""
     # Raise the reference to a safe altitude if wind has blown the vehicle far away.
-    far, place = jnp.linalg.norm(x[POSITION][:2]) > ASTRAY * scale.length, plan.position
+    far, place = jnp.linalg.norm(x[POSITION][:2]) > ASTRAY * scale.length, course.position
     place = place.at[2].set(jnp.where(far, jnp.maximum(place[2], SAFE_ALTITUDE * scale.length), place[2]))
     error = place - x[POSITION]
     limit, time = INTEGRAL_LIMIT * scale.acceleration, scale.time
     integral = jnp.clip(integral + PERIOD * (INTEGRAL_GAIN / time**3) * error, -limit, limit)
-    wanted = POSITION_GAIN / time**2 * error + VELOCITY_GAIN / time * (plan.velocity - x[VELOCITY]) + integral
+    wanted = POSITION_GAIN / time**2 * error + VELOCITY_GAIN / time * (course.velocity - x[VELOCITY]) + integral
     climbing = _flare(wanted[2], x[POSITION][2], x[VELOCITY][2], scale)
     lift = _limit_tilt(wanted.at[2].set(climbing + nominal.gravity), x[POSITION][2], nominal.gravity, scale)
-    spin_up = _angular_acceleration(x, lift, plan.heading, scale) + plan.dither[:3]
+    spin_up = _angular_acceleration(x, lift, course.heading, scale) + course.dither[:3]
     rates = x[BODY_RATES]
     torque = nominal.inertia * spin_up + jnp.cross(rates, nominal.inertia * rates)
-    along_thrust = jnp.dot(lift, body_z(x[QUATERNION])) + plan.dither[3]
+    along_thrust = jnp.dot(lift, body_z(x[QUATERNION])) + course.dither[3]
     thrust = nominal.mass * jnp.clip(along_thrust, 0.3 * nominal.gravity, 2.0 * nominal.gravity)
     return integral, _allocate(thrust, torque, vehicle)
 
@@ -187,10 +187,10 @@ def _allocate(thrust: Scalar, torque: Vector, vehicle: Vehicle) -> Input:
     return jnp.sqrt(jnp.clip(squared, 0.0, vehicle.max_rotor_speed**2))
 
 
-def starting_state(key: PRNGKeyArray, plan: Plan, scale: Scale) -> State:
-    """A random state near the start of a plan, slightly tilted, drifting and turning."""
+def starting_state(key: PRNGKeyArray, course: Course, scale: Scale) -> State:
+    """A random state near the start of a course, slightly tilted, drifting and turning."""
     draw = jax.random.normal(key, (3, 3))
-    level = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), plan.heading[0])
+    level = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), course.heading[0])
     tilted = multiply(level, from_axis_angle(draw[0] / jnp.linalg.norm(draw[0]), jnp.asarray(0.05)))
     velocity = 0.3 * scale.speed * draw[1].at[2].set(0.0)
-    return jnp.concatenate([plan.position[0], tilted, velocity, 0.3 / scale.time * draw[2]])
+    return jnp.concatenate([course.position[0], tilted, velocity, 0.3 / scale.time * draw[2]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy
 
-from experiments.reporting.statistics import Interval, mean_interval, ratio_of_stds, share_of_gap
+from experiments.reporting.statistics import Estimate, mean_interval, ratio_of_stds, share_of_gap
 
 REPEATS, SEEDS = 2000, 10
 
@@ -65,7 +65,7 @@ def test_ratio_of_stds_has_the_size_and_the_ends_of_pitmans_test():
     one, other = shared[0], 1.5 * shared[0] + rng.normal(size=SEEDS)
     at = ratio_of_stds(one, other).high  # at an end of the interval the test is just significant
     assert scipy.stats.pearsonr(one + at * other, one - at * other).pvalue == pytest.approx(0.05)
-    assert ratio_of_stds([1.0, 1.0, math.inf], [1.0, 2.0, 3.0]) == Interval(*[math.inf] * 3)
+    assert ratio_of_stds([1.0, 1.0, math.inf], [1.0, 2.0, 3.0]) == Estimate(*[math.inf] * 3)
     assert math.isnan(ratio_of_stds([1.0, math.inf], [2.0, math.inf]).value)
 
 

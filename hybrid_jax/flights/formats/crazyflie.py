@@ -61,8 +61,8 @@ NO_FORCE = "specific force along z: the length of stateEstimate.a* with gravity;
 NO_MOTOR = "commands: the mixer's, of controller.cmd_*, as neither motor.m* nor pwm.m*_pwm is logged"
 # Quantity → where it may stand, the first that a log has counts: variables, what to multiply them by or to make of
 # them, and a note.
-Change = float | np.ndarray | Callable[[np.ndarray], np.ndarray]
-SOURCES: dict[str, list[tuple[tuple[str, ...], Change, str]]] = {
+Conversion = float | np.ndarray | Callable[[np.ndarray], np.ndarray]
+SOURCES: dict[str, list[tuple[tuple[str, ...], Conversion, str]]] = {
     "position": [
         (_named("stateEstimate.{}", "xyz"), 1.0, ""),
         (_named("stateEstimateZ.{}", "xyz"), 1e-3, ""),
@@ -101,7 +101,7 @@ SOURCES: dict[str, list[tuple[tuple[str, ...], Change, str]]] = {
         ),
     ],
 }
-Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # variable → its ticks [µs] and values
+Variables = dict[str, tuple[np.ndarray, np.ndarray]]  # variable → its ticks [µs] and values
 
 
 def read_crazyflie(path: str | Path) -> Recording:
@@ -166,7 +166,7 @@ def _text(content: bytes, at: int) -> tuple[str, int]:
     return content[at:end].decode("ascii"), end + 1 if end < len(content) else len(content)
 
 
-def _columns(content: bytes, at: int, end: int, events) -> tuple[Columns, int]:
+def _columns(content: bytes, at: int, end: int, events) -> tuple[Variables, int]:
     """Return the variables of all complete records, and where these end."""
     starts, sizes = {key: array.array("q") for key in events}, {key: kind.itemsize for key, (_, kind) in events.items()}
     while at + 2 <= end and (size := sizes.get(key := content[at : at + 2])) and at + 2 + size <= end:
@@ -184,7 +184,7 @@ def _columns(content: bytes, at: int, end: int, events) -> tuple[Columns, int]:
     return found, at
 
 
-def _parts(columns: Columns, notes: list[str]) -> Iterator[tuple[str, Samples]]:
+def _parts(columns: Variables, notes: list[str]) -> Iterator[tuple[str, Samples]]:
     for quantity, places in SOURCES.items():
         for names, change, note in places:
             ticks = {len(columns[name][0]) for name in names if name in columns}
