@@ -18,7 +18,6 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval
-from experiments.reporting.tables import print_tables
 from experiments.runner import command
 from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
@@ -113,9 +112,7 @@ def experiment(config: AblationConfig, console: Console) -> None:
             rows += run(other, stages).tagged(choice=choice, value=value, default=other == config)
             seconds[f"{choice}, {value}"] = sum(stages.seconds.values())
         if hosts.is_main_process():
-            write(config, rows, seconds)
-    if hosts.is_main_process():
-        print_tables(Console(), ablation_tables(rows, TRUTH))
+            write(config, rows, seconds, Console() if choice == config.over[-1] else None)
 
 
 def run(config: AblationConfig, stages: Stages) -> Results:
@@ -128,7 +125,7 @@ def run(config: AblationConfig, stages: Stages) -> Results:
     return rows
 
 
-def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> None:
+def write(config: AblationConfig, rows: Results, seconds: dict[str, float], console: Console | None) -> None:
     out, drawn = config.out / NAME, {}
     for choice, group in rows.group("choice").items():
         title = f"{choice.capitalize()}: test error over 1 s after fine-tuning"
@@ -145,7 +142,7 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
         conclusion=conclusion(rows),
         tables=ablation_tables(rows, TRUTH),
     )
-    write_report(out, report)
+    write_report(out, report, console)
 
 
 def effects(rows: Results) -> dict[tuple[str, str], dict[str, Estimate]]:

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from experiments.flying.images import picture
-from experiments.reporting.tables import Table, print_tables
+from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
 from experiments.runner.options import CountFromZero, check_numbers
 from experiments.runner.progress import Line
@@ -122,7 +122,7 @@ def make_flights(options: Options) -> None:
         found = [survey(each) if kind == "statistics" else dataset.metadata[kind][name] for name, each in splits]
         lines += [(name.replace("_", " "), *(f"{each[name]:{form}}" for each in found)) for name in found[0]]
     title = f"{dataset.config['domain']}, seed {dataset.config['seed']}"
-    print_tables(Console(), [Table(title, ("", *dataset.splits), lines)])
+    print_table(Console(), Table(title, ("", *dataset.splits), lines))
 
 
 main = partial(command.call, "make_flights", Options, make_flights)

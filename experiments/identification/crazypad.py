@@ -12,7 +12,7 @@ import tyro
 from jaxtyping import Float
 from rich.console import Console
 
-from experiments.reporting.tables import Table, print_tables
+from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
 from hybrid_jax import runtime
 from hybrid_jax.cli.compared import inputs_of
@@ -163,7 +163,7 @@ def run(options: Options) -> None:
     lines.append(("all", "", "", "", "", *(f"{each:.3f}" for each in pooled)))
     header = ("cut [mm]", "rotor", "thrust lost, by thrust and trim", "95 %", "by thrust alone")
     title = f"Damage by {SECONDS:g} s; specific force along the thrust after them, RMSE [m/s²]"
-    print_tables(console, [Table(title, (*header, "from normal", "those seconds", "interpolated"), lines)])
+    print_table(console, Table(title, (*header, "from normal", "those seconds", "interpolated"), lines))
 
 
 main = partial(command.call, "identification.crazypad", Options, run)

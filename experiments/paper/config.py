@@ -101,7 +101,7 @@ class Config(Run):
     """Shared options of all experiments in simulation. Defaults: the paper's full protocol."""
 
     sizes: tuple[int, ...] = TABLE_SIZES
-    """N, target trajectories to train on; rates and patience are those of the nearest size in the paper's table."""
+    """N, target trajectories to train on. Rates and patience are those of the nearest size in the paper's table."""
     pool: int | None = None
     """Target trajectories from which a seed draws its N; by default as many as the largest N."""
     draw: Literal["random", "contiguous"] = "random"

@@ -65,10 +65,6 @@ def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
     return Table(title, ("", "claim", "verdict", "measured"), lines, verdicts=True)
 
 
-def decided(table: Table) -> Table:
-    return table._replace(lines=[line for line in table.lines if OUTCOMES[None] not in line])
-
-
 def summary(verdicts: Sequence[Verdict]) -> list[str]:
     judged = [each for each in verdicts if not each.lacks_data]
     if not judged:

@@ -14,12 +14,13 @@ from experiments.reporting import claims
 from experiments.reporting.claims import Verdict
 from experiments.reporting.questions import QUESTIONS, Asked
 from experiments.reporting.results import Results, leaves
-from experiments.reporting.tables import Table, markdown, narrowed, plain, print_tables
+from experiments.reporting.tables import Table, markdown, narrowed, plain, print_table
 from hybrid_jax.cli.page import Page, document
 from hybrid_jax.cli.page import Table as Cells
 from hybrid_jax.io.files import json_value, write_atomic
 
 FORMAT = 2  # of report.json
+PRINTED = 5  # lines of a table in a terminal
 JSON_NAME, CSV_NAME, PAGE_NAME, HTML_NAME = "report.json", "rows.csv", "report.md", "report.html"
 MEANINGLESS = "The smoke preset only shows that everything works: its numbers mean nothing, so no hypothesis is judged."
 
@@ -60,13 +61,17 @@ class Report:
         """The tables of the page; a smoke run has no verdicts."""
         return [table for table in self.tables if not (self.meaningless and table.verdicts)]
 
+    def main(self) -> Table | None:
+        """The table of the page that is not folded."""
+        plainly = [table for table in self.shown() if not (table.verdicts or table.folded)]
+        return next((table for table in plainly if self.asked.table in table.title), next(iter(plainly), None))
+
     def page(self, folder: Path) -> Page:
         """Lay out question, answer, one figure, one small table and their meaning; the rest is folded."""
         asked, (_, _, introduction) = self.asked, self.head.partition("\n")
         said = [" ".join(re.sub(r"[*`]", "", each).split()) for each in re.split(r"\n\s*\n|\n- ", introduction)]
-        plainly = [table for table in self.shown() if not (table.verdicts or table.folded)]
-        named = [table for table in plainly if asked.table in table.title] or plainly
-        main = narrowed(named[0]) if named else None
+        found = self.main()
+        main = narrowed(found) if found else None
         tables = [Cells("The question, the models and the measures", ("",), [(each,) for each in said if each])]
         tables += [_cells(table) for table in self.shown() if table != main]
         for name, each in {"Environment": self.environment, "Configuration": self.config}.items():
@@ -87,7 +92,7 @@ class Report:
 def write_report(out: str | Path, report: Report, console: Console | None = None) -> None:
     """Write report.html, report.md, rows.csv and report.json into the folder `out`, each atomically, report.json last.
 
-    Tables, notes and the report's path are printed to the console, if any; for a quick run only decided hypotheses.
+    A headline, the first lines of the main table and the report's path are printed to the console, if any.
     """
     out, record = Path(out), lines_of(to_json(report))
     page = report.page(out)
@@ -96,9 +101,10 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
     for name, content in {name: content.encode() for name, content in contents.items()}.items():
         write_atomic(out / name, content)
     if console is not None:
-        quick = report.config.get("preset") == "quick"
-        print_tables(console, [claims.decided(t) if quick and t.verdicts else t for t in report.shown()])
-        for line in (*report.notes, *report.warnings, *report.conclusions()):
+        console.print(Text(" ".join(report.conclusions()[:1])))
+        if (main := report.main()) and not report.meaningless:
+            print_table(console, main, PRINTED)
+        for line in report.warnings:
             console.print(Text(line))
         console.print(Text(f"Report: {out / HTML_NAME}"), soft_wrap=True)
 

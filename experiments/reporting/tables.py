@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
@@ -14,9 +15,8 @@ from experiments.reporting.results import Results
 from experiments.reporting.statistics import Spread
 
 EMPTY = "–"
-STYLES = {"✓ holds": "green", "✗ fails": "bold red"}
 SMALLEST, LARGEST = -3, 5  # powers of ten between which numbers are written without an exponent
-BETWEEN = 3  # characters between two printed columns, and one more in all
+BETWEEN = 3  # characters between two printed columns
 FEW = 6  # columns of the table that a page shows first
 Cell = Callable[[Results], str]  # the text of a cell, of the rows that belong to it
 
@@ -107,36 +107,31 @@ def markdown(table: Any) -> str:
     return "\n".join(f"| {' | '.join(plain(cell) for cell in line)} |" for line in lines)
 
 
-def print_tables(console: Console, tables: Sequence[Table]) -> None:
-    """Print tables without broken words; a wide one is printed in parts, each with the labels."""
-    for table in tables:
-        columns = list(zip(table.header, *table.lines, strict=True))
-        least = [max(len(word) for cell in column for word in [*cell.split(), ""]) for column in columns]
-        parts = columns_of_parts([width + BETWEEN for width in least], table.labels, console.width - 1)
-        for number, own in enumerate(parts, 1):
-            of = f" ({number} of {len(parts)})" if len(parts) > 1 else ""
-            # As Text, or the brackets of a unit would be read as markup.
-            printed = RichTable(title=Text(table.title + of), title_justify="left", title_style="bold", box=SIMPLE_HEAD)
-            more = {i: max(map(len, columns[i])) - least[i] for i in own}  # that a column would take to wrap nothing
-            left = max(0, console.width - 1 - sum(least[i] + BETWEEN for i in own))
-            for after, i in enumerate(sorted(own, key=more.__getitem__)):  # rich itself would break words
-                more[i] = min(more[i], left // (len(own) - after))
-                left -= more[i]
-            for i in own:
-                printed.add_column(Text(table.header[i]), width=least[i] + more[i])
-            for line in table.lines:
-                printed.add_row(*(Text(line[i], style=STYLES.get(line[i], "")) for i in own))
-            console.print(printed)
-
-
-def columns_of_parts(least: Sequence[int], labels: int, width: int) -> list[list[int]]:
-    """Return the columns of each part of a table, with the labels, such that the least widths fit."""
-    parts: list[list[int]] = [[]]
-    for i in range(labels, len(least)):
-        if parts[-1] and sum(least[:labels]) + sum(least[j] for j in [*parts[-1], i]) > width:
-            parts.append([])
-        parts[-1].append(i)
-    return [[*range(labels), *part] for part in parts]
+def print_table(console: Console, table: Table, most: int = 0) -> None:
+    """Print a table without broken words or numbers: the columns that fit, and at most so many lines."""
+    header, *lines = ([cell.replace(" ± ", "±") for cell in line] for line in (table.header, *table.lines))
+    columns = list(zip(header, *lines, strict=True))
+    least = [max(len(word) for cell in column for word in [*cell.split(), ""]) for column in columns]
+    ends = np.cumsum([width + BETWEEN for width in least])
+    turnable = table.labels == 1 and len(lines) <= len(columns) <= most + 1
+    if turnable and ends[-1] >= console.width:
+        print_table(console, table._replace(header=columns[0], lines=columns[1:]))
+        return
+    kept = max(table.labels + 1, int(np.sum(ends < console.width)))
+    most = most or len(lines)
+    # As Text, or the brackets of a unit would be read as markup.
+    printed = RichTable(title=Text(table.title), title_justify="left", title_style="bold", box=SIMPLE_HEAD)
+    left = max(0, console.width - 1 - int(ends[min(kept, len(ends)) - 1]))
+    for i in range(min(kept, len(columns))):
+        more = min(left, max(map(len, columns[i])) - least[i])
+        left -= more
+        printed.add_column(Text(header[i]), width=least[i] + more)
+    for line in lines[:most]:
+        printed.add_row(*map(Text, line[:kept]))
+    console.print(printed)
+    hidden = {"further lines:": len(lines) - most, "columns:": len(columns) - kept}
+    if told := ", ".join(f"{what} {count}" for what, count in hidden.items() if count > 0):
+        console.print(Text(f"Not shown here: {told}"))
 
 
 def plain(text: str) -> str:

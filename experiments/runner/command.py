@@ -7,13 +7,14 @@ import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from inspect import cleandoc
 from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 from rich.console import Console
 
 from experiments.runner.cache import source_digest
-from experiments.runner.options import Run
+from experiments.runner.options import COMMON, Run
 from experiments.runner.run_record import recorded
 from hybrid_jax import checks
 from hybrid_jax.cli.command import exit_codes, parsed
@@ -97,8 +98,10 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
     if chosen not in presets:
         raise ValueError(f"--preset must be one of {', '.join(presets)}, got {chosen!r}")
     kind = type(presets[chosen])
-    description = "\n\n".join([about, *(each.__doc__ or "" for each in kind.__mro__ if issubclass(each, Run))])
-    return parsed(kind, _program(name), arguments, description=description, default=presets[chosen])
+    description = "\n\n".join(
+        [about, *(cleandoc(each.__doc__ or "") for each in kind.__mro__ if issubclass(each, Run))]
+    )
+    return parsed(kind, _program(name), arguments, presets[chosen], description, COMMON)
 
 
 def _program(name: str) -> str:

@@ -22,6 +22,22 @@ if TYPE_CHECKING:
 else:  # the command line offers what the registry holds
     Activation = Literal[tuple(ACTIVATIONS)]
 
+# Options that --help lists; --help-all lists all.
+COMMON = {
+    "preset",
+    "out",
+    "fresh",
+    "seeds",
+    "sizes",
+    "models",
+    "methods",
+    "changes",
+    "compared",
+    "references",
+    "agents",
+}
+COMMON |= {"over", "parts", "change", "parameters", "noise", "seconds", "worlds"}
+COMMON |= {"vehicle", "source", "target", "simulated", "learn", "columns", "n", "folds"}
 # Options that do not affect the results.
 UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id", "timeout")
 
@@ -31,18 +47,18 @@ class Run:
     """Results are written to --out. Flights and finished stages are kept in --cache and reused by later runs."""
 
     preset: Literal["paper", "quick", "smoke"] = "paper"
-    """paper: the full protocol. quick: few seeds, sizes and epochs, a few minutes. smoke: a functional check."""
+    """Protocol: the paper's takes hours, quick a few minutes, smoke only shows that everything works."""
     out: Path = Path("runs")
-    """Folder for the report, the figures and the models; a subfolder named after the experiment is created in it."""
+    """Folder of reports, in which one named after the experiment is created."""
     cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))
     """Folder for flights and finished stages. Compiled programs are kept in the user's cache folder, or in
     JAX_COMPILATION_CACHE_DIR."""
     fresh: bool = False
-    """Restart: earlier results in --out and unfinished sweeps are moved to a backup; nothing is deleted."""
+    """Restart, with earlier results in --out and unfinished sweeps moved to a backup. Nothing is deleted."""
     saving: float = 0.02
     """Largest share of a sweep's time for checkpoints; with a smaller share you lose more work if the run is killed."""
     seeds: Count = 10
-    """Trials of each condition: initialisation, order of minibatches, which N trajectories are drawn."""
+    """Trials of each condition. Seeds differ in initialisation, order of minibatches, and the N trajectories."""
     distributed: bool = False
     """Share the runs between processes, on one machine or many: start the same command for each.
     Process 0 writes. Slurm, Open MPI, Kubernetes and Cloud TPU are detected; elsewhere set the next three options."""

@@ -10,14 +10,15 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import field, fields, make_dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import fields
 from importlib import import_module
-from typing import Any, NoReturn, TypeVar, get_type_hints
+from typing import Any, NoReturn, TypeVar, cast
 
 import tyro
 
 from hybrid_jax.cli.flags import in_flags
+from hybrid_jax.cli.help import short_help
 from hybrid_jax.runtime import configure
 
 Options = TypeVar("Options")
@@ -33,7 +34,6 @@ VERBS = {
     "replay": "show a flight in 3-D, and where a model expects the vehicle",
     "export": "write a model as C, CasADi functions or StableHLO",
 }
-RARE = "rare"  # in the annotation of an option: --help-all lists it, --help does not
 INTERRUPTED = "interrupted, nothing was written"
 USAGE = """usage: hybrid-jax VERB ...
 
@@ -88,37 +88,34 @@ def _answer_at_once(program: str) -> None:
     threading.Thread(target=listen, daemon=True).start()
 
 
-def parsed(kind: type[Options], program: str, arguments: Sequence[str] | None, **more: Any) -> Options:
-    """Parse a command line into a dataclass; raise ValueError if it is invalid."""
+def parsed(
+    kind: type[Options],
+    program: str,
+    arguments: Sequence[str] | None,
+    default: Options | None = None,
+    description: str = "",
+    common: Collection[str] | None = None,
+) -> Options:
+    """Parse a command line into a dataclass; raise ValueError if it is invalid. `common`: options of --help."""
     output, given = io.StringIO(), list(sys.argv[1:] if arguments is None else arguments)
-    more = {"description": inspect.cleandoc(kind.__doc__ or "")} | more
-    asked = kind
-    if "--help-all" in given:
-        given = ["--help"]
-    elif {"-h", "--help"} & {*given} and (rare := _rare(kind)):
-        asked = make_dataclass(kind.__name__, rare, bases=(kind,), frozen=True, kw_only=True)
-        more["description"] += f"\n\n--help-all lists {len(rare)} more options."
+    description = description or inspect.cleandoc(str(kind.__doc__))
+    if {"-h", "--help"} & {*given}:
+        print(short_help(kind, program, description, default, common))
+        sys.exit(0)
+    given = ["--help"] if "--help-all" in given else given
     try:
         with contextlib.redirect_stderr(output):
-            return tyro.cli(asked, prog=program, args=given, **more)
+            return cast(Options, tyro.cli(kind, prog=program, args=given, description=description, default=default))
     except SystemExit as stop:
         if not stop.code:
             raise  # --help
         message = _message(output.getvalue())
-        known = [f"--{field.name.replace('_', '-')}" for field in fields(kind)]  # pyright: ignore[reportArgumentType]
-        asked = [re.split(r"[=.]", word)[0] for word in given if word.startswith("--")]
+        known = [f"--{field.name.replace('_', '-')}" for field in fields(cast(Any, kind))]
         # One that is wrong is named even where an argument is missing, which the parser finds first.
-        for word in asked:
+        for word in (re.split(r"[=.]", word)[0] for word in given if word.startswith("--")):
             if word.replace("--no-", "--", 1) not in (*known, "--help"):
                 message = f"Unrecognized options: {word}{_meant(word, known)}"
         raise ValueError(f"{message}; see --help") from None
-
-
-def _rare(kind: type) -> list[tuple[str, Any, Any]]:
-    """Return the options that --help hides."""
-    hints = get_type_hints(kind, include_extras=True)
-    rare = [each for each in fields(kind) if RARE in getattr(hints[each.name], "__metadata__", ())]
-    return [(each.name, tyro.conf.Suppress[hints[each.name]], field(default=each.default)) for each in rare]
 
 
 def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:

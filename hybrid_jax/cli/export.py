@@ -12,7 +12,8 @@ import tyro
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
-from hybrid_jax.cli.command import RARE, step
+from hybrid_jax.cli.command import step
+from hybrid_jax.cli.help import RARE
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters

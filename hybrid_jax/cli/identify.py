@@ -15,9 +15,10 @@ from matplotlib.figure import Figure
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
-from hybrid_jax.cli.command import RARE, step
+from hybrid_jax.cli.command import step
 from hybrid_jax.cli.compared import check_consistent, check_whole, unlearned_drag
 from hybrid_jax.cli.flags import in_flags
+from hybrid_jax.cli.help import RARE
 from hybrid_jax.cli.logs import LogOptions, content_of, raw_logs, require_distinct
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model

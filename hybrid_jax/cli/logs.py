@@ -9,7 +9,8 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from hybrid_jax.cli.command import RARE, ChecksFailed, step
+from hybrid_jax.cli.command import ChecksFailed, step
+from hybrid_jax.cli.help import RARE
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.checks.consistency import GYRO, RATIO, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
-from hybrid_jax.cli.command import RARE, step
+from hybrid_jax.cli.command import step
+from hybrid_jax.cli.help import RARE
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.io.files import write_atomic
@@ -116,7 +117,7 @@ def _page(options: Options, found: Excitation, points: np.ndarray, values: dict[
 
 @mpl.rc_context(page.STYLE)
 def _figure(found: Excitation, points: np.ndarray) -> Figure:
-    figure = Figure(figsize=(7.5, 3.5), layout="constrained")
+    figure = Figure(figsize=(6.0, 3.2), layout="constrained")
     above, time = figure.subplots(1, 2)
     above.plot(*found.states[:, POSITION].T[:2])
     above.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")

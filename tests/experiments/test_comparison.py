@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
     (run,) = experiments("comparison", "comparison", folder=folder, options=options)
     assert run.returncode == 0, run.stderr
     assert "Table" not in run.stderr
-    assert "Expert Augmentation" in run.stdout
+    assert "Report: " in run.stdout
     return folder / "out" / "comparison"
 
 

@@ -3,6 +3,7 @@
 import io
 import re
 import time
+from dataclasses import replace
 
 import pytest
 from reports import make_report, make_rows
@@ -10,11 +11,8 @@ from rich.cells import cell_len
 from rich.console import Console
 from smoke import ROOT
 
-from experiments.coverage import pooled_table
-from experiments.paper.known_body import known_body_table
 from experiments.reporting.report import MEANINGLESS, write_report
-from experiments.reporting.results import Results
-from experiments.reporting.tables import Table, columns_of_parts, print_tables
+from experiments.reporting.tables import Table, print_table
 from experiments.runner.progress import Line
 
 ANSI = re.compile(r"\x1b\[[0-9;]*m")
@@ -29,48 +27,47 @@ def tables_of(page):
 
 
 @pytest.mark.parametrize("name", ["param_shift", "comparison", "closed_loop", "real_flight/payload"])
-def test_no_word_is_broken(name):
+def test_no_word_or_number_is_broken(name):
     for table in tables_of(ROOT / "docs" / "reference" / name / "report.md"):
-        assert_whole(table, 80, True)
+        for most in (0, 5):
+            text = io.StringIO()
+            print_table(Console(file=text, width=80, force_terminal=True), table, most)
+            *printed, _ = ANSI.sub("", text.getvalue().partition("Not shown")[0]).splitlines()
+            assert max(map(cell_len, printed)) <= 80
+            cells = " ".join(cell.replace(" ± ", "±") for line in [table.header, *table.lines] for cell in line)
+            words = {*cells.split(), *table.title.split()}
+            assert {word for line in printed for word in line.split() if not set(word) <= {"─"}} <= words
 
 
-def test_nor_in_the_tables_of_coverage():
-    """Of which no report is kept: the longest names and numbers that it can have."""
-    tags = {"domain": "load_and_wind", "noise": "1", "parameter": "k", "draw": 0}
-    numbers = {"inside": True, "alone": 1.0, "error": -123.45, "half_width": 1234.56}
-    known = {"coverage": 0.5, "standard_error": 0.05, "bias": -12.3, "half_width": 123.4, "converged": 1.0}
-    case = {"case": "exact physics", "noise_on": "targets", "parameter": "Ix"}
-    for table in (pooled_table(Results([tags | numbers])), known_body_table(Results([case | known]))):
-        assert_whole(table, 80, False)
-
-
-def assert_whole(table, width, terminal):
+def test_a_table_that_is_too_wide_is_turned_or_cut():
+    numbers = [[f"{n}", *(f"{i}.123 ± 0.001" for i in range(5))] for n in (100, 1000)]
+    table = Table("Errors", ("N", *(f"method_{i}, fine-tuned" for i in range(5))), numbers)
     text = io.StringIO()
-    print_tables(Console(file=text, width=width, force_terminal=terminal), [table])
-    printed = ANSI.sub("", text.getvalue())
-    assert max(map(cell_len, printed.splitlines())) <= width
-    words = set(printed.split())
-    cells = {cell for line in [table.header, *table.lines] for cell in line}
-    assert [word for cell in cells for word in cell.split() if word not in words] == []
-
-
-def test_a_table_that_is_too_wide_comes_in_parts_that_each_have_the_labels():
-    assert columns_of_parts([9, 6, *[16] * 6], 2, 79) == [[0, 1, 2, 3, 4, 5], [0, 1, 6, 7]]
-    assert columns_of_parts([9, 6, *[16] * 6], 2, 199) == [[*range(8)]]
-
-
-def test_a_smoke_run_shows_no_verdict(tmp_path):
+    print_table(Console(file=text, width=60), table, 5)
+    assert "method_4," in text.getvalue()
+    assert "4.123±0.001" in text.getvalue()
     text = io.StringIO()
-    report = make_report(make_rows())
-    write_report(tmp_path, report, Console(file=text, width=100))
-    assert "holds" in text.getvalue()
+    print_table(Console(file=text, width=60), table)
+    assert text.getvalue().splitlines()[-1] == "Not shown here: columns: 2"
+
+
+def test_a_terminal_shows_a_headline_one_table_and_the_reports_path(tmp_path):
+    text = io.StringIO()
+    report = replace(make_report(make_rows()), warnings=["Look twice."])
+    write_report(tmp_path, report, Console(file=text, width=80))
+    headline, *_, warning, path = text.getvalue().splitlines()
+    assert headline.startswith("With N = 100, ")
+    assert (warning, path) == ("Look twice.", f"Report: {tmp_path / 'report.html'}")
+    assert "±" in text.getvalue()
+    assert len(text.getvalue().splitlines()) <= 24
     report.config["preset"] = "smoke"
     text = io.StringIO()
     write_report(tmp_path, report, Console(file=text, width=200))
     for shown in (text.getvalue(), (tmp_path / "report.md").read_text(), (tmp_path / "report.html").read_text()):
         assert MEANINGLESS in shown
         assert not re.search(r"✓ holds|✗ fails|– undecided", shown)
-    assert text.getvalue().splitlines()[-1] == f"Report: {tmp_path / 'report.html'}"
+    assert "±" not in text.getvalue()
+    assert text.getvalue().splitlines()[-1] == path
 
 
 def test_a_file_says_after_a_second_what_is_being_done_and_a_terminal_at_once(monkeypatch):

@@ -79,7 +79,7 @@ def test_report_tables_and_figures_keep_their_contract(name, folder, finished):
     assert "hybrid" in (out / "report.md").read_text()
     for figure in ("scores", "example_flight", "predictions"):
         assert (out / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
-    assert finished[name].stdout.strip()  # the tables, for a person
+    assert finished[name].stdout.strip()
     assert "Traceback" not in finished[name].stderr
 
 

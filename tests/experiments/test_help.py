@@ -20,6 +20,25 @@ def test_the_command_line_is_explained_or_refused_in_one_line(name, arguments, c
     assert len(said.err.splitlines()) == (code != 0)
 
 
+MAIN = {
+    name: f"experiments.{name}.__main__"
+    for name in ("closed_loop", "excitation", "online", "reaction_diffusion", "real_flight", "worlds")
+}
+NAMES = "ablation changes closed_loop comparison coverage excitation external_force online param_shift worlds"
+
+
+@pytest.mark.parametrize("name", [*NAMES.split(), "reaction_diffusion", "real_flight", "make_flights"])
+def test_help_has_a_screen_of_options_for_users(name, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as stop:
+        import_module(MAIN.get(name, f"experiments.{name}")).main(["--help"])
+    said = capsys.readouterr().out.splitlines()
+    assert stop.value.code == 0
+    assert 4 <= sum(line.startswith("  --") for line in said) <= 12
+    assert len(said) <= 50
+    assert max(map(len, said)) <= 80
+
+
 def test_all_programs_are_listed(capsys):
     import_module("experiments.__main__").main()
     said = capsys.readouterr().out

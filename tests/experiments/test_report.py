@@ -1,6 +1,5 @@
 """Reports: the contract of report.json, and what the pages and a terminal show."""
 
-import io
 import json
 import math
 
@@ -9,14 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reports import ODD_ROWS, TRUTH, changed, make_report, make_rows
-from rich.console import Console
 
 from experiments.paper.claims import DOMAINS_OF
 from experiments.paper.figures import HOME, scores
 from experiments.paper.lanes import by_altitude
 from experiments.paper.study import placeholder
 from experiments.paper.tables import altitudes, parameters, run_notes
-from experiments.reporting.claims import OUTCOMES
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import measured, spread_text
@@ -120,16 +117,6 @@ def test_notes_count_diverged_runs_and_name_their_epochs():
     notes = run_notes(changed(rows, "hybrid", "fine_tuned", 100, status="diverged", epochs=1))
     assert notes[1].startswith(f"6 of {len(rows)} runs met a non-finite loss, in epoch 1, 7, and count with their best")
     assert run_notes(make_rows())[1].startswith(f"0 of {len(rows)} runs met a non-finite loss and count")
-
-
-def test_terminal_shows_each_verdict_and_unit(tmp_path):
-    text = io.StringIO()
-    rows = changed(make_rows(), "hybrid", "fine_tuned", 100, factor=1.2)
-    write_report(tmp_path, make_report(rows), Console(file=text, width=200))
-    printed = text.getvalue()
-    assert sum(printed.count(outcome) for outcome in OUTCOMES.values()) == 9
-    assert "✗ fails" in printed
-    assert "[kg m²]" in printed
 
 
 def test_nothing_is_written_if_a_value_has_no_json_form(tmp_path):

@@ -1,0 +1,86 @@
+"""`--help`: a line or two for each common option; tyro lists all of them for `--help-all`."""
+
+import ast
+import inspect
+import re
+import shutil
+import textwrap
+from collections.abc import Collection
+from dataclasses import MISSING, fields, is_dataclass
+from itertools import pairwise
+from types import NoneType
+from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
+
+import tyro
+
+RARE = "rare"  # in the annotation of an option that only --help-all lists
+INDENT, WIDEST, LONG = 26, 100, 20  # columns; choices that are longer follow the text
+VALUES: dict[Any, str] = {bool: "", int: "N", float: "X", str: "NAME"}
+
+
+def short_help(kind: type, program: str, about: str, default: Any, common: Collection[str] | None) -> str:
+    """Return the help of a dataclass of options: those in `common`, or all without RARE in their annotation."""
+    said, hints = _documented(kind), get_type_hints(kind, include_extras=True)
+    every = fields(cast(Any, kind))
+    options: list[tuple[int, str, str]] = []
+    for each in every:
+        marks = getattr(hints[each.name], "__metadata__", ())
+        if RARE in marks if common is None else each.name not in common:
+            continue
+        value = each.default if default is None else getattr(default, each.name)
+        values, more, _ = _values(hints[each.name]).partition(" …")
+        told = re.split(r"(?<=\.)\s", " ".join(said[each.name].split()))[0].removesuffix(".")
+        shown = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        if len(values) > LONG:
+            told, values = f"{told}: {values.replace('|', ', ')}", "NAME"
+        elif not (value is None or isinstance(value, bool) or value in ((), MISSING)):
+            told += f" [{shown}]"
+        named = f"--{'no-' * (value is True)}{each.name.replace('_', '-')} {values}{more}".rstrip()
+        aliases = [alias for mark in marks for alias in getattr(mark, "aliases", None) or ()]
+        needed = value is MISSING and each.default_factory is MISSING
+        place = 0 if tyro.conf.Positional in marks else 1 if needed else 2 + (each.name not in kind.__annotations__)
+        options.append((place, ", ".join([*aliases, named]) if place else each.name.upper(), told))
+    options.sort(key=lambda option: option[0])  # arguments, needed options, own ones, inherited ones
+    width = min(shutil.get_terminal_size().columns, WIDEST) - 1
+    needs = [name.partition(", ")[2] or name for place, name, _ in options if place < 2]
+    text = [f"usage: {' '.join([program, *needs])} [OPTIONS]", *_wrapped(about, width), ""]
+    for _, name, told in options:
+        head = f"  {name}".ljust(INDENT)
+        text += [head.rstrip()] * (len(head) > INDENT)
+        first = " " * INDENT if len(head) > INDENT else head
+        text += textwrap.wrap(told, width, initial_indent=first, subsequent_indent=" " * INDENT)
+    left = len(every) - len(options)
+    return "\n".join([*text, "", "--help-all explains more" + f", and lists {left} more options" * (left > 0) + "."])
+
+
+def _documented(kind: type) -> dict[str, str]:
+    """Return the string below each field of a dataclass and of its bases."""
+    found: dict[str, str] = {}
+    for each in filter(is_dataclass, reversed(kind.__mro__)):
+        (body,) = ast.parse(textwrap.dedent(inspect.getsource(cast(Any, each)))).body
+        for field, said in pairwise(cast(ast.ClassDef, body).body):
+            if isinstance(field, ast.AnnAssign) and isinstance(said, ast.Expr):
+                found[ast.unparse(field.target)] = ast.literal_eval(said.value)
+    return found
+
+
+def _values(hint: Any) -> str:
+    """Return what a user types after an option of this type."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _values(args[0])
+    if origin is Literal:
+        return "|".join(map(str, args))
+    if origin is tuple:
+        return f"{_values(args[0])} …" if ... in args else " ".join(map(_values, args))
+    if args:
+        return "|".join(_values(each) for each in args if each is not NoneType)
+    return VALUES.get(hint, "PATH")
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Wrap paragraphs, and leave indented ones as they are."""
+    lines: list[str] = []
+    for paragraph in text.split("\n\n"):
+        lines += ["", *(paragraph.splitlines() if paragraph[:1].isspace() else textwrap.wrap(paragraph, width))]
+    return lines
