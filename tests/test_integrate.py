@@ -83,10 +83,8 @@ def test_every_ode_solver_of_diffrax_converges_without_options(name, reference):
 def test_a_solver_for_other_equations_is_refused(name):
     with pytest.raises(ValueError, match=f"solver must be a one-step method for ODEs of one term, got {name}"):
         path_of(getattr(diffrax, name)())
-
-
-def test_rk4_is_the_default():
-    np.testing.assert_array_equal(path_of(), path_of(RK4()))
+    with pytest.raises(ValueError, match=r"one of diffrax or of hybrid_jax\.SOLVERS, got 'rk4'"):
+        path_of("rk4")
 
 
 @pytest.mark.parametrize("solver", [RK4(), diffrax.Tsit5(), diffrax.Heun()], ids=lambda value: type(value).__name__)
@@ -182,11 +180,6 @@ def test_along_pairs_each_input_with_the_state_it_found():
     pairs = {(*state, *held) for state, held in zip(np.asarray(states).T, np.asarray(inputs).T, strict=True)}
     starts = np.concatenate([x0[None], x[:-1]])
     assert pairs == {(*starts[t, :, b], *u[t, :, b]) for t in range(4) for b in range(3)}
-
-
-def test_the_error_of_a_solver_by_name_says_where_the_names_are():
-    with pytest.raises(ValueError, match=r"one of diffrax or of hybrid_jax\.SOLVERS, got 'rk4'"):
-        path_of("rk4")
 
 
 def test_an_attitude_stays_one_however_long_it_turns():

@@ -78,27 +78,23 @@ def test_windows_are_picked_by_slices_and_by_traced_indices():
     assert picked.dt == cut.dt
 
 
-@pytest.mark.parametrize(("field", "index"), [("x0", (2, 1)), ("u", (1, 3, 0)), ("x", (3, 4, 2))], ids=["x0", "u", "x"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_the_number_that_is_not_finite_is_named(field, index, value):
+BAD = [({"dt": dt}, "dt must be a positive number") for dt in (0.0, -0.01, np.nan, np.inf)]
+BAD += [({part: np.s_[..., :-1, :]}, "trajectories: shapes of x0 .* do not agree") for part in ("x0", "u", "x")]
+BAD += [({"u": value}, r"trajectories: u\[1, 3, 0\] is not finite") for value in (np.nan, np.inf, -np.inf)]
+
+
+@pytest.mark.parametrize(("changes", "said"), BAD)
+def test_what_is_wrong_with_windows_is_named(changes, said):
     cut = windows()
-    getattr(cut, field)[index] = value
-    with pytest.raises(ValueError, match="mine") as error:
-        check(cut, "mine")
-    assert f"{field}{list(index)} is not finite" in str(error.value)
-
-
-@pytest.mark.parametrize("dt", [0.0, -0.01, np.nan, np.inf])
-def test_dt_must_be_positive(dt):
-    with pytest.raises(ValueError, match="dt must be a positive number"):
-        check(replace(windows(), dt=dt))
-
-
-@pytest.mark.parametrize(("part", "place"), [("x0", np.s_[:-1]), ("u", np.s_[:, :-1]), ("x", np.s_[..., :-1])])
-def test_shapes_that_do_not_agree_are_named(part, place):
-    cut = windows()
-    with pytest.raises(ValueError, match=r"trajectories: shapes of x0 .* do not agree"):
-        check(replace(cut, **{part: getattr(cut, part)[place]}))
+    for part, change in changes.items():
+        if isinstance(change, tuple):
+            cut = replace(cut, **{part: getattr(cut, part)[change]})
+        elif part == "u":
+            cut.u[1, 3, 0] = change
+        else:
+            cut = replace(cut, dt=change)
+    with pytest.raises(ValueError, match=said):
+        check(cut)
 
 
 def test_single_and_empty_windows_are_refused():

@@ -20,7 +20,7 @@ from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody, rigid_bo
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.state import POSITION, QUATERNION, VELOCITY
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
@@ -176,37 +176,6 @@ def test_the_mass_of_a_payload_is_found_where_the_thrust_is_known():
     windows = Trajectories(x0.T, u, rollout_batch(loaded, x0.T, u, 0.01), 0.01)
     found = fit_least_squares(rigid_body(IRIS, ("mass",)), windows).field
     np.testing.assert_allclose(found.theta()["mass"], 1.2 * IRIS.mass, rtol=1e-6)
-
-
-def test_no_torque_without_gain():
-    x, u = samples()
-    still = x.at[BODY_RATES].set(0.0)
-    derivative = one_by_one(rigid_body(IRIS, (), Terms(torque_gain=(0.0, 0.0, 0.0))), still, u)
-    np.testing.assert_array_equal(derivative[BODY_RATES], 0)
-
-
-@pytest.mark.parametrize(
-    ("learn", "said"),
-    [
-        (("weight",), "'weight'"),
-        (("k", "k_rotors"), "both k and k_rotors"),
-        (("k_rotors", "mass"), "both mass and k_rotors"),
-        (("Ix", "Ix"), "twice"),
-    ],
-)
-def test_what_cannot_be_learned_is_refused(learn, said):
-    with pytest.raises(ValueError, match=said):
-        rigid_body(IRIS, learn)
-
-
-@pytest.mark.parametrize(
-    "term",
-    [{"drag": (1.0, 2.0)}, {"drag": (1.0, 2.0, np.inf)}, {"aerodynamic_moment": (1.0, 2.0, 3.0)}, {"rate_damping": 1}],
-    ids=str,
-)
-def test_a_term_that_is_none_is_refused_by_name(term):
-    with pytest.raises(ValueError, match=next(iter(term))):
-        Terms(**term)
 
 
 def test_it_survives_a_file_and_its_states_are_checked(tmp_path):

@@ -57,11 +57,6 @@ def test_body_velocity_is_rotated_into_the_world():
     np.testing.assert_allclose(x[0, 7:10], [-1, 3, 2], atol=1e-12)
 
 
-def test_library_frames_change_nothing(flight):
-    parts = flight.x[:, :3], flight.x[:, 3:7], flight.x[:, 7:10], flight.x[:, 10:]
-    np.testing.assert_allclose(to_library(*parts, Frames("ENU", "FLU", "world")), flight.x, atol=1e-12)
-
-
 def test_euler_angles_turn_yaw_first():
     forward = rotation_of(from_euler(row(0, 90 * DEG, 90 * DEG))).apply([1.0, 0, 0])[0]
     np.testing.assert_allclose(forward, [0, 0, -1], atol=1e-12)  # z up: positive pitch is nose down

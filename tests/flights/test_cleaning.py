@@ -126,13 +126,6 @@ def test_step_response_of_the_lag_is_exponential(flight):
     np.testing.assert_allclose(log.u[:100], 400)
 
 
-def test_lag_recovers_rotor_speeds_from_commands(flight):
-    speeds, step = flight.u, flight.dt / 0.04
-    commands = speeds[:-1] + np.diff(speeds, axis=0) / (1 - np.exp(-step))
-    commanded = FlightLog(flight.t[:-1], flight.x[:-1], np.maximum(commands, 0))
-    np.testing.assert_allclose(lag_motors(commanded, 0.04).u[50:], 0.5 * (speeds[50:-1] + speeds[51:]), rtol=0.01)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

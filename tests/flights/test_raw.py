@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from hybrid_jax.flights.formats.column_map import read_mapped
-from hybrid_jax.flights.formats.raw import own_samples
+from hybrid_jax.flights.formats.raw import Samples, own_samples, record
 
 
 def drawn(t, own, values):
@@ -51,22 +50,11 @@ def test_values_that_were_repeated_are_samples_once(rows):
     assert own_samples(t, values, repeated=False)[1] is values
 
 
-def test_a_mapped_csv_says_which_columns_were_lines(tmp_path):
+def test_a_recording_says_which_signals_were_lines():
     rng, t = np.random.default_rng(2), 0.01 * np.arange(501)
-    slow = drawn(t, 0.1 * np.arange(51), 1500 + rng.integers(-100, 100, size=(51, 4)))
-    rates = rng.normal(size=(501, 3))
-    names = ["t", "u0", "u1", "u2", "u3", "p", "q", "r"]
-    rows = [",".join(map(repr, row)) for row in np.column_stack([t, slow, rates]).tolist()]
-    (tmp_path / "log.csv").write_text("\n".join([",".join(names), *rows, ""]))
-    (tmp_path / "map.toml").write_text(
-        'frames = { world = "NED", body = "FRD", velocity = "world" }\n'
-        'time = { columns = ["t"], unit = "s" }\n'
-        'body_rates = { columns = ["p", "q", "r"], unit = "rad/s" }\n'
-        'motors = { columns = ["u0", "u1", "u2", "u3"], unit = "pwm" }\n'
-    )
-    found = read_mapped(tmp_path / "log.csv", tmp_path / "map.toml")
-    assert len(found.signals["command"]) == 51
-    assert len(found.signals["rates"]) == 501
+    slow = drawn(t, 0.1 * np.arange(51), rng.normal(size=(51, 4)))
+    parts = {"command": Samples(t, slow, "motors"), "rates": Samples(t, rng.normal(size=(501, 3)), "gyro")}
+    found = record("log", parts)
+    assert (len(found.signals["command"]), len(found.signals["rates"])) == (51, 501)
     (note,) = found.notes
-    assert "u0 u1 u2 u3" in note
-    assert "0.1 s apart" in note
+    assert note.startswith("motors: values repeated, or lines between samples 0.1 s apart")

@@ -167,17 +167,12 @@ def test_what_the_estimator_calls_invalid_resets_and_dropouts_are_said(written):
         assert any(words in note for note in recording.notes)
 
 
-@pytest.mark.parametrize("missing", PX4_STATES)
+@pytest.mark.parametrize("missing", [*PX4_STATES, "esc_status"])
 def test_a_missing_topic_is_named(flight, topics, written, missing):
     motors = {"esc_status": escs(flight.t - flight.t[0], flight.u)}
     path = written({name: samples for name, samples in (topics | motors).items() if name != missing})
-    quantity = dict(zip(PX4_STATES, ("position", "attitude", "rates"), strict=True))[missing]
+    quantity = dict(zip((*PX4_STATES, "esc_status"), ("position", "attitude", "rates", "motors"), strict=True))[missing]
     refusal(lambda: to_flight(read_ulog(path)), path, f"no {quantity}", "logger_topics.txt", f"{missing} ")
-
-
-def test_a_log_without_motors_is_refused(topics, written):
-    path = written(topics)
-    refusal(lambda: to_flight(read_ulog(path)), path, "no motors")
 
 
 def test_a_dropout_becomes_a_gap(flight, topics, written):

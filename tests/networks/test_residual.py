@@ -16,9 +16,7 @@ from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.networks.mlp import (
     FusedNetwork,
     InputScaling,
-    LinearResidual,
     LinearSkip,
-    ResidualNetwork,
     SmoothRelu,
     residual_network,
     smoothed,
@@ -121,21 +119,6 @@ def test_what_is_no_activation_is_refused():
     for beta in (0.0, -1.0, float("nan"), "30"):
         with pytest.raises(ValueError, match=r"^beta must be"):
             smoothed(network(), beta)
-
-
-def test_in_training_hidden_units_have_mean_zero_and_variance_one():
-    with jax.enable_x64(True):
-        # relu(h) − relu(−h) = h: with weights ±1 the output shows the normalised units themselves.
-        inner = jax.random.normal(jax.random.key(0), (STATES, STATES + INPUTS))
-        both = BatchNorm(jnp.ones(2 * STATES), jnp.zeros(2 * STATES), base.RunningStats(jnp.zeros(10), jnp.ones(10)))
-        field = ResidualNetwork(
-            jnp.concatenate([inner, -inner]), both, jnp.hstack([jnp.eye(STATES), -jnp.eye(STATES)]), jnp.zeros(STATES)
-        )
-        x, u = batch(columns=50)
-        normalised = np.asarray(field.train_batch(x, u))
-        variance = np.asarray(inner @ jnp.concatenate([x, u])).var(1)
-        np.testing.assert_allclose(normalised.mean(1), 0, atol=1e-13)
-        np.testing.assert_allclose(normalised.var(1), variance / (variance + 1e-5), rtol=1e-12)
 
 
 def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
@@ -245,15 +228,6 @@ def test_every_norm_survives_a_file_and_starts_from_the_same_weights(norm, tmp_p
 def test_without_normalisation_the_bias_starts_as_a_linear_layer_s():
     shift = residual_network(13, 4, jax.random.key(0), norm="none").norm.shift
     assert 0.85 / 17**0.5 < jnp.abs(shift).max() <= 1 / 17**0.5  # 64 draws of a fixed seed
-
-
-def test_a_linear_residual_is_linear_for_one_sample_and_for_a_batch():
-    with jax.enable_x64(True):
-        rng = np.random.default_rng(0)
-        field, (x, u) = LinearResidual(jnp.asarray(rng.normal(size=(5, 7))), jnp.asarray(rng.normal(size=5))), batch()
-        expected = np.asarray(field.weight) @ np.concatenate([x, u]) + np.asarray(field.bias)[:, None]
-        np.testing.assert_allclose(field.train_batch(x, u), expected, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])
