@@ -31,7 +31,7 @@ class RK4(diffrax.AbstractSolver):
 
     Attributes:
         scanned: whether its stages are a loop, which compiles faster (see `compact`). The result is the same.
-        substeps: steps of equal length in each interval, for systems where a single step is unstable or inaccurate.
+        substeps: steps that functions of this library take in each interval, for systems where one is not accurate.
     """
 
     scanned: bool = False
@@ -49,17 +49,8 @@ class RK4(diffrax.AbstractSolver):
         return None
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        if self.substeps == 1:  # training usually takes one: that program has no loop in it
-            y1 = self._one(terms, t0, t1 - t0, y0, args)
-        else:
-            length = (t1 - t0) / self.substeps
-            times = t0 + length * jnp.arange(self.substeps, dtype=y0.dtype)
-            y1 = jax.lax.scan(lambda y, t: (self._one(terms, t, length, y, args), None), y0, times)[0]
-        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
-
-    def _one(self, terms, t0, length, y0, args):
-        half = length / 2
-        middle, t1 = t0 + half, t0 + length
+        half = (t1 - t0) / 2
+        middle = t0 + half
         if self.scanned:
             times, steps = jnp.array([t0, middle, middle, t1]), jnp.array([0, half, half, 2 * half], y0.dtype)
 
@@ -74,7 +65,8 @@ class RK4(diffrax.AbstractSolver):
             k2 = terms.vf(middle, y0 + half * k1, args)
             k3 = terms.vf(middle, y0 + half * k2, args)
             k4 = terms.vf(t1, y0 + 2 * half * k3, args)
-        return y0 + (half / 3) * (k1 + 2 * (k2 + k3) + k4)
+        y1 = y0 + (half / 3) * (k1 + 2 * (k2 + k3) + k4)
+        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
@@ -102,6 +94,7 @@ def integrate(
     """
     solver = _prepared(solver, jnp.result_type(x0))
     term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
+    substeps *= solver.substeps if isinstance(solver, RK4) else 1
     begin, end = 0.0, dt / substeps
     if isinstance(solver, diffrax.AbstractImplicitSolver):
         begin, end = jnp.asarray(begin), jnp.asarray(end)  # its root finder accepts no plain numbers
@@ -164,7 +157,6 @@ def rollout(
     u: Float[Array | np.ndarray, "t m"],
     dt: float,
     solver: Solver | None = None,
-    substeps: int = 1,
 ) -> Float[Array, "t d"]:
     """The trajectory of a field in inference mode: x[i] is the state (i + 1) dt after x0, u[i] the input before it.
 
@@ -175,19 +167,18 @@ def rollout(
         field: ẋ = f(x, u), a vector field or any function of a state (d,) and an input (m,).
         x0: the initial state (d,).
         dt: length of an interval [s].
-        solver: a one-step ODE solver of diffrax; by default `RK4`.
-        substeps: solver steps of equal length in each interval.
+        solver: a one-step ODE solver of diffrax; by default `RK4`, which can take several steps per interval.
 
     Raises:
-        ValueError: an argument has the wrong shape or type, or is not finite; dt or substeps is not positive; the
-            solver is not for ODEs; or the field does not map x0 and u to ẋ of the shape of x0.
+        ValueError: an argument has the wrong shape or type, or is not finite; dt is not positive; the solver is
+            not for ODEs; or the field does not map x0 and u to ẋ of the shape of x0.
     """
-    return _integrate(field, *checked(field, x0, u, dt, solver, substeps), dt, substeps)
+    return _integrate(field, *checked(field, x0, u, dt, solver), dt)
 
 
 @eqx.filter_jit
-def _integrate(field, x0, u, solver, dt, substeps):
-    return integrate(field, x0, u, dt, solver, substeps, projection(field, len(x0), len(u)))
+def _integrate(field, x0, u, solver, dt):
+    return integrate(field, x0, u, dt, solver, 1, projection(field, len(x0), len(u)))
 
 
 def projection(field, d: int, intervals: int) -> Callable[[Array], Array]:
@@ -202,7 +193,6 @@ def rollout_batch(
     u: Float[Array | np.ndarray, "n t m"],
     dt: float,
     solver: Solver | None = None,
-    substeps: int = 1,
 ) -> Float[Array, "n t d"]:
     """`rollout` of each of n windows.
 
@@ -211,23 +201,22 @@ def rollout_batch(
         x0: the initial state of each window (n, d).
         dt: length of an interval [s].
         solver: by default `RK4`.
-        substeps: solver steps of equal length in each interval.
     """
-    return _integrate_batch(field, *checked(field, x0, u, dt, solver, substeps, windows=True), dt, substeps)
+    return _integrate_batch(field, *checked(field, x0, u, dt, solver, windows=True), dt)
 
 
 @eqx.filter_jit
-def _integrate_batch(field, x0, u, solver, dt, substeps):
+def _integrate_batch(field, x0, u, solver, dt):
     if isinstance(solver, diffrax.AbstractImplicitSolver) or not as_field(field).features_first:
-        return jax.vmap(lambda start, held: _integrate(field, start, held, solver, dt, substeps))(x0, u)
+        return jax.vmap(lambda start, held: _integrate(field, start, held, solver, dt))(x0, u)
     project = jax.vmap(projection(field, x0.shape[1], u.shape[1]), -1, -1)
     columns, held = jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1)
-    states = integrate(lambda x, held: _infer(field, x, held), columns, held, dt, solver, substeps, project)
+    states = integrate(lambda x, held: _infer(field, x, held), columns, held, dt, solver, 1, project)
     return jnp.moveaxis(states, -1, 0)
 
 
 def checked(
-    field, x0, u, dt, solver, substeps: int = 1, *, windows: bool = False
+    field, x0, u, dt, solver, *, windows: bool = False
 ) -> tuple[Float[Array, "*n d"], Float[Array, "*n t m"], Solver]:
     """x0 in the precision of ẋ, u, and the solver or its default, after the checks of `rollout`."""
     x0, u = checks.floating("x0", x0), checks.floating("u", u)
@@ -235,7 +224,6 @@ def checked(
     if x0.ndim != 1 + windows or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
         raise ValueError(f"{expected} expected, got shapes {x0.shape} and {u.shape}")
     checks.positive("dt", dt, "a positive number of seconds")
-    checks.count("substeps", substeps)
     solver = RK4() if solver is None else solver
     check_solver(solver)
     slope = check_field(field, *(jax.ShapeDtypeStruct(part.shape[-1:], part.dtype) for part in (x0, u)))

@@ -16,20 +16,20 @@ _evaluate = eqx.filter_jit(lambda field, x, u: field(x, u))
 
 
 def rollout_minibatch(
-    field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1
+    field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver
 ) -> Float[Array, "t d b"]:
     """The trajectories of a minibatch in training mode, features first: batch normalisation sees all windows."""
-    if (states := kernels.trained(field, x0, u, dt, solver, substeps)) is not None:
+    if (states := kernels.trained(field, x0, u, dt, solver)) is not None:
         return states
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     if (
         batch_norms(field) if implicit else as_field(field).features_first
     ):  # implicit and coupled: one system of equations
-        return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver, substeps)
+        return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver)
     alone = training_mode(field)  # samples first: transposing in each evaluation costs up to half the step
 
     def one_window(x0, u):
-        return integrate(lambda x, held: _evaluate(alone, x, held), x0, u, dt, solver, substeps)
+        return integrate(lambda x, held: _evaluate(alone, x, held), x0, u, dt, solver)
 
     return over_samples(one_window)(x0, u)
 

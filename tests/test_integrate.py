@@ -11,7 +11,7 @@ from pendulum import pendulum
 
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.integrate import RK4, SOLVERS, along, rollout, rollout_batch
+from hybrid_jax.integrate import RK4, SOLVERS, along, integrate, rollout, rollout_batch
 from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.rollouts import predict, rollout_minibatch
 from hybrid_jax.vehicle import IRIS
@@ -55,7 +55,9 @@ def reference(double_precision):
 
 @eqx.filter_jit
 def _path(torques, dt, solver, substeps):
-    return rollout(pendulum(**FIELD), jnp.asarray(START), torques, dt, solver, substeps)
+    if substeps > 1:
+        return integrate(pendulum(**FIELD), jnp.asarray(START), torques, dt, solver, substeps)
+    return rollout(pendulum(**FIELD), jnp.asarray(START), torques, dt, solver)
 
 
 def path_of(solver=None, substeps=1, torques=TORQUES, dt=DT):
@@ -103,7 +105,9 @@ def test_an_input_acts_from_its_own_interval_on(solver):
 @pytest.mark.parametrize("solver", STEPPERS, ids=lambda value: type(value).__name__)
 def test_a_program_does_not_grow_with_its_substeps(solver):
     def size(substeps):
-        program = jax.make_jaxpr(lambda x0: rollout(pendulum(**FIELD), x0, jnp.asarray(TORQUES), DT, solver, substeps))
+        program = jax.make_jaxpr(
+            lambda x0: integrate(pendulum(**FIELD), x0, jnp.asarray(TORQUES), DT, solver, substeps)
+        )
         return len(str(program(jnp.asarray(START))).splitlines())
 
     assert abs(size(100) - size(2)) < 0.1 * size(1)  # lines are broken where names happen to be longer
@@ -121,7 +125,7 @@ def test_substeps_and_their_gradient_are_those_of_steps_by_hand(solver):
         return x.sum()
 
     def looped(field):
-        return rollout(field, jnp.asarray(START), jnp.asarray(TORQUES[:2]), DT, solver, 3)[-1].sum()
+        return integrate(field, jnp.asarray(START), jnp.asarray(TORQUES[:2]), DT, solver, 3)[-1].sum()
 
     found, expected = (eqx.filter_jit(eqx.filter_value_and_grad(last))(pendulum(**FIELD)) for last in (looped, by_hand))
     np.testing.assert_allclose(*map(jax.tree.leaves, (found, expected)), rtol=1e-12)  # order of sums
@@ -131,7 +135,7 @@ def test_substeps_and_their_gradient_are_those_of_steps_by_hand(solver):
 def test_substeps_are_differentiated_inside_shard_map(solver):
     def slope(x0):
         field = pendulum(**FIELD)
-        return jax.grad(lambda field: rollout(field, x0, jnp.asarray(TORQUES), DT, solver, 3).sum())(field).log_length
+        return jax.grad(lambda field: integrate(field, x0, jnp.asarray(TORQUES), DT, solver, 3).sum())(field).log_length
 
     mesh, part = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("lanes",)), jax.sharding.PartitionSpec("lanes")
     share = jax.shard_map(lambda x0: slope(x0[0])[None], mesh=mesh, in_specs=part, out_specs=part, check_vma=False)

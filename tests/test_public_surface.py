@@ -74,13 +74,12 @@ def test_a_prediction_is_finite_or_refused(flight, dt, other):
 @given(
     flights(),
     odd(0.01),
-    odd(1, 2),
-    st.sampled_from([None, hj.RK4(), "rk4", 4]),
+    st.sampled_from([None, hj.RK4(), hj.RK4(substeps=2), "rk4", 4]),
     st.sampled_from([hj.rollout, hj.rollout_batch]),
 )
-def test_a_rollout_is_finite_or_refused(flight, dt, substeps, solver, function):
+def test_a_rollout_is_finite_or_refused(flight, dt, solver, function):
     kind, x0, u = flight
-    found = outcome(function, FLOWN[kind], x0, u, dt, solver, substeps)
+    found = outcome(function, FLOWN[kind], x0, u, dt, solver)
     # One that leaves the numbers from a finite start is carried on: see its documentation, and `Model.predict`.
     assert found is None or is_finite(found) or max(np.abs(x0).max(), np.abs(u).max()) > 1e4
 

@@ -20,27 +20,27 @@ VECTOR = 16  # numbers in a vector, at most: of windows the kernels take at leas
 
 def serves_training(field, x0: Shaped, u: Shaped, solver: Solver, windows_axis: int) -> bool:
     """Whether `trained` supports a minibatch of these shapes with windows along an axis."""
-    return _kernel(field, x0, u, solver, 1, windows_axis, True) is not None
+    return _kernel(field, x0, u, solver, windows_axis, True) is not None
 
 
-def trained(field, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1) -> Any:
+def trained(field, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver) -> Any:
     """Return the trajectories (t, d, b) of a minibatch in training mode, or None without a kernel."""
-    if (kernel := _kernel(field, x0, u, solver, substeps, -1, True)) is None:
+    if (kernel := _kernel(field, x0, u, solver, -1, True)) is None:
         return None
     return _rollout((kernel, float(dt)), kernel.weights(field), jnp.asarray(x0), jnp.asarray(u))
 
 
 def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, solver: Solver):
     """Return the trajectories (n, t, d) for x0 (n, d), u (n, t, m) in inference mode, or None without a kernel."""
-    if (kernel := _kernel(field, x0, u, solver, 1, 0, False)) is None:
+    if (kernel := _kernel(field, x0, u, solver, 0, False)) is None:
         return None
     last = jnp.moveaxis(jnp.asarray(x0), 0, -1), jnp.moveaxis(jnp.asarray(u), 0, -1)
     return jnp.moveaxis(_called((kernel, float(dt)), 0, kernel.weights(field), *last)[0], -1, 0)
 
 
-def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, substeps: int, axis: int, training: bool) -> Kernel | None:
+def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, axis: int, training: bool) -> Kernel | None:
     """Return the kernel for these arrays, whose shapes it does not check itself."""
-    if type(solver) is not RK4 or (solver.substeps, substeps) != (1, 1) or (x0.ndim, u.ndim) != (2, 3):
+    if type(solver) is not RK4 or solver.substeps != 1 or (x0.ndim, u.ndim) != (2, 3):
         return None
     if x0.shape[axis] != u.shape[axis] or x0.shape[axis] < VECTOR or library.obstacle() is not None:
         return None
