@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.external_force import FLOOR
@@ -126,23 +127,28 @@ def run(config: AblationConfig, stages: Stages) -> Results:
 
 
 def write(config: AblationConfig, rows: Results, seconds: dict[str, float], console: Console | None) -> None:
-    out, drawn = config.out / NAME, {}
-    for choice, group in rows.group("choice").items():
-        title = f"{choice.capitalize()}: test error over 1 s after fine-tuning"
-        figure = figures.ablation(group, title, {EXTERNAL_FORCE.name: FLOOR})
-        drawn[choice] = figure, f"Test errors of all seeds, by {choice}"
+    out = config.out / NAME
     report = Report(
         experiment=NAME,
         config=config.described(),
         environment=environment(seconds),
         rows=rows,
-        figures=save_figures(out, drawn),
+        figures=save_figures(out, draw(rows)),
         notes=NOTES,
         head=HEAD,
         conclusion=conclusion(rows),
         tables=ablation_tables(rows, TRUTH),
     )
     write_report(out, report, console)
+
+
+def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
+    drawn = {}
+    for choice, group in rows.group("choice").items():
+        title = f"{str(choice).capitalize()}: test error over 1 s after fine-tuning"
+        figure = figures.ablation(group, title, {EXTERNAL_FORCE.name: FLOOR})
+        drawn[choice] = figure, f"Test errors of all seeds, by {choice}"
+    return drawn
 
 
 def effects(rows: Results) -> dict[tuple[str, str], dict[str, Estimate]]:

@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any, get_args
 
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.external_force import sine_floor
@@ -85,13 +86,16 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     if not hosts.is_main_process():
         return
     floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
-    drawn = ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
-    caption = "Test errors of all seeds of every method (paper, Table 2)"
-    figures = save_figures(out, {"standings": (drawn, caption)})
+    figures = save_figures(out, draw(rows, floor))
     notes = stages.notes()
     true, extra = {each.name: nominal(each.vehicle) for each in DOMAINS}, {"flights": flights}
     report = paper_report(NAME, config, stages.seconds, rows, true, figures, notes, floor, extra)
     write_report(out, report, Console())
+
+
+def draw(rows: Results, floor: float) -> dict[str, tuple[Figure, str]]:
+    caption = "Test errors of all seeds of every method (paper, Table 2)"
+    return {"standings": (ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor}), caption)}
 
 
 def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, Fit], Fit | None]:

@@ -4,23 +4,21 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import jax
-from matplotlib.figure import Figure
 from rich.console import Console
 
-from experiments.closed_loop import figures, models
+from experiments.closed_loop import models
 from experiments.closed_loop.claims import Evidence, Speed, claims
 from experiments.closed_loop.config import PRESETS, ClosedLoopConfig
+from experiments.closed_loop.figures import draw
 from experiments.closed_loop.flights import DOMAINS, Flown, ModelSet, Scenario, fly_all, results_of
 from experiments.closed_loop.models import Trained
-from experiments.closed_loop.results import ORACLE, SOURCES, Agent, conclusion, gap_tables, speed_table, tables
+from experiments.closed_loop.results import Agent, conclusion, gap_tables, speed_table, tables
 from experiments.closed_loop.timing import call_times
 from experiments.flying.timing import on_one_core
 from experiments.paper.config import Config
 from experiments.reporting.claims import evaluate, verdict_table
-from experiments.reporting.names import label
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
-from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
@@ -138,7 +136,6 @@ def write(config: ClosedLoopConfig, trained: dict[str, Trained], flown: Sequence
     spent, worked = sum(each.seconds for each in flown), sum(each.processor_seconds for each in flown)
     clocked = call["processor_ms"], call["median_ms"], simulated, spent, worked, flown[0].devices
     verdicts = evaluate(claims(few), Evidence(rows, Speed(*clocked)))
-    drawn, missing = draw(rows, flown, few)
     notes = [f"{name}: {note}" for name, stages in training.items() for note in stages.notes()]
     notes += [f"least squares: {note}" for note in models.disturbance_counts(trained["least_squares"])]
     seconds = {f"{name}, {stage}": taken for name, own in training.items() for stage, taken in own.seconds.items()}
@@ -148,30 +145,14 @@ def write(config: ClosedLoopConfig, trained: dict[str, Trained], flown: Sequence
         environment=environment(seconds),
         rows=rows,
         claims=verdicts,
-        figures=save_figures(out, drawn),
-        notes=[*missing, *notes],
+        figures=save_figures(out, draw(rows)),
+        notes=notes,
         extra={"speed": timed},
         head=head(config),
         conclusion=conclusion(rows, few),
         tables=[verdict_table(verdicts, "Hypotheses"), *tables(rows), *gap_tables(rows), speed_table(timed)],
     )
     write_report(out, report, Console())
-
-
-def draw(rows: Results, flown: Sequence[Flown], few: int) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
-    followed = (Agent("nominal"), Agent("hybrid"), *(Agent(model, few) for model in SOURCES), ORACLE)
-    made, missing = {}, []
-    for domain in (each.name for each in DOMAINS):
-        for file, caption, drawing in (
-            ("errors", "Position RMSE of all seeds", partial(figures.errors, rows, domain)),
-            ("gap", "Position RMSE before and after adaptation", partial(figures.shares, rows, domain)),
-            ("paths", "Flights of seed 0", partial(figures.flown_paths, flown, domain, followed)),
-        ):
-            try:
-                made[f"{file}_{domain}"] = drawing(), f"{caption}, {label(domain)}"
-            except ValueError as error:  # nothing of it was flown
-                missing.append(f"{file}_{domain}.png is missing: {error}.")
-    return made, missing
 
 
 ABOUT = "Does ten seconds of flight improve the control of a vehicle? A predictive controller flies every model."

@@ -65,9 +65,9 @@ def away(distance: float) -> str:
 
 def conclusion(rows: Results, few: int) -> list[str]:
     sentences = []
-    for domain in (PARAMETER_SHIFT, EXTERNAL_FORCE):
+    for domain in (EXTERNAL_FORCE, PARAMETER_SHIFT):
         flown = {agent: _at_home(own) for agent, own in by_agent(rows.where(domain=domain, distance=0.0)).items()}
-        parts = []
+        parts, best = [], flown.get(ORACLE)
         for model, source in SOURCES.items():
             before, after = flown.get(Agent(source)), flown.get(Agent(model, few))
             if before is not None and after is not None:
@@ -75,10 +75,15 @@ def conclusion(rows: Results, few: int) -> list[str]:
                 more = "" if both is None else f", with an observer {_in_cm(both)}"
                 parts.append(f"{LEARNED[model]}: {_in_cm(before)} before, {_in_cm(after)} after{more}")
         if parts:
-            best = flown.get(ORACLE)
             known = "" if best is None else f"; the {KNOWN['oracle']} {_in_cm(best)}"
             what = f"{DOMAINS[domain].capitalize()}, adapted to {few} trajectories, median position RMSE at home"
             sentences.append(f"{what}: {'; '.join(parts)}{known}.")
+        before, after = flown.get(Agent("invariant")), flown.get(Agent("invariant", few))
+        if domain == EXTERNAL_FORCE and before is not None and after is not None:
+            told = f"{DOMAINS[domain].capitalize()}: adapted to {few} trajectories, the {LEARNED['invariant']} has a"
+            known = f"; the true vehicle has {_in_cm(best)}" if best is not None else ""
+            found = f"{_in_cm(after)} at home instead of {_in_cm(before)}"
+            sentences.insert(0, f"{told} median position RMSE of {found}{known}.")
     lost = {
         agent.name: f"{sum(own['crashed'])} of {len(own)}"
         for agent, own in by_agent(rows.where(lambda row: row["distance"] > 0)).items()

@@ -22,8 +22,7 @@ from experiments.excitation.results import (
     Flown,
     conclusion,
     described,
-    flight_figure,
-    interval_figure,
+    draw,
     margin_table,
     margins,
     tables,
@@ -123,17 +122,13 @@ def experiment(config: ExcitationConfig, console: Console) -> None:
     own = flights[DESIGNED, 0]
     evidence = Evidence(rows, margins(config.bounds, own[0]))
     verdicts, out = evaluate(CLAIMS, evidence), config.out / NAME
-    figures = {
-        "intervals": (interval_figure(rows), "95 % intervals of each flight; a dot is a seed, a bar their mean."),
-        "flight": (flight_figure(design, own), "The designed flight: planned (dashed) and flown."),
-    }
     report = Report(
         experiment=NAME,
         config=config.described(),
         environment=environment(stages.seconds),
         rows=rows,
         claims=verdicts,
-        figures=save_figures(out, figures),
+        figures=save_figures(out, draw(rows)),
         notes=stages.notes(),
         head=HEAD.strip(),
         tables=[verdict_table(verdicts, "Hypotheses"), *tables(rows), margin_table(design, evidence)],

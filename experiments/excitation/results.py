@@ -12,14 +12,13 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.claims import Claim, Part, all_of
 from experiments.reporting.names import HYBRID
-from experiments.reporting.plots import COLOURS, PAGE, STYLE, name_lines, subplots, tick_errors
+from experiments.reporting.plots import COLOURS, PAGE, STYLE, Line, dots, subplots
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval
 from experiments.reporting.tables import Table, cross_table, over_seeds, tabulate
 from hybrid_jax.planning import Excitation, FlightBounds
 from hybrid_jax.rotation import heading
-from hybrid_jax.sim.flight import DT
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.state import POSITION, QUATERNION, VELOCITY
 
 RANDOM, DESIGNED = "random", "designed"
 FLIGHTS = ("hover", "figure-8", RANDOM, DESIGNED)
@@ -138,43 +137,24 @@ def described(design: Excitation) -> dict[str, Any]:
     }
 
 
+def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
+    caption = (
+        f"Half-width of the 95 % intervals of each flight; a dot is a seed, a bar the median, ▷ above {WIDEST:g} %"
+    )
+    return {"intervals": (interval_figure(rows), caption)}
+
+
 @mpl.rc_context(STYLE)
 def interval_figure(rows: Results) -> Figure:
     """Draw a panel per parameter, a line per flight; intervals wider than `WIDEST` are triangles."""
     names = rows.unique("parameter")
     figure, panels = subplots((PAGE, 2.4), 1, len(names), sharex=True, sharey=True)
     for axes, name in zip(panels[0], names, strict=True):
-        for y, flight in enumerate(FLIGHTS):
-            found = rows.where(parameter=name, flight=flight).numbers("half_width")
-            place = y + np.linspace(-0.25, 0.25, len(found) + 2)[1:-1]
-            tint = COLOURS[HYBRID] if flight == DESIGNED else "0.35"
-            for marker, drawn in (("o", found <= WIDEST), (">", found > WIDEST)):
-                shown = np.minimum(found[drawn], WIDEST)
-                axes.plot(shown, place[drawn], marker, color=tint, alpha=0.5, markersize=3)
-            axes.plot([min(found.mean(), WIDEST)] * 2, [y - 0.35, y + 0.35], color=tint, linewidth=2)
-        axes.set(title=name, xscale="log", xlabel="half-width [%], log scale")
-    name_lines(panels[0][0], FLIGHTS)
-    tick_errors(panels[0][0].xaxis, *panels[0][0].get_xlim())
-    figure.suptitle(f"How wide is the 95 % interval? (dot: a seed, bar: mean, ▷: beyond {WIDEST:g} %; lower is better)")
-    return figure
-
-
-@mpl.rc_context(STYLE)
-def flight_figure(design: Excitation, flown: Flown) -> Figure:
-    figure, panels = subplots((PAGE, 4.2), 2, 2, sharex=True)
-    states, inputs = flown
-    shown = {
-        "position [m]": (design.states[:, POSITION], states[:, POSITION], "xyz"),
-        "velocity [m/s]": (design.states[:, VELOCITY], states[:, VELOCITY], "xyz"),
-        "body rates [rad/s]": (design.states[:, BODY_RATES], states[:, BODY_RATES], "xyz"),
-        "rotor speeds [rad/s]": (design.inputs, inputs, ("0", "1", "2", "3")),
-    }
-    for axes, (title, (planned, actual, labels)) in zip(panels.flat, shown.items(), strict=True):
-        for i, label in enumerate(labels):
-            (line,) = axes.plot(DT * np.arange(len(actual)), actual[:, i], linewidth=1, label=label)
-            axes.plot(DT * np.arange(len(planned)), planned[:, i], "--", color=line.get_color(), linewidth=0.7)
-        axes.set_title(title, loc="left")
-        axes.legend(ncols=len(labels), loc="lower right", bbox_to_anchor=(1, 0.98), handlelength=1, columnspacing=1)
-    for axes in panels[1]:
-        axes.set_xlabel("time [s]")
+        found = {flight: rows.where(parameter=name, flight=flight).numbers("half_width") for flight in FLIGHTS}
+        tints = {flight: COLOURS[HYBRID] if flight == DESIGNED else "0.35" for flight in FLIGHTS}
+        dots(axes, [Line(flight, own, tints[flight]) for flight, own in found.items()], WIDEST)
+        axes.set(title=name, xlabel="half-width [% of the value; log scale]")
+    figure.suptitle(
+        f"How wide is the 95 % interval? (dot: a seed, bar: median, ▷: above {WIDEST:g} %; lower is better)"
+    )
     return figure

@@ -4,10 +4,10 @@ from functools import partial
 
 from rich.console import Console
 
-from experiments.online import figures
 from experiments.online.config import PRESETS, OnlineConfig
+from experiments.online.figures import draw
 from experiments.online.flights import fly_all
-from experiments.online.results import Evidence, claims, results_of, tables
+from experiments.online.results import Evidence, claims, conclusion, results_of, tables
 from experiments.online.timing import step_time
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.plots import save_figures
@@ -46,10 +46,6 @@ def experiment(config: OnlineConfig, console: Console) -> None:
     rows, step = results_of(run), step_time(config.hardware(), config.controller().period)
     evidence = Evidence(rows, step, run.seconds, run.processor_seconds, len(rows))
     verdicts = evaluate(claims(list(config.changes)), evidence)
-    reference = "figure_eight" if "figure_eight" in config.references else config.references[0]
-    drawn = {"errors": (figures.errors(run, config, reference), "Errors around the change")}
-    if "online" in config.agents:
-        drawn["parameters"] = figures.parameters(run, config, reference), "Parameters around the change"
     out = config.out / NAME
     report = Report(
         experiment=NAME,
@@ -57,10 +53,11 @@ def experiment(config: OnlineConfig, console: Console) -> None:
         environment=environment(stages.seconds),
         rows=rows,
         claims=verdicts,
-        figures=save_figures(out, drawn),
+        figures=save_figures(out, draw(rows)),
         notes=[f"One step of the filter: {step:.3f} ms of processor time on one core, in a compiled loop."],
         extra={"step_ms": step},
         head=HEAD.strip(),
+        conclusion=conclusion(rows),
         tables=[verdict_table(verdicts, "Goals"), *tables(rows)],
     )
     write_report(out, report, Console())

@@ -64,6 +64,19 @@ def error(name: str):
     return lambda row: np.inf if row["crashed"] or row[name] is None else 100 * row[name]
 
 
+def conclusion(rows: Results) -> list[str]:
+    means = {
+        key: np.mean(own.where(crashed=False).numbers(error("settled")))
+        for key, own in rows.where(agent=("online", "oracle")).group("change", "agent").items()
+    }
+    ratios = [means[change, "online"] / means[change, "oracle"] for change, agent in means if agent == "online"]
+    if not ratios or len(means) < 2 * len(ratios):
+        return []
+    span = f"{min(ratios):.2f} to {max(ratios):.2f} times"
+    who = "a controller that knows the change"
+    return [f"From {SETTLED:g} s after a change on, a controller that adapts flies {span} as far off as {who}."]
+
+
 def tables(rows: Results) -> list[Table]:
     made = []
     columns = {REFERENCES[name]: {"reference": name} for name in rows.unique("reference")}

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -11,7 +10,7 @@ from rich.console import Console
 from experiments.paper.claims import COMPARISON, claims
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.figures import scores
-from experiments.paper.flight_figures import example_flight, predictions
+from experiments.paper.flight_figures import parted, predictions
 from experiments.paper.lanes import BANDS, BASELINES, bands, by_domain, save_models
 from experiments.paper.study import Study, study
 from experiments.paper.tables import altitudes, by_size, conclusion, meaning, parameters, ranking, run_notes
@@ -28,14 +27,13 @@ from hybrid_jax.integrate import compact
 from hybrid_jax.rollouts import predict
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.domain import Domain
-from hybrid_jax.sim.flight import DT, random_flights
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
 
-FLIGHT_SECONDS = 11.0
 DRAWN_FLIGHTS = 200  # the test flights whose predictions are drawn
 FLOOR = "wind_sine_mse"  # the key of report.json for the share of L^T_MSE that is the wind's sine
+PATHS = "paths"  # the key of predicted paths
 PAPER = "Osaka, Takeishi, Yairi, *Domain Adaptation with Hybrid Modeling for Learning Dynamical Systems*, ACML 2025"
 RATE_NOTE = (
     "C8 and C10 depend on the rate of θ_p in fine-tuning, --rates.physics-fine-tuning, an option whose "
@@ -74,11 +72,13 @@ def adapt_and_report(experiment: str, domain: Domain, floor: float, config: Adap
         return
     out, truth, rows = config.out / experiment, nominal(domain.vehicle), found.rows
     save_models(out / "models", found.lanes, rows)
-    figures = save_figures(out, draw(domain, config, found, floor))
     lowest = bands(found.target.splits["test"])
     counted = ", ".join(f"{np.sum(lowest == i)} {band}" for i, band in enumerate(BANDS.values()))
     notes = [*found.notes, f"Test windows by lowest altitude: {counted}."]
-    extra = {"flights": {"source": found.source.metadata, "target": found.target.metadata}}
+    extra: dict[str, Any] = {"flights": {"source": found.source.metadata, "target": found.target.metadata}}
+    extra |= {FLOOR: floor} if floor else {}
+    extra |= paths(found)
+    figures = save_figures(out, draw(rows, extra))
     report = paper_report(experiment, config, found.seconds, rows, truth, figures, notes, floor, extra)
     write_report(out, report, Console())
 
@@ -134,24 +134,22 @@ def introduction(experiment: str, rows: Results) -> str:
     return "\n\n".join(parts)
 
 
-def draw(domain: Domain, config: AdaptationConfig, found: Study, floor: float) -> dict[str, tuple[Figure, str]]:
-    """Draw Figs. 2/4, 3/5 and 7, with captions, by name."""
-    title = label(domain.name).capitalize()
-    flight = random_flights(domain, 1, FLIGHT_SECONDS, jax.random.key(config.data_seed))
-    example = example_flight(np.asarray(flight.states[0]), np.asarray(flight.inputs[0]), DT)
+def draw(rows: Results, extra: Mapping[str, Any]) -> dict[str, tuple[Figure, str]]:
+    """Draw Figs. 3/5 and, if there are predicted paths, 2/4, with captions, by name."""
+    title, floor = label(*rows.unique("domain")).capitalize(), extra.get(FLOOR, 0.0)
     lines = "Dash-dotted: the error before the change, and the error that no model here can avoid"
-    figures = {
-        "scores": (scores(found.rows, title, floor), f"Test error and gain against N (paper, Figs. 3, 5). {lines}"),
-        "example_flight": (example, "A flight like those of the data (paper, Fig. 7)"),
-    }
-    if {*config.models} - {PHYSICS_ONLY}:
-        figures["predictions"] = paths(title, found), "How predictions part from the truth (paper, Figs. 2, 4)"
+    figures = {"scores": (scores(rows, title, floor), f"Test error and gain against N (paper, Figs. 3, 5). {lines}")}
+    if PATHS in extra:
+        about = "How predictions of one seed part from the truth (paper, Figs. 2, 4)"
+        figures["predictions"] = predictions(extra[PATHS], title), about
     return figures
 
 
-def paths(title: str, found: Study) -> Figure:
-    """Draw test flights as predicted by the first seed's fine-tuned models; from above the flight of median error."""
+def paths(found: Study) -> dict[str, Any]:
+    """Predict test flights by the first seed's fine-tuned models; the flight of median error is shown from above."""
     tuned = [lanes for lanes in found.lanes if lanes.mode == FINE_TUNED and lanes.model != PHYSICS_ONLY]
+    if not tuned:
+        return {}
     test = found.target.splits["test"][:DRAWN_FLIGHTS]
     sizes = {row["n_train"] for row in tuned[0].rows}
     shown = sorted({100, 500, 1000} & sizes or sizes)[:3]
@@ -167,4 +165,4 @@ def paths(title: str, found: Study) -> Figure:
     truth = np.concatenate([start, np.asarray(test.x)], axis=1)
     errors = np.square(predicted[shown[0]][tuned[0].model] - truth).sum(-1).mean(-1)
     middle = int(np.argsort(errors)[len(errors) // 2])  # errors of flights that diverged sort last
-    return predictions(predicted, truth, middle, test.dt, f"{title}: predictions of {len(truth)} test flights")
+    return {PATHS: parted(predicted, truth, middle, test.dt)}

@@ -7,8 +7,7 @@ from rich.console import Console
 from experiments.reaction_diffusion import forecast, gray_scott, shifted
 from experiments.reaction_diffusion.config import PRESETS, Config
 from experiments.reaction_diffusion.figures import draw
-from experiments.reaction_diffusion.report import claims, tables
-from experiments.reaction_diffusion.systems import DT
+from experiments.reaction_diffusion.report import claims, conclusion, tables
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
@@ -54,14 +53,13 @@ def experiment(config: Config, console: Console) -> None:
     stages = stages_of(config, console)
     options = {name: value for name, value in config.described().items() if name not in SELECTIONS}
     kept = partial(stages.kept, identity=identity_of(options))
-    rows, shown, patterns = [], {}, {}
+    rows = []
     if "forecast" in config.parts:
-        rows, shown = forecast.study(config, kept)
+        rows += forecast.study(config, kept)
     if "shifted" in config.parts:
         rows += shifted.study(config, kept)
     if "gray_scott" in config.parts:
-        more, patterns = gray_scott.study(config, kept)
-        rows += more
+        rows += gray_scott.study(config, kept)
     results, out = Results(rows), config.out / NAME
     verdicts = evaluate(claims(results), results)
     report = Report(
@@ -70,9 +68,10 @@ def experiment(config: Config, console: Console) -> None:
         environment=environment(stages.seconds),
         rows=results,
         claims=verdicts,
-        figures=save_figures(out, draw(results, shown, patterns, DT)),
+        figures=save_figures(out, draw(results)),
         notes=stages.notes(),
         head=HEAD.strip(),
+        conclusion=conclusion(results),
         tables=[verdict_table(verdicts, "Goals, and the paper's claims for a PDE"), *tables(results)],
     )
     write_report(out, report, Console())

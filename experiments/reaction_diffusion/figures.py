@@ -1,56 +1,54 @@
-"""Figures: fields over time, spectra, errors against the number of trajectories."""
+"""Figures: errors of forecasts, and after a change against the number of trajectories."""
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.reaction_diffusion import shifted
-from experiments.reaction_diffusion.config import LOCAL, POINTWISE
-from experiments.reaction_diffusion.gray_scott import SOLVED
-from experiments.reaction_diffusion.report import SHIFT_WORDS, WAYS, _way
+from experiments.reaction_diffusion import forecast, shifted
+from experiments.reaction_diffusion.report import APHYNITY, SHIFT_WORDS, WAYS, _way
 from experiments.reaction_diffusion.shifted import AUTO
-from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, SOURCE_ONLY, TARGET_ONLY
-from experiments.reporting.plots import PAGE, STYLE, colour, legend_below, subplots, tick_errors
+from experiments.reporting.names import (
+    FINE_TUNED,
+    HYBRID,
+    LEAST_SQUARES,
+    NO_PHYSICS,
+    PHYSICS_ONLY,
+    SOURCE_ONLY,
+    TARGET_ONLY,
+)
+from experiments.reporting.plots import METHODS, PAGE, STYLE, Line, colour, dots, legend_below, subplots, tick_errors
 from experiments.reporting.results import Results
-from hybrid_jax.io.archive import Arrays
 
 STYLES = {FINE_TUNED: "-o", TARGET_ONLY: "--s", SOURCE_ONLY: ":", LEAST_SQUARES: "-.^", AUTO: "-D"}
-TINTS = {LEAST_SQUARES: "#CC79A7", AUTO: "#009E73"}
-Shown = Arrays
+TINTS = {LEAST_SQUARES: METHODS["physics"], AUTO: METHODS["adapted"]}
 
 
-def draw(rows: Results, shown: Shown, patterns: Shown, dt: float) -> dict[str, tuple[Figure, str]]:
+def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
     found = {}
-    known = [name for name in (POINTWISE, LOCAL) if name in shown]
-    if known:
-        caption = f"u of a test trajectory of FitzHugh–Nagumo: truth, forecast of {known[0]}, and the error"
-        found["fields"] = fields(shown, known[0], (0, 4, 9, 24), dt), caption
-    own = rows.where(part=shifted.PART)
-    if len(own):
+    if len(own := rows.where(part=forecast.PART)):
+        found["forecasts"] = (
+            forecasts(own),
+            "Error of forecasts of 2.5 s by each model; a dot is a seed, a bar the median",
+        )
+    if len(own := rows.where(part=shifted.PART)):
         found["scores"] = scores(own), "Error of forecasts after a change, against the number of target trajectories"
-    if patterns:
-        caption = "v of Gray–Scott in a new environment: truth, forecast with F and k adapted, and the error"
-        found["gray_scott"] = fields(patterns, SOLVED, (0, 2, 5, 8), 40.0, 1), caption
     return found
 
 
 @mpl.rc_context(STYLE)
-def fields(shown: Shown, name: str, at: tuple[int, ...], dt: float, component: int = 0) -> Figure:
-    truth, forecast = (_component(shown[each], component) for each in ("truth", name))
-    error = forecast - truth
-    figure, axes = subplots((PAGE * 0.8, PAGE * 0.8 * 3 / len(at) * 0.98), 3, len(at))
-    low, high, most = truth.min(), truth.max(), np.abs(error[list(at)]).max() or 1.0
-    limits = {"truth": (truth, low, high, "viridis"), "forecast": (forecast, low, high, "viridis")}
-    limits["error"] = (error, -most, most, "RdBu_r")
-    for row, (label, (values, least, largest, colours)) in zip(axes, limits.items(), strict=True):
-        for panel, step in zip(row, at, strict=True):
-            image = panel.imshow(values[step], vmin=least, vmax=largest, cmap=colours, interpolation="nearest")
-            panel.set(xticks=[], yticks=[])
-            if label == "truth":
-                panel.set_title(f"{(step + 1) * dt:.3g} s")
-        row[0].set_ylabel(label)
-        figure.colorbar(image, ax=list(row), shrink=0.9, aspect=12)
-    return figure
+def forecasts(rows: Results) -> Figure:
+    """Draw the error of each model, the best on top, and what APHYNITY published."""
+    groups = sorted(rows.group("case").items(), key=lambda group: group[1].spread("mse").median)
+    figure, ((axes,),) = subplots((PAGE, 0.9 + 0.24 * len(groups)), 1, 1)
+    lines = [Line(str(name), own.numbers("mse"), colour(_model(str(name)))) for name, own in groups]
+    axes.axvline(APHYNITY, color="0.4", linestyle=":", label="published: APHYNITY, 1600 trajectories")
+    dots(axes, lines)
+    axes.set_xlabel("mean squared error (log scale; lower is better)")
+    return legend_below(figure, "Forecasts of 2.5 s, learned from one trajectory")
+
+
+def _model(case: str) -> str:
+    return PHYSICS_ONLY if case.startswith("physics alone") else NO_PHYSICS if case.startswith("no physics") else HYBRID
 
 
 @mpl.rc_context(STYLE)
@@ -79,9 +77,3 @@ def scores(rows: Results) -> Figure:
     axes[0, 0].set_ylabel("mean squared error")
     tick_errors(axes[0, 0].yaxis, *axes[0, 0].get_ylim())
     return legend_below(figure, meaning="line: median over seeds; dot: a seed; lower is better", columns=3)
-
-
-def _component(states: np.ndarray, component: int) -> np.ndarray:
-    """Return one of two components of the first trajectory's states (t, d), as squares (t, side, side)."""
-    side = round((states.shape[-1] / 2) ** 0.5)
-    return states[0].reshape(-1, 2, side, side)[:, component]

@@ -8,7 +8,7 @@ import numpy as np
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import CASES, Case, Config
-from experiments.reaction_diffusion.models import error, pieces, predicted, weights
+from experiments.reaction_diffusion.models import error, pieces, weights
 from experiments.reaction_diffusion.systems import COARSE, STEPS, A, B, fitzhugh_nagumo, plane, reacting
 from experiments.reporting.results import Row
 from experiments.runner.stages import Found, Kept, rows_of
@@ -20,7 +20,6 @@ GUESS = (2 * A, B / 2)  # where a and b start
 EVERY = 4  # intervals between the windows of the first stage
 ANOTHER = 1000  # between the seeds of two networks of one trial
 TRIED = 10  # steps of every start; the best after them was the best at the end in 6 of 8 trials with seeds from 100
-KEPT = 2  # test trajectories whose forecasts are drawn
 
 
 def scaling(kernel: int) -> ChannelScaling:
@@ -61,11 +60,10 @@ def trained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
     return fit(best, whole, max_steps=config.polish).field
 
 
-def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]:
-    """Return a row for each case and seed, and forecasts to draw by the name of their case, with the truth."""
+def study(config: Config, kept: Kept) -> list[Row]:
+    """Return a row for each case and seed."""
     truth = fitzhugh_nagumo(plane(config.points))
     test = reacting(truth, config.test, (TEST, 0))
-    drawn = test[: min(KEPT, config.test)]
     cases = [case for case in CASES if case.name in config.cases]
     runs = [(case, seed) for case in cases for seed in range(min(config.seeds, case.seeds))]
 
@@ -73,12 +71,9 @@ def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]
         model = trained(case, config, seed)
         row = {"part": PART, "case": case.name, "seed": seed, "draw": 0, "mse": error(model, test, COARSE)}
         row |= _found(model) | {"trajectories": 1, "noise": case.noise}
-        return [row], {"weights": weights(model), "forecast": np.asarray(predicted(model, drawn, COARSE))}
+        return [row], {"weights": weights(model)}
 
-    found = kept(PART, {f"{case.name}, seed {seed}": partial(work, case, seed) for case, seed in runs})
-    shown = {"start": np.asarray(drawn.x0), "truth": np.asarray(drawn.x)}
-    first = {case.name: found[f"{case.name}, seed {seed}"] for case, seed in runs if seed == 0}
-    return rows_of(found), shown | {name: arrays["forecast"] for name, (_, arrays) in first.items()}
+    return rows_of(kept(PART, {f"{case.name}, seed {seed}": partial(work, case, seed) for case, seed in runs}))
 
 
 def _found(model: Any) -> dict[str, float | None]:

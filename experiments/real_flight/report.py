@@ -4,14 +4,16 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import product
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.real_flight.config import RealFlightConfig
-from experiments.real_flight.study import ADAPTED, BASELINES, LEARNED, MODELS, Fold, key_of
-from experiments.reporting import names
+from experiments.real_flight.study import ADAPTED, BASELINES, LEARNED, MODELS, Fold
+from experiments.reporting import names, plots
 from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evaluate, every, verdict_table
-from experiments.reporting.plots import save_figures
+from experiments.reporting.plots import METHODS, PAGE, STYLE, Line, dots, save_figures, subplots
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval, spread
@@ -31,6 +33,7 @@ LABELS = names.LABELS | {
     names.PHYSICS_ONLY: "its physics alone",
     names.LINEAR_RESIDUAL: "rigid body + linear residual",
 }
+SHOWN = (None, names.NOMINAL, names.FINE_TUNED, names.SOURCE_ONLY)  # modes, in reports of an earlier program
 Cell = tuple[str, int]  # model, n_train
 HEAD = f"""# {NAME}
 
@@ -51,15 +54,10 @@ def write(
     sets: Mapping[str, Flights],
     folds: Sequence[Fold],
     rows: Results,
-    curves: Mapping[str, np.ndarray],
     stages: Stages,
 ) -> None:
     out, found = config.out / NAME, cells(rows)
     best = max((cell for cell in found if cell[0] in (ADAPTED, LEARNED)), key=lambda cell: cell[1])
-    drawn = [(names.HOLD, 0), (names.THRUST, 0), (names.PHYSICS_ONLY, 0), *dict.fromkeys([(LEARNED, 0), best])]
-    lines = {label(*cell): np.stack([curves[key_of(row)] for row in found[cell]]) for cell in drawn}
-    figure = errors.figure(lines, config.dt)
-    caption = "RMSE over the time since a prediction began, on flights held out"
     claims = verdicts(found, best)
     tables = [expected_table(found), *score_tables(rows, found, config.dt), verdict_table(claims, "Hypotheses")]
     tables += [by_flight_table(found, best, max(config.horizon)), parameter_table(found)]
@@ -72,7 +70,7 @@ def write(
         environment=environment(stages.seconds),
         rows=rows,
         claims=claims,
-        figures=save_figures(out, {"errors_by_step": (figure, caption)}),
+        figures=save_figures(out, draw(rows)),
         notes=[*stages.notes(), *said],
         extra={"folds": split},
         head=f"{HEAD}\n\nFlights: {flown}, in {len(folds)} folds.",
@@ -80,6 +78,32 @@ def write(
         conclusion=conclusion(found, best, config.dt),
     )
     write_report(out, made, Console())
+
+
+def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
+    return {"errors": (error_figure(rows), "RMSE on held-out flights; a dot is a flight, or a fold and seed")}
+
+
+@mpl.rc_context(STYLE)
+def error_figure(rows: Results) -> Figure:
+    """Draw the RMSE at the end of the longest prediction, a panel per quantity, of models adapted to most windows."""
+    horizon, most = max(int(name) for name in rows[0]["scores"] if name.isdigit()), max(rows["n_train"])
+    chosen = rows.where(lambda row: row.get("mode") in SHOWN, n_train=(0, most))
+    groups = chosen.group("model", *(["mode"] if "mode" in rows[0] else []))
+    named = {
+        ", ".join([LABELS.get(model, model), *(names.label(mode) for mode in modes if mode != names.NOMINAL)]): own
+        for (model, *modes), own in groups.items()
+    }
+    figure, (panels,) = subplots((PAGE, 0.9 + 0.24 * len(named)), 1, len(errors.UNITS), sharey=True)
+    for axes, (quantity, unit) in zip(panels, errors.UNITS.items(), strict=True):
+        tints = [plots.colour(keys[0]) if keys[0] != ADAPTED else METHODS["adapted"] for keys in groups]
+        scores = [own.numbers(f"scores.{horizon}.{quantity}") for own in named.values()]
+        dots(axes, [Line(*line) for line in zip(named, scores, tints, strict=True)])
+        axes.set(title=quantity.replace("_", " "), xlabel=f"RMSE [{unit}]")
+    more = f", models adapted to {most} windows" * bool(most)
+    title = f"Held-out flights, after {horizon} intervals{more} (bar: median; log scales; lower is better)"
+    figure.suptitle(title)
+    return figure
 
 
 def cells(rows: Results) -> dict[Cell, Results]:

@@ -62,8 +62,8 @@ def make_folds(train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, c
 
 def run_folds(
     config: RealFlightConfig, model: VehicleModel, sets: Mapping[str, Flights], stages: Stages
-) -> tuple[list[Fold], Results, dict[str, np.ndarray]]:
-    """Return the folds, a row of each model on each test flight, and its errors by interval and `key_of` its row."""
+) -> tuple[list[Fold], Results]:
+    """Return the folds, and a row of each model on each test flight."""
     adapts = "target" in sets
     tested = sets["test"].logs if "test" in sets else None
     made = make_folds(sets.get("target", sets["source"]).logs, tested, config)
@@ -91,17 +91,16 @@ def run_folds(
     found = stages.kept(
         "real flight", jobs, identity_of(config.described(), contents, vars(model.vehicle), list(model.learn))
     )
-    curves = {name: array for _, arrays in found.values() for name, array in arrays.items()}
-    return made, Results(rows_of(found), TAGS), curves
+    return made, Results(rows_of(found), TAGS)
 
 
 def of_fold(
     config: RealFlightConfig, model: VehicleModel, fold: Fold, source: Learned, seed: int, adapts: bool
 ) -> Found:
-    """Return rows and curves of one fold and seed; baselines only in the first seed."""
+    """Return rows of one fold and seed; baselines only in the first seed."""
     train, test = lagged(fold.train, source.lag), lagged(fold.test, source.lag)
     physics, rigid = model.physics(), rigid_body(model.vehicle, (), model.terms)
-    rows, curves = [], {}
+    rows = []
 
     def score(name: str, field: AbstractVectorField, n: int = 0, found: Adaptation | None = None) -> None:
         for log in test:
@@ -114,7 +113,6 @@ def of_fold(
             row |= expected_of(source.expected if name == LEARNED and not adapts else None, found, curve)
             row |= parameters_of(found or (source.physics if name == LEARNED else None))
             rows.append(row)
-            curves[key_of(row)] = curve
 
     if seed == 0:
         fitted = windows_of(train, STEPS, STEPS, LINEAR).windows
@@ -128,11 +126,7 @@ def of_fold(
         score(ADAPTED, found.field, n, found)
         scratch = adapted(physics, train, None, n)
         score(names.SCRATCH, scratch.field, n, scratch)
-    return rows, curves
-
-
-def key_of(row: Mapping[str, Any]) -> str:
-    return " ".join(str(row[tag]) for tag in TAGS)
+    return rows, {}
 
 
 def expected_of(learned: np.ndarray | None, found: Adaptation | None, curve: np.ndarray) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, MaxNLocator, NullFormatter
 
 from experiments.reporting import names
 from hybrid_jax.io.files import write_atomic
@@ -22,7 +22,7 @@ from hybrid_jax.io.files import write_atomic
 STYLE: dict[Any, Any] = dict(mpl.rc_params_from_file(Path(__file__).with_name("style.mplstyle"), False, False))
 COLUMN, PAGE = 3.5, 7.2  # inches: the width of a column, and of a page of text
 DPI = 200
-SHADES = 64  # of a picture: some colours, and their shades at edges
+SHADES = 160  # colours of a picture, with their shades at edges
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 COLOURS = {
     names.HYBRID: "#0072B2",
@@ -41,6 +41,7 @@ OTHERS = "0.4"  # the colour of models that no figure of the paper shows
 DRAWABLE = 1e30  # a number beyond it overflows inside matplotlib and is drawn like one that is not finite
 LARGEST_RATIO = 100.0  # an axis of errors ends at this many times the smallest mean; errors beyond are marked there
 PADDING = 1.15  # factor of room at either end of an axis of errors
+SMALL = 1e-4  # an axis that begins below it has powers of ten
 LONG_NUMBER = 0.05  # numbers up to this need room on an axis
 HALF_LINE = 0.3  # half the height of a line in a panel: of a mean's bar, and of the band of its seeds
 FLOOR_LABEL = "floor: error that no model here can see"
@@ -115,6 +116,20 @@ def error_legend(figure: Figure, title: str, failed: bool) -> Figure:
     return legend_below(figure, title, columns=2, entries=entries)
 
 
+def dots(axes: Axes, lines: Sequence[Line], largest: float = math.inf) -> None:
+    """Draw a dot for each run and a bar for the median, the first line on top; numbers above `largest` as ▷ there."""
+    for y, line in enumerate(lines):
+        place = y + np.linspace(-HALF_LINE, HALF_LINE, len(line.errors) + 2)[1:-1]
+        for marker, drawn in (("o", line.errors <= largest), (">", line.errors > largest)):
+            shown = np.minimum(line.errors[drawn], largest)
+            axes.plot(shown, place[drawn], marker, color=line.colour, alpha=0.55, markersize=3.5, markeredgewidth=0)
+        middle = min(float(np.median(line.errors)), largest)
+        axes.plot([middle] * 2, [y - HALF_LINE, y + HALF_LINE], color=line.colour, linewidth=2)
+    axes.set_xscale("log")
+    name_lines(axes, [line.name for line in lines])
+    tick_errors(axes.xaxis, *axes.get_xlim())
+
+
 def name_lines(axes: Axes, names: Sequence[str]) -> None:
     """Label a line for each name, the first on top, at y = 0, 1, …"""
     axes.set(ylim=(len(names) - 0.4, -0.6))
@@ -132,7 +147,8 @@ def tick_errors(axis: Axis, low: float, high: float, room: float = 0.0) -> None:
     room = room or (2.2 if low > LONG_NUMBER else 1.5)
     subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if decades < 0.8 else (1.0, 2.0, 5.0) if decades < room else (1.0,)
     axis.set_major_locator(MaxNLocator(5) if decades < 0.5 else LogLocator(subs=subs))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    powers = decades > 2 and low < SMALL
+    axis.set_major_formatter(LogFormatterMathtext() if powers else FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
 

@@ -70,6 +70,7 @@ QUESTIONS = {
             "Train several random networks and keep the one with the least loss.",
         ),
         "Forecasts",
+        "forecasts.png",
     ),
     "worlds": Asked(
         "Is an adapted model ever worse than its source?",

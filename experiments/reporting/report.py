@@ -72,7 +72,9 @@ class Report:
         said = [" ".join(re.sub(r"[*`]", "", each).split()) for each in re.split(r"\n\s*\n|\n- ", introduction)]
         found = self.main()
         main = narrowed(found) if found else None
-        tables = [Cells("The question, the models and the measures", ("",), [(each,) for each in said if each])]
+        answer, *more = self.conclusions() or [""]
+        tables = [Cells("More results", ("",), [(each,) for each in more])]
+        tables += [Cells("The question, the models and the measures", ("",), [(each,) for each in said if each])]
         tables += [_cells(table) for table in self.shown() if table != main]
         for name, each in {"Environment": self.environment, "Configuration": self.config}.items():
             lines = [(key, json.dumps(value, ensure_ascii=False)) for key, value in leaves(each, ", ")]
@@ -80,7 +82,7 @@ class Report:
         pictures = [(caption, (folder / path).read_bytes()) for path, caption in self.ordered()]
         return Page(
             asked.question,
-            " ".join(self.conclusions()),
+            answer,
             _cells(main) if main else None,
             pictures,
             [*self.warnings, *asked.meaning],

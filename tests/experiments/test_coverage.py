@@ -41,7 +41,7 @@ def test_the_claim_fails_from_above_where_intervals_are_too_wide(change, holds):
 def test_the_conclusion_says_how_many_hold_and_where_fewest(inside, means):
     first, second = conclusion(rows(inside))
     assert first == f"Of 100 pooled 95 % intervals {inside}% contain the true value, of single sources 50%."
-    assert second.startswith(f"Fewest hold for weak_rotor 1 Ix (change, noise, parameter): {inside}%")
+    assert second.startswith(f"The fewest do for weak_rotor 1 Ix (change, noise, parameter): {inside}%")
     assert means in second
 
 

@@ -20,7 +20,7 @@ import hybrid_jax
 from experiments.external_force import sine_floor
 from experiments.paper.config import SMOKE
 from experiments.paper.lanes import physics_in, source_of
-from experiments.paper.outcome import draw
+from experiments.paper.outcome import draw, paths
 from experiments.paper.study import placeholder, study
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
 from hybrid_jax.sim.flight import SplitSpec
@@ -77,7 +77,7 @@ def test_report_tables_and_figures_keep_their_contract(name, folder, finished):
     with (out / "rows.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(report["rows"])
     assert "hybrid" in (out / "report.md").read_text()
-    for figure in ("scores", "example_flight", "predictions"):
+    for figure in ("scores", "predictions"):
         assert (out / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
     assert finished[name].stdout.strip()
     assert "Traceback" not in finished[name].stderr
@@ -120,8 +120,7 @@ def test_one_model_is_an_experiment_too_and_comes_from_the_cache(model, figures,
             expected[key] for key in ("mode", "val_mse", "theta")
         ]
         assert row["test_mse"] == pytest.approx(expected["test_mse"], rel=1e-5)
-    drawn = draw(PARAMETER_SHIFT, config, found, 0.0)
-    assert set(drawn) == {"scores", "example_flight", *figures}
+    assert set(draw(found.rows, paths(found))) == {"scores", *figures}
 
 
 @pytest.mark.slow

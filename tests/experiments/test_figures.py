@@ -1,10 +1,12 @@
 """Figures show the numbers of the rows, also of failed runs, and are reproducible."""
 
 import io
+import json
 import math
 
 import matplotlib as mpl
 import numpy as np
+import PIL.Image
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -12,7 +14,8 @@ from reports import ODD_ROWS, SIZES, changed, make_rows
 from test_ranking import compared_rows, spoilt
 
 from experiments.paper.figures import ranking, scores
-from experiments.paper.flight_figures import example_flight, predictions, tilt
+from experiments.paper.flight_figures import parted, predictions
+from experiments.redraw import REFERENCE, drawn
 from experiments.reporting.plots import LARGEST_RATIO, save_figures
 
 
@@ -25,16 +28,11 @@ def straight_flight(steps=10):
     return states
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: scores(make_rows(), "Scores", floor=0.01),
-        lambda: example_flight(straight_flight(), np.full((10, 4), 656.0), 0.1),
-    ],
-)
-def test_figures_are_reproducible_and_keep_matplotlibs_settings(tmp_path, make):
+def test_figures_are_reproducible_and_keep_matplotlibs_settings(tmp_path):
     before = dict(mpl.rcParams)
-    captions = save_figures(tmp_path, {name: (make(), "A figure") for name in ("one", "two")})
+    captions = save_figures(
+        tmp_path, {name: (scores(make_rows(), "Scores", floor=0.01), "A figure") for name in ("one", "two")}
+    )
     assert captions == dict.fromkeys(("one.png", "two.png"), "A figure")
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
     assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
@@ -109,7 +107,7 @@ def test_predictions_show_quantiles_of_flights_and_one_flight_from_above():
     off[:, 5:, 1] = 1e30
     lost[:, 3:] = math.nan
     predicted = {100: {"no_physics": off, "hybrid": near}, 1000: {"hybrid": lost}}
-    above, few, _, many = predictions(predicted, truth, 0, 0.1, "Flights").axes
+    above, few, _, many = predictions(parted(predicted, truth, 0, 0.1), "Flights").axes
     curves = {line.get_label(): line.get_ydata() for line in few.lines}
     assert curves["hybrid"] == pytest.approx(np.full(10, 0.2))
     assert few.get_ylim() == many.get_ylim()
@@ -117,11 +115,6 @@ def test_predictions_show_quantiles_of_flights_and_one_flight_from_above():
     assert np.ptp(above.get_xlim()) == pytest.approx(1.3)
     ends = [line.get_marker() for line in above.lines if line.get_marker() in "ox" and line.get_label()[0] == "_"]
     assert ends == ["x", "o"]  # where a prediction leaves the box, and where it ends
-
-
-def test_tilt_is_the_angle_of_roll_and_pitch_alone():
-    quaternions = np.array([[math.cos(0.2), math.sin(0.2), 0, 0], [math.cos(0.5), 0, 0, math.sin(0.5)]])
-    assert tilt(quaternions) == pytest.approx([math.degrees(0.4), 0.0], abs=1e-9)
 
 
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -136,3 +129,21 @@ def test_any_rows_are_drawn(rows, floor):
     for enough, draw in drawn:
         if len(enough):
             draw().savefig(io.BytesIO(), format="png", dpi=30)
+
+
+REPORTS = sorted(path.parent for path in REFERENCE.rglob("report.json"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", REPORTS, ids=lambda folder: str(folder.relative_to(REFERENCE)))
+def test_committed_pictures_are_what_the_code_draws(folder, tmp_path):
+    """Run `python -m experiments.redraw` if a figure's program has changed."""
+    captions = save_figures(tmp_path, drawn(folder))
+    assert json.loads((folder / "report.json").read_text())["figures"] == captions
+    assert {path.name for path in folder.iterdir() if path.suffix in (".png", ".gif", ".svg")} == captions.keys()
+    for name in captions:
+        assert f"]({name})" in (folder / "report.md").read_text()
+        own, committed = (PIL.Image.open(path / name).convert("RGB") for path in (tmp_path, folder))
+        assert own.size == committed.size
+        # Another version of matplotlib may draw a letter elsewhere.
+        assert np.abs(np.asarray(own, float) - np.asarray(committed, float)).mean() < 2

@@ -241,4 +241,4 @@ def test_simulated_run_writes_a_complete_report(tmp_path_factory):
     page = (out / "report.md").read_text()
     parts = "Error to expect", "RMSE after 0.05 s", "Physical parameters"
     assert sorted(parts, key=page.index) == [*parts]
-    assert (out / "errors_by_step.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "errors.png").read_bytes().startswith(b"\x89PNG")

@@ -106,7 +106,7 @@ def test_page_has_everything_once(tmp_path):
     tables = [line for line in page.splitlines() if line.startswith("|")]
     assert all(line.endswith("|") for line in tables)
     html = (tmp_path / "report.html").read_text()
-    assert html.index("hypotheses hold") < html.index("<img") < html.index("<table")
+    assert html.index("has the smallest test error") < html.index("<img") < html.index("<table")
     assert "<details><summary>Configuration</summary>" in html
     assert html.count("data:image/png;base64,") == 1
     assert "a &lt; b" in html
