@@ -69,7 +69,7 @@ def visit(site: Path, pages: list[str], widths: list[int], measure: str, profile
         address = f"http://127.0.0.1:{server.server_port}{PREFIX}visit"
         log = profile / "console.txt"
         with log.open("w") as said:
-            command = [str(BROWSER), *FLAGS, OFFLINE, f"--user-data-dir={profile}", "--remote-debugging-port=0", address]
+            command = [str(BROWSER), *FLAGS, OFFLINE, f"--user-data-dir={profile}", address]
             browser = subprocess.Popen(command, stderr=said, stdout=said)
             answered.wait(seconds)
             browser.terminate()
