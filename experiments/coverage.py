@@ -246,8 +246,7 @@ def conclusion(rows: Results) -> list[str]:
     return [
         f"Of {len(fitted)} pooled 95 % intervals {np.mean(fitted['inside']):.0%} contain the true value, "
         f"of single sources {np.mean(fitted['alone']):.0%}.",
-        f"The fewest do for {worst} (change, noise, parameter): {shares[worst]:.0%} (required: {ASKED:.0%}). "
-        f"{trust}",
+        f"The fewest do for {worst} (change, noise, parameter): {shares[worst]:.0%} (required: {ASKED:.0%}). {trust}",
     ]
 
 

@@ -10,6 +10,7 @@ from test_layers import ORDER
 
 DOCS = ROOT / "docs"
 PACKAGES = sorted(f"hybrid_jax.{path.parent.name}" for path in (ROOT / "hybrid_jax").glob("*/__init__.py"))
+CODE = 78  # characters of a line of code
 WIDEST = 120  # characters of a line or a cell, without the targets of its links
 TARGET = re.compile(r"\]\([^)]*\)|\]\[[^\]]*\]")
 
@@ -59,3 +60,10 @@ def test_lines_and_cells_are_short(page):
     cells = [cell.strip() for row in rows for cell in TARGET.sub("]", row).split("|")]
     others = [TARGET.sub("]", line) for line in prose if line not in rows and not line.startswith(("![", "    "))]
     assert [text for text in cells + others if len(text) > WIDEST] == []
+
+
+@pytest.mark.parametrize("page", written(), ids=lambda page: page.stem)
+def test_no_line_of_code_scrolls(page):
+    """Programs and notebooks have the same limit in docs/ruff.toml."""
+    code = re.findall(r"^```\w+\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    assert [line for block in code for line in block.splitlines() if len(line) > CODE] == []

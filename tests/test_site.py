@@ -7,6 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from browser import BROWSER, visit
 from smoke import LEFT, ROOT, script
 
 PACKAGES = [
@@ -53,3 +54,27 @@ def test_pages_load_only_what_is_in_the_folder(site):
             # The page for lost visitors of a server has absolute paths.
             place = site / target[1:] if target.startswith("/") else page.parent / target
             assert target[:5] == "data:" or place.exists(), f"{page}: {target}"
+
+
+MEASURE = """(page, window) => {
+  const right = Math.min(page.querySelector(".md-content")?.getBoundingClientRect().right ?? 1e9, window.innerWidth)
+  const frames = [...page.querySelectorAll("table")].map(table => table.closest(".md-typeset__scrollwrap") ?? table)
+  return {
+    sideways: page.documentElement.scrollWidth > window.innerWidth,
+    tables: frames.filter(frame => frame.getBoundingClientRect().right > right + 1).length,
+    formulas: [...page.querySelectorAll("math")].filter(each => each.getBoundingClientRect().height < 3).length,
+    source: page.querySelectorAll(".arithmatex").length,
+    pictures: [...page.images].filter(each => each.complete && !each.naturalWidth).length,
+  }
+}"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium")
+def test_pages_fit_wide_and_narrow_screens_and_need_no_network(site, tmp_path):
+    """Also under a path of a host that others share, where an address that leads nowhere shows 404.html."""
+    pages = [str(page.relative_to(site)) for page in sorted(site.rglob("*.html"))]
+    found, said = visit(site, pages, [1400, 400], MEASURE, tmp_path)
+    assert len(found) == 2 * len(pages)
+    assert [(page, width, own) for page, width, own in found if any(own.values())] == []
+    assert said == []

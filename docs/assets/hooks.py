@@ -1,4 +1,4 @@
-"""What mkdocs does beyond its plugins: mathematics as MathML, which needs no script, changes, and an index of names."""
+"""What mkdocs does beyond its plugins: MathML, changes, an index of names."""
 
 import html
 import re
@@ -8,7 +8,10 @@ from pathlib import Path
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
-FORMULA = re.compile(r'<(span|div) class="arithmatex">\s*\\[(\[](.*?)\\[)\]]\s*</\1>', re.DOTALL)
+FORMULA = re.compile(
+    r'<(span|div) class="arithmatex">\s*\\[(\[](.*?)\\[)\]]\s*</\1>',
+    re.DOTALL,
+)
 ROOT = Path(__file__).parents[2]
 
 
@@ -20,17 +23,35 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Add all public names in the order of the alphabet to the first page of the reference."""
+    """Add all public names to the first page of the reference, sorted."""
     if page.file.src_uri != "api/index.md":
         return markdown
-    packages = (f"hybrid_jax.{path.parent.name}" for path in sorted((ROOT / "hybrid_jax").glob("*/__init__.py")))
-    names = {name: package for package in packages for name in import_module(package).__all__}
-    names["rigid_body"] = "hybrid_jax.dynamics.rigid_body"  # as its module is called
-    entries = [f"[`{name}`][{names[name]}.{name}]" for name in sorted(names, key=str.lower) if name[0] != "_"]
+    packages = (
+        f"hybrid_jax.{path.parent.name}"
+        for path in sorted((ROOT / "hybrid_jax").glob("*/__init__.py"))
+    )
+    names = {
+        name: package
+        for package in packages
+        for name in import_module(package).__all__
+    }
+    names["rigid_body"] = (
+        "hybrid_jax.dynamics.rigid_body"  # as its module is called
+    )
+    entries = [
+        f"[`{name}`][{names[name]}.{name}]"
+        for name in sorted(names, key=str.lower)
+        if name[0] != "_"
+    ]
     return f"{markdown}\n\n## All names\n\n{' · '.join(entries)}\n"
 
 
 def on_page_content(content, page, config, files):
-    """Replace each formula of the page by MathML, on a line of its own if it was one."""
+    """Replace each formula of the page by MathML, which needs no script."""
     display = {"span": "inline", "div": "block"}
-    return FORMULA.sub(lambda found: convert(html.unescape(found[2]).strip(), display=display[found[1]]), content)
+    return FORMULA.sub(
+        lambda found: convert(
+            html.unescape(found[2]).strip(), display=display[found[1]]
+        ),
+        content,
+    )

@@ -1,4 +1,4 @@
-"""Adapt a pendulum that became longer: ten seconds of data repair the model."""
+"""Adapt a pendulum that became longer to ten seconds of new data."""
 
 import jax
 import jax.numpy as jnp
@@ -7,35 +7,50 @@ import matplotlib.pyplot as plt
 import hybrid_jax as hj
 
 
-class Pendulum(hj.AbstractVectorField):  # x = [angle, rate], u = [acceleration]
+class Pendulum(hj.AbstractVectorField):  # x = [angle, rate], u = [push]
     log_length: jax.Array
 
     def __call__(self, x, u):
-        return jnp.stack([x[1], u[0] - 9.81 / jnp.exp(self.log_length) * jnp.sin(x[0])])
+        stiffness = 9.81 / jnp.exp(self.log_length)
+        return jnp.stack([x[1], u[0] - stiffness * jnp.sin(x[0])])
 
 
 def damped(length):
-    return lambda x, u: Pendulum(jnp.log(length))(x, u) - jnp.stack([0.0, 0.3 * x[1]])
+    exact = Pendulum(jnp.log(length))
+    return lambda x, u: exact(x, u) - jnp.stack([0.0, 0.3 * x[1]])
 
 
 def windows(length, count, seed):
     starts, inputs = jax.random.split(jax.random.key(seed))
-    x0, u = jax.random.normal(starts, (count, 2)), jax.random.normal(inputs, (count, 10, 1))
-    return hj.Trajectories(x0, u, hj.rollout_batch(damped(length), x0, u, 0.05), dt=0.05)
+    x0 = jax.random.normal(starts, (count, 2))
+    u = jax.random.normal(inputs, (count, 10, 1))
+    x = hj.rollout_batch(damped(length), x0, u, 0.05)
+    return hj.Trajectories(x0, u, x, dt=0.05)
 
 
-network = hj.residual_network(2, 1, jax.random.key(4), hidden=16, norm="none", activation="tanh")
+size = {"hidden": 16, "norm": "none", "activation": "tanh"}
+network = hj.residual_network(2, 1, jax.random.key(4), **size)
 model = hj.Hybrid(Pendulum(jnp.log(1.0)), network)
-source = hj.fit(model, windows(0.7, 300, 0), windows(0.7, 100, 1), jax.random.key(5), max_epochs=200).best
+train, stop, key = (
+    windows(0.7, 300, 0),
+    windows(0.7, 100, 1),
+    jax.random.key(5),
+)
+source = hj.fit(model, train, stop, key, max_epochs=200).best
 result = hj.adapt(source, windows(0.8, 20, 2))
 print(result.report())
 
 start, push = jnp.array([1.5, 0.0]), jnp.zeros((100, 1))
 time = 0.05 * jnp.arange(1, 101)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
-plt.plot(time, hj.rollout(damped(0.8), start, push, 0.05)[:, 0], color="0.75", lw=5, label="true")
-plt.plot(time, hj.rollout(source, start, push, 0.05)[:, 0], color="0.45", ls="--", label="not adapted")
-plt.plot(time, hj.rollout(result.field, start, push, 0.05)[:, 0], color="#CC79A7", label="adapted")
+shown = {
+    "true": (damped(0.8), {"color": "0.75", "lw": 5}),
+    "not adapted": (source, {"color": "0.45", "ls": "--"}),
+    "adapted": (result.field, {"color": "#CC79A7"}),
+}
+for label, (field, style) in shown.items():
+    angle = hj.rollout(field, start, push, 0.05)[:, 0]
+    plt.plot(time, angle, label=label, **style)
 plt.xlabel("time [s]")
 plt.ylabel("angle [rad]")
 plt.legend(ncols=3, fontsize=7, loc="upper right")

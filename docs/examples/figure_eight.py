@@ -1,4 +1,4 @@
-"""Fly a figure-8 with model predictive control, adapt to that flight, and fly again."""
+"""Fly a figure-8 with model predictive control, adapt, and fly again."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,29 +11,47 @@ from hybrid_jax.trajectories import windows_of
 
 controller = Controller(hj.IRIS)
 nominal = hj.rigid_body(hj.IRIS)
-heavy = hj.RigidBody({"Ix": jnp.array(0.0), "Iy": jnp.array(0.0), "k": jnp.log(1 / 1.3)}, hj.IRIS)  # 30 % heavier
+# 30 % heavier.
+heavy = hj.RigidBody(
+    {"Ix": jnp.array(0.0), "Iy": jnp.array(0.0), "k": jnp.log(1 / 1.3)},
+    hj.IRIS,
+)
 reference = sample(figure_eight(top_speed=2.0), controller, duration=4.0)
 control, simulate = eqx.filter_jit(controller), eqx.filter_jit(advance)
 
 
 def flown(model):
-    """States (401, 13) and rotor speeds (400, 4) of a flight with a controller that predicts with this model."""
+    """States (401, 13) and rotor speeds (400, 4) of a flight with a model."""
     plan, states, inputs = controller.begin(), [reference[0]], []
     for i in range(400):
-        u, plan = control(model, controller.horizon(reference, i), states[-1], plan)
-        states, inputs = [*states, simulate(heavy, states[-1], u, controller.period)], [*inputs, u]
+        u, plan = control(
+            model, controller.horizon(reference, i), states[-1], plan
+        )
+        states, inputs = (
+            [*states, simulate(heavy, states[-1], u, controller.period)],
+            [*inputs, u],
+        )
     return np.array(states), np.array(inputs)
 
 
 first, inputs = flown(nominal)
-result = hj.adapt(nominal, windows_of(first, inputs, dt=controller.period, steps=10), method="theta_least_squares")
+result = hj.adapt(
+    nominal,
+    windows_of(first, inputs, dt=controller.period, steps=10),
+    method="theta_least_squares",
+)
 print(result.report())
 second, _ = flown(result.field)
 
 time = controller.period * np.arange(401)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
-for name, states, colour in (("not adapted", first, "0.45"), ("adapted", second, "#CC79A7")):
-    error = 100 * np.linalg.norm((states - np.array(reference)[:401])[:, :3], axis=1)
+for name, states, colour in (
+    ("not adapted", first, "0.45"),
+    ("adapted", second, "#CC79A7"),
+):
+    error = 100 * np.linalg.norm(
+        (states - np.array(reference)[:401])[:, :3], axis=1
+    )
     print(f"{name}: {error.max():.2f} cm off at most")
     plt.plot(time, error, color=colour, label=name)
 plt.xlabel("time [s]")

@@ -1,4 +1,4 @@
-"""Learn a friction that nobody wrote down: the network finds the force that physics lacks."""
+"""A network finds the friction that physics lacks."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import numpy as np
 import hybrid_jax as hj
 
 
-class Oscillator(hj.AbstractVectorField):  # x = [position, speed], u = [force]
+class Oscillator(hj.AbstractVectorField):  # x = [place, speed]
     log_stiffness: jax.Array
 
     def __call__(self, x, u):
@@ -21,18 +21,34 @@ def friction(speed):
 
 def windows(count, seed):
     draw = np.random.default_rng(seed).normal
-    x0, u = draw(size=(count, 2)).astype("f4"), draw(size=(count, 10, 1)).astype("f4")
-    true = lambda x, u: Oscillator(jnp.log(4.0))(x, u) + jnp.stack([0.0, friction(x[1])])
-    return hj.Trajectories(x0, u, hj.rollout_batch(true, x0, u, 0.05, hj.RK4(substeps=5)), dt=0.05)
+    x0, u = (
+        draw(size=(count, 2)).astype("f4"),
+        draw(size=(count, 10, 1)).astype("f4"),
+    )
+    true = lambda x, u: (
+        Oscillator(jnp.log(4.0))(x, u) + jnp.stack([0.0, friction(x[1])])
+    )
+    return hj.Trajectories(
+        x0,
+        u,
+        hj.rollout_batch(true, x0, u, 0.05, hj.RK4(substeps=5)),
+        dt=0.05,
+    )
 
 
-network = hj.residual_network(2, 1, jax.random.key(0), hidden=32, norm="none", activation="tanh")
+network = hj.residual_network(
+    2, 1, jax.random.key(0), hidden=32, norm="none", activation="tanh"
+)
 model = hj.Hybrid(Oscillator(jnp.log(3.0)), network)
-fitted = hj.fit(model, windows(300, 0), windows(100, 1), jax.random.key(1), max_epochs=300).best
+fitted = hj.fit(
+    model, windows(300, 0), windows(100, 1), jax.random.key(1), max_epochs=300
+).best
 print(f"stiffness {jnp.exp(fitted.physics.log_stiffness):.2f}, true 4.00")
 
 speed = jnp.linspace(-2, 2, 200)
-learned = jax.vmap(lambda v: fitted.residual(jnp.stack([0.0, v]), jnp.zeros(1))[1])(speed)
+learned = jax.vmap(
+    lambda v: fitted.residual(jnp.stack([0.0, v]), jnp.zeros(1))[1]
+)(speed)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
 plt.plot(speed, friction(speed), color="0.6", lw=4, label="true friction")
 plt.plot(speed, learned, color="#0072B2", label="learned by the network")

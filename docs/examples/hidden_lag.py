@@ -1,4 +1,4 @@
-"""A motor lags behind its command, and nothing measures it: the lag is a hidden state."""
+"""A motor lags behind its command: the lag is a hidden state."""
 
 import jax
 import jax.numpy as jnp
@@ -17,14 +17,25 @@ class Cart(hj.AbstractVectorField):  # x = [place, speed], u = [force]
 
 
 def model(mass, lag):
-    field = hj.with_hidden(Cart(jnp.log(jnp.array(mass))), Lag(jnp.log(jnp.array([lag])), places=(0,)))
-    return hj.StateSpaceModel(field, ("force",), {"place": lambda x, u: x[0]}, start=(0.0, 0.0, 0.0), spread=(0, 0, 0))
+    field = hj.with_hidden(
+        Cart(jnp.log(jnp.array(mass))),
+        Lag(jnp.log(jnp.array([lag])), places=(0,)),
+    )
+    return hj.StateSpaceModel(
+        field,
+        ("force",),
+        {"place": lambda x, u: x[0]},
+        start=(0.0, 0.0, 0.0),
+        spread=(0, 0, 0),
+    )
 
 
 random = np.random.default_rng(0)
 commands, times = np.arange(0, 12, 0.4), np.arange(0, 12, 0.05)
 force = random.choice([-1.0, 1.0], size=30)
-empty = hj.Record.of("truth", force=(commands, force), place=(times, 0 * times))
+empty = hj.Record.of(
+    "truth", force=(commands, force), place=(times, 0 * times)
+)
 true = hj.simulate(model(0.5, 0.25), empty, dt=0.01)[0]["place"][:, 0]
 place = true + 0.005 * random.normal(size=len(times))
 record = hj.Record.of("run", force=(commands, force), place=(times, place))

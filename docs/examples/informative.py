@@ -17,13 +17,25 @@ class Cart(hj.AbstractVectorField):  # x = [place, speed], u = [force]
 
 
 cart = Cart(jnp.array(0.5), jnp.array(0.2))
-limits = hj.InputBounds((-1.0,), (1.0,), start=(0.0, 0.0), state_low=(-1.0, -2.0), state_high=(1.0, 2.0))
-plan = hj.excitation(cart, None, limits, noise=[1e-3, 1e-2], seconds=4.0, dt=0.02, steps=50)
-print({name: f"± {error:.2g}" for name, error in plan.standard_errors.items()})
+limits = hj.InputBounds(
+    (-1.0,),
+    (1.0,),
+    start=(0.0, 0.0),
+    state_low=(-1.0, -2.0),
+    state_high=(1.0, 2.0),
+)
+plan = hj.excitation(
+    cart, None, limits, noise=[1e-3, 1e-2], seconds=4.0, dt=0.02, steps=50
+)
+print(
+    {name: f"± {error:.2g}" for name, error in plan.standard_errors.items()}
+)
 
 time = 0.02 * np.arange(len(plan.inputs))
 states = hj.rollout(cart, jnp.zeros(2), plan.inputs, 0.02)
-figure, (above, below) = plt.subplots(2, 1, figsize=(4.2, 2.8), layout="constrained", sharex=True)
+figure, (above, below) = plt.subplots(
+    2, 1, figsize=(4.2, 2.8), layout="constrained", sharex=True
+)
 above.step(time, plan.inputs[:, 0], color="#0072B2", where="post")
 above.set_ylabel("force [N]")
 below.plot(time, states[:, 0], color="#CC79A7")

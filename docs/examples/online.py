@@ -1,4 +1,4 @@
-"""Adapt while it runs: a filter finds that a mass doubled, sample by sample."""
+"""Adapt while it runs: a filter finds that a mass doubled."""
 
 import equinox as eqx
 import jax
@@ -18,25 +18,39 @@ class Cart(hj.AbstractVectorField):  # x = [place, speed], u = [force]
 
 dt, noise = 0.02, (0.002, 0.02)
 random = np.random.default_rng(0)
-force = np.repeat(random.choice([-2.0, 2.0], size=(30, 1)), 20, axis=0).astype("f4")
+force = np.repeat(
+    random.choice([-2.0, 2.0], size=(30, 1)), 20, axis=0
+).astype("f4")
 light, heavy = Cart(jnp.log(1.0)), Cart(jnp.log(2.0))
 first = hj.rollout(light, jnp.zeros(2), force[:300], dt)
-states = np.vstack([first, hj.rollout(heavy, first[-1], force[300:], dt)])  # it changes after 6 s
+# It changes after 6 s.
+states = np.vstack([first, hj.rollout(heavy, first[-1], force[300:], dt)])
 samples = (states + noise * random.normal(size=states.shape)).astype("f4")
 
 online = hj.OnlineAdaptation(light, dt=dt, noise=noise, prior=0.5)
-update, state, found = eqx.filter_jit(online.update), online.begin(jnp.zeros(2)), []
+update, state, found = (
+    eqx.filter_jit(online.update),
+    online.begin(jnp.zeros(2)),
+    [],
+)
 for x, u in zip(samples, force, strict=True):
     state = update(state, x, u)
     found.append(online.intervals(state)["log_mass"])
-value, low, high = (np.exp([getattr(one, name) for one in found]) for name in ("value", "low", "high"))
+value, low, high = (
+    np.exp([getattr(one, name) for one in found])
+    for name in ("value", "low", "high")
+)
 print(f"mass {value[299]:.2f} before, {value[-1]:.2f} kg after")
 
 time = dt * np.arange(len(samples))
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
-plt.step([0, 6, 12], [1, 2, 2], where="post", color="0.75", lw=5, label="true")
+plt.step(
+    [0, 6, 12], [1, 2, 2], where="post", color="0.75", lw=5, label="true"
+)
 plt.plot(time, value, color="#CC79A7", label="estimate")
-plt.fill_between(time, low, high, color="#CC79A7", alpha=0.25, lw=0, label="95 % interval")
+plt.fill_between(
+    time, low, high, color="#CC79A7", alpha=0.25, lw=0, label="95 % interval"
+)
 plt.xlabel("time [s]")
 plt.ylabel("mass [kg]")
 plt.ylim(0.5, 3)

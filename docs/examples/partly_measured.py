@@ -1,4 +1,4 @@
-"""Measure only the angle, with a gap: the rate, the start and the parameters are estimated."""
+"""Only the angle is measured, with a gap: estimate the rest."""
 
 import jax
 import jax.numpy as jnp
@@ -8,24 +8,33 @@ import numpy as np
 import hybrid_jax as hj
 
 
-class Pendulum(hj.AbstractVectorField):  # x = [angle, rate], u = [acceleration]
+class Pendulum(hj.AbstractVectorField):  # x = [angle, rate], u = [push]
     log_length: jax.Array
     damping: jax.Array
 
     def __call__(self, x, u):
-        return jnp.stack([x[1], u[0] - 9.81 / jnp.exp(self.log_length) * jnp.sin(x[0]) - self.damping * x[1]])
+        pull = 9.81 / jnp.exp(self.log_length) * jnp.sin(x[0])
+        return jnp.stack([x[1], u[0] - pull - self.damping * x[1]])
 
 
 def model(length, damping, spread):
     field = Pendulum(jnp.log(jnp.array(length)), jnp.array(damping))
-    return hj.StateSpaceModel(field, ("push",), {"angle": lambda x, u: x[0]}, start=(0.5, 0.0), spread=spread)
+    return hj.StateSpaceModel(
+        field,
+        ("push",),
+        {"angle": lambda x, u: x[0]},
+        start=(0.5, 0.0),
+        spread=spread,
+    )
 
 
 random = np.random.default_rng(0)
 push_times, times = np.arange(0, 10, 0.1), np.sort(random.uniform(0, 10, 150))
 push = 2 * random.normal(size=100)
 times[0] = 0.0
-empty = hj.Record.of("truth", push=(push_times, push), angle=(times, 0 * times))
+empty = hj.Record.of(
+    "truth", push=(push_times, push), angle=(times, 0 * times)
+)
 true = hj.simulate(model(0.8, 0.3, (0, 0)), empty, dt=0.01)[0]["angle"][:, 0]
 angle = true + 0.02 * random.normal(size=150)
 angle[(times > 4) & (times < 6)] = np.nan  # the sensor failed

@@ -1,4 +1,4 @@
-"""Predator and prey: growth and death are known to exist, and a network learns how the two meet."""
+"""Predator and prey: a network learns what happens when they meet."""
 
 import jax
 import jax.numpy as jnp
@@ -24,23 +24,33 @@ def meeting(x):
 true = lambda x, u: Growth(jnp.array(1.3), jnp.array(1.8))(x, u) + meeting(x)
 starts = np.array([[0.5, 1.0], [4.0, 1.0], [1.0, 3.0], [2.0, 0.5]], "f4")
 u = np.zeros((60, 0), "f4")
-recorded = [np.vstack([start, hj.rollout(true, start, u, 0.1)]) for start in starts]
-data = hj.trajectories.concatenate([windows_of(states, u, dt=0.1, steps=5) for states in recorded])
+recorded = [
+    np.vstack([start, hj.rollout(true, start, u, 0.1)]) for start in starts
+]
+data = hj.trajectories.concatenate(
+    [windows_of(states, u, dt=0.1, steps=5) for states in recorded]
+)
 
-network = hj.residual_network(2, 0, jax.random.key(0), hidden=10, norm="none", activation="tanh")
-model = hj.with_scaling(hj.Hybrid(Growth(jnp.array(1.0), jnp.array(1.0)), network), data)
+network = hj.residual_network(
+    2, 0, jax.random.key(0), hidden=10, norm="none", activation="tanh"
+)
+model = hj.with_scaling(
+    hj.Hybrid(Growth(jnp.array(1.0), jnp.array(1.0)), network), data
+)
 fitted = hj.fit_gauss_newton(model, data, max_steps=60).field
 
 time, long = 0.1 * np.arange(1, 201), np.zeros((200, 0), "f4")
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
 plt.axvspan(0, 6, color="0.93", label="length of the data")
-for i, (name, colour) in enumerate({"prey": "#009E73", "predators": "#D55E00"}.items()):
-    plt.plot(time, hj.rollout(true, starts[0], long, 0.1)[:, i], color="0.75", lw=5)
-    plt.plot(time, hj.rollout(fitted, starts[0], long, 0.1)[:, i], color=colour, label=f"{name}, model")
+exact, found = (hj.rollout(f, starts[0], long, 0.1) for f in (true, fitted))
+for i, colour in enumerate(("#009E73", "#D55E00")):
+    label = f"{('prey', 'predators')[i]}, model"
+    plt.plot(time, exact[:, i], color="0.75", lw=5)
+    plt.plot(time, found[:, i], color=colour, label=label)
 plt.xlabel("time")
 plt.ylabel("population (grey: true)")
 plt.legend(fontsize=7, ncols=3, loc="upper center")
 plt.ylim(top=9)
 plt.savefig("predator_prey.png", dpi=110)
-error = jnp.abs(hj.rollout(fitted, starts[0], long, 0.1) - hj.rollout(true, starts[0], long, 0.1)).max()
+error = jnp.abs(found - exact).max()
 print(f"largest error in {time[-1]:.0f} units of time: {error:.2g}")

@@ -1,4 +1,4 @@
-"""A quadrotor loses 15 % of one rotor's thrust: adaptation says which rotor, and how much."""
+"""A rotor loses 15 % of its thrust: which one, and how much?"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,12 +13,16 @@ controller, model = Controller(hj.IRIS), hj.rigid_body(hj.IRIS)
 share = jnp.array([1.0, 1.0, 0.85, 1.0])
 
 
-def damaged(x, u):  # thrust and torque grow with the square of a rotor's speed
+# Thrust and torque grow with the square of a rotor's speed.
+def damaged(x, u):
     return model(x, u * jnp.sqrt(share))
 
 
 reference = sample(figure_eight(top_speed=2.0), controller, duration=4.0)
-control, simulate = eqx.filter_jit(controller), eqx.filter_jit(lambda x, u: advance(damaged, x, u, controller.period))
+control, simulate = (
+    eqx.filter_jit(controller),
+    eqx.filter_jit(lambda x, u: advance(damaged, x, u, controller.period)),
+)
 plan, x = controller.begin(), reference[0]
 states, inputs = [x], []
 for i in range(400):
@@ -26,8 +30,12 @@ for i in range(400):
     x = simulate(x, u)
     states, inputs = [*states, x], [*inputs, u]
 
-noise = np.repeat([0.001, 0.002, 0.01, 0.01], [3, 4, 3, 3]) * np.random.default_rng(0).normal(size=(401, 13))
-windows = windows_of(np.array(states) + noise, np.array(inputs), dt=controller.period, steps=10)
+noise = np.repeat(
+    [0.001, 0.002, 0.01, 0.01], [3, 4, 3, 3]
+) * np.random.default_rng(0).normal(size=(401, 13))
+windows = windows_of(
+    np.array(states) + noise, np.array(inputs), dt=controller.period, steps=10
+)
 result = hj.adapt(model, windows)
 print(result.report())
 
@@ -36,7 +44,13 @@ plt.figure(figsize=(4.2, 2.8), layout="constrained")
 plt.bar(range(4), 100 * share, color="0.85", label="true")
 for i, one in enumerate(found):
     plt.plot([i, i], [100 * one.low, 100 * one.high], color="#CC79A7", lw=3)
-    plt.plot(i, 100 * one.value, "o", color="#CC79A7", label="" if i else "estimate, 95 % interval")
+    plt.plot(
+        i,
+        100 * one.value,
+        "o",
+        color="#CC79A7",
+        label="" if i else "estimate, 95 % interval",
+    )
 plt.xticks(range(4), [f"rotor {i}" for i in range(4)])
 plt.ylabel("thrust [% of nominal]")
 plt.ylim(70, 115)
