@@ -65,7 +65,7 @@ def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     # Colours of the models, then lines of the ways to train them.
     models, modes = (dict.fromkeys(key[i] for key in errors) for i in (0, 1))
     entries: dict[str, Artist] = {
-        label(model).replace("θ_p", r"$\theta_p$"): Line2D([], [], color=colour(model), linewidth=4) for model in models
+        plots.typeset(label(model)): Line2D([], [], color=colour(model), linewidth=4) for model in models
     }
     style = {"color": "0.2", "markersize": 4}
     entries |= {label(mode): Line2D([], [], ls=DASHES[mode], marker=MARKERS[mode], **style) for mode in modes}

@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -84,7 +85,7 @@ def legend_below(
         shown |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if title:
         figure.suptitle(title)
-    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=columns, title=meaning or None)
+    figure.legend(shown.values(), map(typeset, shown), loc="outside lower center", ncols=columns, title=meaning or None)
     return figure
 
 
@@ -133,7 +134,12 @@ def dots(axes: Axes, lines: Sequence[Line], largest: float = math.inf) -> None:
 def name_lines(axes: Axes, names: Sequence[str]) -> None:
     """Label a line for each name, the first on top, at y = 0, 1, …"""
     axes.set(ylim=(len(names) - 0.4, -0.6))
-    axes.set_yticks(range(len(names)), names)
+    axes.set_yticks(range(len(names)), [*map(typeset, names)])
+
+
+def typeset(text: str) -> str:
+    """Write the symbols of a label as mathematics."""
+    return re.sub(r"[θf]_[pd]", lambda found: f"${found[0].replace('θ', chr(92) + 'theta')}$", text)
 
 
 def note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[float, float], **style: Any) -> None:
