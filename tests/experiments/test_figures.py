@@ -95,7 +95,7 @@ def test_failed_methods_are_marked_at_the_edge_of_the_ranking():
     rows = spoilt(rows, "linear_residual", lambda row: 1e9 * row["test_mse"])
     axes = ranking(rows, "Ranking").axes[0]
     assert axes.get_xlim()[1] < 3.26e-3 * LARGEST_RATIO * 1.2
-    assert methods_of(axes)[-3:] == ["source + linear residual", "θ_d only", "last layer (ridge)"]
+    assert methods_of(axes)[-3:] == ["source + linear residual", "$\\theta_d$ only", "last layer (ridge)"]
     words = [text.get_text() for text in axes.texts]
     assert words == ["3 of 3 beyond, mean 5e+06", "2 of 3 not finite", "3 of 3 not finite"]
 
