@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from browser import BROWSER, visit
+from browser import BROWSER, PREFIX, visit
 from smoke import LEFT, ROOT, script
 
 PACKAGES = [
@@ -30,7 +30,7 @@ def site(tmp_path_factory):
         "--strict",
         "--site-dir",
         folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "HYBRID_JAX_EXECUTE": "false"},
+        env=os.environ | {"PYTHONPATH": str(ROOT), "HYBRID_JAX_EXECUTE": "false", "SITE_URL": f"http://host{PREFIX}"},
     )
     return folder
 
@@ -52,7 +52,7 @@ def test_pages_load_only_what_is_in_the_folder(site):
         loaded = [re.findall(r"\b(?:src|href)=\"?([^\" >]*)", tag) for tag in tags if 'rel="canonical"' not in tag]
         for target in (target.partition("#")[0] for found in loaded for target in found):
             # The page for lost visitors of a server has absolute paths.
-            place = site / target[1:] if target.startswith("/") else page.parent / target
+            place = site / target.removeprefix(PREFIX) if target.startswith("/") else page.parent / target
             assert target[:5] == "data:" or place.exists(), f"{page}: {target}"
 
 
@@ -64,6 +64,7 @@ MEASURE = """(page, window) => {
     tables: frames.filter(frame => frame.getBoundingClientRect().right > right + 1).length,
     formulas: [...page.querySelectorAll("math")].filter(each => each.getBoundingClientRect().height < 3).length,
     source: page.querySelectorAll(".arithmatex").length,
+    styles: [...page.styleSheets].filter(each => !each.cssRules.length).length,
     pictures: [...page.images].filter(each => each.complete && !each.naturalWidth).length,
   }
 }"""
@@ -74,7 +75,7 @@ MEASURE = """(page, window) => {
 def test_pages_fit_wide_and_narrow_screens_and_need_no_network(site, tmp_path):
     """Also under a path of a host that others share, where an address that leads nowhere shows 404.html."""
     pages = [str(page.relative_to(site)) for page in sorted(site.rglob("*.html"))]
-    found, said = visit(site, pages, [1400, 400], MEASURE, tmp_path)
-    assert len(found) == 2 * len(pages)
+    found, said = visit(site, [*pages, "no/such/page.html"], [1400, 400], MEASURE, tmp_path)
+    assert len(found) == 2 * len(pages) + 2
     assert [(page, width, own) for page, width, own in found if any(own.values())] == []
     assert said == []
