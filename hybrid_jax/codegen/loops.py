@@ -1,25 +1,39 @@
 """Loops over columns: the layout of their entries in arrays and tables, and statements that fill arrays."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hybrid_jax.codegen.nodes import (
-    Address,
-    Assign,
-    Element,
-    Entry,
-    Expression,
-    Loop,
-    Operation,
-    Statement,
-    Variable,
-    nested,
-)
-from hybrid_jax.codegen.tables import Tables
+from hybrid_jax.codegen.nodes import Address, Assign, Element, Entry, Expression, Loop, Operation, Statement, nested
 
 LOOPED = 8  # so many entries are copied by a loop
+
+
+@dataclass
+class Tables:
+    """Tables of numbers, and unused names, that the functions of one file share.
+
+    Attributes:
+        double: whether numbers are in double instead of single precision.
+        numbers: tables by name.
+    """
+
+    double: bool
+    numbers: dict[str, np.ndarray] = field(default_factory=dict)
+    _known: dict[bytes, str] = field(default_factory=dict)  # bytes of the numbers → name
+    _count: int = 0
+
+    def name(self, letter: str) -> str:
+        self._count += 1
+        return f"{letter}{self._count}"
+
+    def table(self, numbers: np.ndarray) -> str:
+        """Add a table, or reuse an equal one, and return its name."""
+        numbers = np.asarray(numbers, float if self.double else np.float32)
+        name = self._known.setdefault(numbers.tobytes(), f"c{len(self._known)}")
+        self.numbers[name] = numbers
+        return name
 
 
 def is_contiguous(entries: np.ndarray) -> bool:
@@ -30,12 +44,10 @@ def is_contiguous(entries: np.ndarray) -> bool:
     return places is not None and bool((np.diff(places) == 1).all())
 
 
-def address(tables: Tables, entries: np.ndarray, stride: int = 0) -> Address:
-    """Return the start of contiguous entries; in a loop with counter i0, each step advances by `stride`."""
+def address(tables: Tables, entries: np.ndarray) -> Address:
+    """Return the start of contiguous entries."""
     first = entries[0]
-    if isinstance(first, Entry):
-        return Address(first.name, first.index or 0, (stride,))
-    return Address(tables.table(entries.astype(float)), 0, (stride,))
+    return Address(first.name, first.index or 0) if isinstance(first, Entry) else Address(tables.table(entries))
 
 
 def indexed(tables: Tables, entries: np.ndarray, shape: tuple[int, ...]) -> Expression | None:
@@ -43,24 +55,19 @@ def indexed(tables: Tables, entries: np.ndarray, shape: tuple[int, ...]) -> Expr
     first = entries[0]
     if all(one == first for one in entries):
         return first
-    if all(isinstance(one, float) for one in entries):
-        return _in_table(tables, entries.astype(float).reshape(shape))
+    if all(isinstance(one, float) for one in entries):  # a table, with one entry along axes that do not matter
+        grid = entries.astype(float).reshape(shape)
+        kept = [bool((grid != grid.take([0], axis)).any()) for axis in range(grid.ndim)]
+        core = grid[tuple(slice(None) if keep else slice(0, 1) for keep in kept)]
+        strides = np.array(_strides(core.shape)) * kept
+        return Element(tables.table(core.ravel()), 0, tuple(strides.tolist()))
     if (places := _places(entries)) is None:
         return None
     grid = places.reshape(shape)
     corner = int(grid.flat[0])
     steps = [int(grid.take(1, axis).flat[0]) - corner if size > 1 else 0 for axis, size in enumerate(shape)]
-    if not (grid == corner + np.tensordot(steps, np.indices(shape), 1)).all():
-        return None
-    return Element(first.name, corner, tuple(steps))
-
-
-def _in_table(tables: Tables, grid: np.ndarray) -> Element:
-    """Store a constant in a table, with one entry along axes on which it does not depend."""
-    kept = [bool((grid != grid.take([0], axis)).any()) for axis in range(grid.ndim)]
-    core = grid[tuple(slice(None) if keep else slice(0, 1) for keep in kept)]
-    strides = tuple(stride if keep else 0 for stride, keep in zip(_strides(core.shape), kept, strict=True))
-    return Element(tables.table(core.ravel()), 0, strides)
+    linear = (grid == corner + np.tensordot(steps, np.indices(shape), 1)).all()
+    return Element(first.name, corner, tuple(steps)) if linear else None
 
 
 def _strides(shape: Sequence[int]) -> tuple[int, ...]:
@@ -69,10 +76,8 @@ def _strides(shape: Sequence[int]) -> tuple[int, ...]:
 
 def _places(entries: np.ndarray) -> np.ndarray | None:
     """Return the indices of entries of one array."""
-    first = entries[0]
-    if not isinstance(first, Entry) or first.index is None:
-        return None
-    if any(not isinstance(one, Entry) or one.name != first.name for one in entries):
+    name = entries[0].name if isinstance(entries[0], Entry) else None
+    if any(not isinstance(one, Entry) or one.name != name or one.index is None for one in entries):
         return None
     return np.array([one.index for one in entries])
 
@@ -85,20 +90,19 @@ def mapping(out: str, value: Expression, shape: tuple[int, ...]) -> Statement:
 def folding(out: str, name: str, operand: Expression, shape: tuple[int, int]) -> Statement:
     """Reduce the entries of each row by a binary operation."""
     first = replace(operand, steps=operand.steps[:1]) if isinstance(operand, Element) else operand
-    total = Entry("s")
-    inner = Loop(1, shape[1], (Assign(total, Operation(name, (total, operand))),), start=1)
-    return Loop(0, shape[0], (Variable("s", first, constant=False), inner, Assign(Element(out, 0, (1,)), total)))
+    total = Element(out, 0, (1,))
+    more = Loop("i1", shape[1], (Assign(total, Operation(name, (total, operand))),), start=1)
+    return nested(shape[:1], Assign(total, first), more)
 
 
 def stores(out: str, entries: np.ndarray, begin: int = 0) -> tuple[Statement, ...]:
     """Write entries into an array from `begin` on, with loops for equal numbers and runs of another array."""
-    statements, i = [], 0
+    statements, i = list[Statement](), 0
     while i < len(entries):
         first, (run, step) = entries[i], _run(entries[i:])
         if run >= LOOPED:
-            in_array = isinstance(first, Entry) and first.index is not None
-            source = Element(first.name, first.index or 0, (step,)) if in_array else first
-            statements.append(Loop(0, run, (Assign(Element(out, begin + i, (1,)), source),)))
+            source = Element(first.name, first.index, (step,)) if step else first
+            statements.append(nested((run,), Assign(Element(out, begin + i, (1,)), source)))
         else:
             run = 1
             statements.append(Assign(Entry(out, begin + i), first))
@@ -112,7 +116,6 @@ def _run(entries: np.ndarray) -> tuple[int, int]:
     if (places := _places(entries[:2])) is not None and len(places) > 1:
         step = int(places[1] - places[0])
     for count, one in enumerate(entries):
-        expected = replace(first, index=first.index + step * count) if step else first
-        if one != expected:
+        if one != (replace(first, index=first.index + step * count) if step else first):
             return count, step
     return len(entries), step

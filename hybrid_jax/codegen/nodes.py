@@ -1,22 +1,17 @@
-"""Generated code as values (expressions, statements and functions) that a printer writes in a language.
+"""Generated code as values (expressions and statements) that a printer writes in a language.
 
 An expression is a number (a float, a bool, or an int for a count), a `Reference` or an `Operation`, named as in JAX.
 Loop counters are numbered from the outermost: i0, i1, …
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property
 from typing import Any
 
 
 @dataclass(frozen=True)
-class Node:
-    """A piece of code, a frozen dataclass; its children are fields, or in tuples there."""
-
-
-@dataclass(frozen=True)
-class Reference(Node):
+class Reference:
     """A node with the name of a variable or an array."""
 
     name: str
@@ -44,16 +39,12 @@ class Element(Reference):
     steps: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class Address(Reference):
+class Address(Element):
     """The start of entries of an array, at an index like `Element`'s."""
 
-    corner: int = 0
-    steps: tuple[int, ...] = ()
-
 
 @dataclass(frozen=True)
-class Operation(Node):
+class Operation:
     """An operation of JAX on scalars."""
 
     name: str
@@ -64,17 +55,16 @@ Expression = float | bool | int | Reference | Operation
 
 
 @dataclass(frozen=True)
-class Variable(Node):
-    """Define a variable, which changes later only if it is not `constant`."""
+class Variable:
+    """Define a constant."""
 
     name: str
     value: Expression
     logical: bool = False
-    constant: bool = True
 
 
 @dataclass(frozen=True)
-class Array(Node):
+class Array:
     """Declare an uninitialised array."""
 
     name: str
@@ -83,49 +73,42 @@ class Array(Node):
 
 
 @dataclass(frozen=True)
-class Assign(Node):
+class Row:
+    """Name the row of a matrix, which begins at `start`, with so many numbers for each value of a counter."""
+
+    name: str
+    start: Address
+    size: int
+    counter: str
+    logical: bool = False
+    written: bool = False
+
+
+@dataclass(frozen=True)
+class Assign:
     target: Entry | Element
     value: Expression
 
 
 @dataclass(frozen=True)
-class Loop(Node):
+class Loop:
     """Repeat statements for each value of the counter from `start` to `stop` − 1."""
 
-    counter: int
+    counter: str
     stop: int
     body: tuple["Statement", ...]
     start: int = 0
 
 
 @dataclass(frozen=True)
-class Call(Node):
+class Call:
     """Call a function, which writes its results into some of its arguments."""
 
     function: str
     arguments: tuple[Expression, ...]
 
 
-Statement = Variable | Array | Assign | Loop | Call
-
-
-@dataclass(frozen=True)
-class Parameter(Node):
-    """A number argument of a function, or an array, which it may change if `written`."""
-
-    name: str
-    logical: bool = False
-    array: bool = False
-    written: bool = False
-
-
-@dataclass(frozen=True)
-class Function(Node):
-    """A function of the file without return value."""
-
-    name: str
-    parameters: tuple[Parameter, ...]
-    body: tuple[Statement, ...]
+Statement = Variable | Array | Row | Assign | Loop | Call
 
 
 @dataclass(frozen=True)
@@ -145,7 +128,7 @@ class Step:
 def walk(node: Any) -> Iterator[Any]:
     """Iterate over a node, or a tuple of nodes, and all its descendants."""
     yield node
-    for inside in node if isinstance(node, tuple) else vars(node).values() if isinstance(node, Node) else ():
+    for inside in node if isinstance(node, tuple) else vars(node).values() if is_dataclass(node) else ():
         yield from walk(inside)
 
 
@@ -158,48 +141,37 @@ def renamed(node: Any, others: Mapping[str, str]) -> Any:
     """Rename some variables and arrays in a node."""
     if isinstance(node, tuple):
         return tuple(renamed(one, others) for one in node)
-    if not isinstance(node, Node):
-        return node
     if isinstance(node, Reference):
         return replace(node, name=others.get(node.name, node.name))
-    return replace(node, **{key: renamed(one, others) for key, one in vars(node).items()})
+    if is_dataclass(node):
+        return replace(node, **{key: renamed(one, others) for key, one in vars(node).items()})  # type: ignore
+    return node
 
 
 def nested(shape: Sequence[int], *body: Statement) -> Statement:
     """Nest statements in a loop over each axis, of which there must be at least one."""
-    for counter, size in reversed(list(enumerate(shape))):
-        body = (Loop(counter, size, body),)
+    for axis, size in reversed(list(enumerate(shape))):
+        body = (Loop(f"i{axis}", size, body),)
     return body[0]
 
 
 def arranged(steps: Sequence[Step], results: frozenset[str], end: Sequence[Statement]) -> tuple[Statement, ...]:
-    """Assemble a function's body: the needed steps and the end. Arrays that are no longer read are reused."""
-    steps = _needed(steps, results)
-    last = {name: i for i, step in enumerate(steps) for name in step.uses}
-    arrays = {step.makes: step.array for step in steps if step.array}
-    places: dict[str, str] = {}
-    spare: list[Array] = []
-    body: list[Statement] = []
-    for i, step in enumerate(steps):
+    """Assemble a function's body: the steps that results need, and the end. Arrays no longer read are reused."""
+    kept, last = [], dict.fromkeys(results, len(steps))  # name → the step that uses it last
+    for i, step in reversed(list(enumerate(steps))):
+        if step.makes in last:
+            kept.append((i, step))
+            last |= {name: i for name in step.uses if name not in last}
+    places: dict[str, Array] = {}
+    spare, body = list[Array](), list[Statement]()
+    for i, step in reversed(kept):
         if (array := step.array) is not None:
             fitting = [one for one in spare if one.logical == array.logical and one.size >= array.size]
-            place = min(fitting, key=lambda one: one.size, default=array)
+            place = places[step.makes] = min(fitting, key=lambda one: one.size, default=array)
             if fitting:
                 spare.remove(place)
             else:
                 body.append(array)
-            places[step.makes] = place.name
-        body += renamed(step.code, places)
-        ended = (name for name in sorted(step.uses - results) if last[name] == i)
-        spare += [arrays[places[name]] for name in ended if name in arrays]
-    return *body, *renamed(tuple(end), places)
-
-
-def _needed(steps: Sequence[Step], results: frozenset[str]) -> list[Step]:
-    """Remove steps that the results do not need."""
-    kept, wanted = [], set(results)
-    for step in reversed(steps):
-        if step.makes in wanted:
-            kept.append(step)
-            wanted |= step.uses
-    return kept[::-1]
+        body += renamed(step.code, {name: one.name for name, one in places.items()})
+        spare += [places[name] for name in sorted(step.uses) if last[name] == i and name in places]
+    return *body, *renamed(tuple(end), {name: one.name for name, one in places.items()})

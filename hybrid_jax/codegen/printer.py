@@ -2,27 +2,70 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from hybrid_jax.codegen import nodes
-from hybrid_jax.codegen.helpers import HELPERS
+from hybrid_jax.codegen.loops import Tables
 from hybrid_jax.codegen.nodes import Address, Element, Entry, Operation
-from hybrid_jax.codegen.tables import Tables
 
-_SAME_NAME = (
-    *("floor", "ceil", "sqrt", "exp", "expm1", "log", "log1p", "erf", "erfc", "exp2", "cbrt", "atan2", "pow"),
-    *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
-)
-MATH: dict[str, str] = {**{name: name for name in _SAME_NAME}, "abs": "fabs", "rem": "fmod"}  # of math.h
-CALLED = {"max": "larger", "min": "smaller"}  # of HELPERS
-PREFIX = {"neg": "-", "not": "!", "convert_element_type": "(real)"}
-INFIX = {
+_INFIX = {
     **{"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&&", "or": "||"},
     **{"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="},
 }
-OPERATIONS = (*MATH, *CALLED, *PREFIX, *INFIX, "select_n")
+_MATH = (
+    *("floor", "ceil", "sqrt", "exp", "expm1", "log", "log1p", "erf", "erfc", "exp2", "cbrt"),
+    *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+)
+# Operation of JAX → C of its operands {0}, …, where {f} is the suffix of single precision in math.h.
+OPERATIONS = {
+    **{name: f"{{0}} {sign} {{1}}" for name, sign in _INFIX.items()},
+    **{name: f"{name}{{f}}({{0}})" for name in _MATH},
+    **{"abs": "fabs{f}({0})", "atan2": "atan2{f}({0}, {1})", "pow": "pow{f}({0}, {1})", "rem": "fmod{f}({0}, {1})"},
+    **{"max": "larger({0}, {1})", "min": "smaller({0}, {1})"},  # of HELPERS
+    **{"neg": "-{0}", "not": "!{0}", "convert_element_type": "(real){0}", "select_n": "{0} ? {2} : {1}"},
+    **{"square": "{0} * {0}", "rsqrt": "1 / sqrt{f}({0})", "logistic": "1 / (1 + exp{f}(-{0}))"},
+    "sign": "(real)(({0} > 0) - ({0} < 0))",
+}
+HELPERS = {
+    "larger": """\
+/* NaN, if one is NaN. */
+static real larger(real a, real b) { return a > b || a != a ? a : b; }
+""",
+    "smaller": """\
+/* NaN, if one is NaN. */
+static real smaller(real a, real b) { return a < b || a != a ? a : b; }
+""",
+    "product": """\
+/* out = A B, of m x k and k x n; four rows at a time, so that sums need not wait for each other. */
+static void product(const real *restrict a, const real *restrict b, real *restrict out, int m, int k, int n) {
+    for (int j = 0; j < n; ++j) {
+        const real *row = a;
+        int i = 0;
+        for (; i + 4 <= m; i += 4, row += 4 * k) {
+            real p = 0, q = 0, r = 0, s = 0;
+            for (int l = 0; l < k; ++l) {
+                const real v = b[l * n + j];
+                p += row[l] * v;
+                q += row[k + l] * v;
+                r += row[2 * k + l] * v;
+                s += row[3 * k + l] * v;
+            }
+            out[i * n + j] = p;
+            out[(i + 1) * n + j] = q;
+            out[(i + 2) * n + j] = r;
+            out[(i + 3) * n + j] = s;
+        }
+        for (; i < m; ++i, row += k) {
+            real p = 0;
+            for (int l = 0; l < k; ++l) { p += row[l] * b[l * n + j]; }
+            out[i * n + j] = p;
+        }
+    }
+}
+""",
+}
 
 
 @dataclass(frozen=True)
@@ -30,6 +73,7 @@ class CPrinter:
     """Prints nodes in double or single precision."""
 
     double: bool
+    operations: ClassVar[dict[str, str]] = OPERATIONS
 
     def number(self, value: float) -> str:
         """Print a number, in brackets if negative."""
@@ -49,69 +93,56 @@ class CPrinter:
                 return self.number(node)
             case Entry(name, index):
                 return name if index is None else f"{name}[{index}]"
-            case Element(name, corner, steps):
-                return f"{name}[{_place(corner, steps)}]"
             case Address(name, corner, steps):
                 return f"{name} + {_place(corner, steps)}" if corner or any(steps) else name
+            case Element(name, corner, steps):
+                return f"{name}[{_place(corner, steps)}]"
             case Operation(name, operands):
-                return self._operation(name, operands)
+                return self.operations[name].format(*map(self._operand, operands), f="" if self.double else "f")
         raise TypeError(f"{type(node).__name__} is not an expression")
-
-    def _operation(self, name: str, operands: Sequence[nodes.Expression]) -> str:
-        if name in MATH or name in CALLED:
-            function = CALLED[name] if name in CALLED else MATH[name] + ("" if self.double else "f")
-            return f"{function}({self._list(operands)})"
-        first, *others = map(self._operand, operands)
-        if name in PREFIX:
-            return f"{PREFIX[name]}{first}"
-        return f"{first} ? {others[1]} : {others[0]}" if name == "select_n" else f"{first} {INFIX[name]} {others[0]}"
 
     def _operand(self, node: nodes.Expression) -> str:
         text = self.expression(node)
-        closed = not isinstance(node, Operation) or node.name in MATH or node.name in CALLED
-        return text if closed else f"({text})"
-
-    def _list(self, expressions: Iterable[nodes.Expression]) -> str:
-        return ", ".join(map(self.expression, expressions))
+        return f"({text})" if isinstance(node, Operation) and not self.operations[node.name][0].isalpha() else text
 
     def statement(self, node: nodes.Statement) -> str:
-        """Print a statement on one line."""
         match node:
-            case nodes.Variable(name, value, logical, constant):
-                return f"{'const ' * constant}{_kind(logical)} {name} = {self.expression(value)};"
+            case nodes.Variable(name, value, logical):
+                return f"const {_kind(logical)} {name} = {self.expression(value)};"
             case nodes.Array(name, size, logical):
                 return f"{_kind(logical)} {name}[{size}];"
+            case nodes.Row(name, start, size, counter, logical, written):
+                kind = f"{'' if written else 'const '}{_kind(logical)}"
+                return f"{kind} *{name} = {self.expression(start)} + {size} * {counter};"
             case nodes.Assign(target, value):
                 return f"{self.expression(target)} = {self.expression(value)};"
             case nodes.Call(function, arguments):
-                return f"{function}({self._list(arguments)});"
-            case nodes.Loop(counter, stop, body, start):
-                i, inside = f"i{counter}", " ".join(map(self.statement, body))
-                alone = len(body) == 1 and isinstance(body[0], nodes.Loop)
-                return f"for (int {i} = {start}; {i} < {stop}; ++{i}) " + (inside if alone else f"{{ {inside} }}")
+                return f"{function}({', '.join(map(self.expression, arguments))});"
+            case nodes.Loop(i, stop, body, start):
+                inside = self.statement(body[0]) if len(body) == 1 else f"{{\n{self.body(body)}\n}}"
+                return f"for (int {i} = {start}; {i} < {stop}; ++{i}) {inside}"
 
     def body(self, statements: Iterable[nodes.Statement]) -> str:
-        return "\n".join(f"    {self.statement(one)}" for one in statements)
-
-    def function(self, node: nodes.Function) -> str:
-        parameters = ", ".join(map(_parameter, node.parameters))
-        return f"static void {node.name}({parameters}) {{\n{self.body(node.body)}\n}}\n"
+        return "\n".join(f"    {line}" for one in statements for line in self.statement(one).splitlines())
 
     def table(self, name: str, numbers: np.ndarray) -> str:
         rows = (", ".join(self.number(float(one)) for one in numbers[i : i + 8]) for i in range(0, len(numbers), 8))
         lines = ",\n    ".join(rows)
         return f"static const real {name}[{len(numbers)}] = {{\n    {lines}}};"
 
-    def shared(self, tables: Tables, *bodies: Sequence[nodes.Statement]) -> dict[str, str]:
-        """Print the tables and functions that bodies use, as parts of a template."""
-        code = (*tables.functions, *bodies)
-        read, every = nodes.names(code), list(nodes.walk(code))
-        called = {one.function for one in every if isinstance(one, nodes.Call)}
-        called |= {CALLED.get(one.name) for one in every if isinstance(one, Operation)}
-        helpers = [text for name, text in HELPERS.items() if name in called]
-        return {
-            "tables": "\n".join(self.table(name, numbers) for name, numbers in tables.numbers.items() if name in read),
-            "helpers": "\n".join([*helpers, *map(self.function, tables.functions)]),
+    def tables(self, tables: Tables, code: tuple) -> list[str]:
+        """Print the tables that code reads."""
+        read = nodes.names(code)
+        return [self.table(name, numbers) for name, numbers in tables.numbers.items() if name in read]
+
+    def parts(self, tables: Tables, **bodies: Sequence[nodes.Statement]) -> dict[str, str]:
+        """Print bodies, and the tables and functions that they use, as parts of a template."""
+        code = tuple(bodies.values())
+        used = {one.function for one in nodes.walk(code) if isinstance(one, nodes.Call)}
+        used |= {OPERATIONS[one.name].partition("(")[0] for one in nodes.walk(code) if isinstance(one, Operation)}
+        return {name: self.body(body) for name, body in bodies.items()} | {
+            "tables": "\n".join(self.tables(tables, code)),
+            "helpers": "\n".join(text for name, text in HELPERS.items() if name in used),
             "type": "double" if self.double else "float",
         }
 
@@ -123,10 +154,3 @@ def _kind(logical: bool) -> str:
 def _place(corner: int, steps: Sequence[int]) -> str:
     terms = [f"i{axis}" if step == 1 else f"{step} * i{axis}" for axis, step in enumerate(steps) if step]
     return " + ".join([*([str(corner)] if corner or not terms else []), *terms])
-
-
-def _parameter(one: nodes.Parameter) -> str:
-    kind = _kind(one.logical)
-    if not one.array:
-        return f"{kind} {one.name}"
-    return f"{kind} *{one.name}" if one.written else f"const {kind} *{one.name}"

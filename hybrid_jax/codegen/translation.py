@@ -5,7 +5,7 @@ in row-major order; each language defines its columns (`Translation`).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from functools import reduce
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -31,7 +31,7 @@ class Translation(ABC, Generic[Column]):
     """Operations of a program on the columns of a language."""
 
     language: ClassVar[str]
-    operations: ClassVar[dict[str, Callable]]  # entry by entry, name → from columns, and the exponent of integer_pow
+    operations: ClassVar[Container[str]]  # that are applied entry by entry
 
     @abstractmethod
     def known(self, array: np.ndarray) -> Column:
@@ -46,8 +46,8 @@ class Translation(ABC, Generic[Column]):
         """Select entries by index."""
 
     @abstractmethod
-    def entrywise(self, name: str, columns: Sequence[Column], shape: tuple[int, ...], parameters: tuple) -> Column:
-        """Apply an operation entrywise to columns of this shape, or of one entry."""
+    def entrywise(self, name: str, columns: Sequence[Column], shape: tuple[int, ...], exponent: int = 0) -> Column:
+        """Apply an operation, of which integer_pow has an exponent, to columns of this shape, or of one entry."""
 
     @abstractmethod
     def fold(self, name: str, rows: Sequence[Column]) -> Column:
@@ -85,19 +85,21 @@ class Translation(ABC, Generic[Column]):
             return self._run(inner.jaxpr if closed else inner, inner.consts if closed else (), inputs)
         if not any(isinstance(value, Entries) for value in inputs):
             return _evaluated(equation, inputs)
-        if name in self.operations:
-            return [Entries(self._entrywise(equation, inputs, shape), shape)]
         if name in MOVES:
             return self._moved(equation, inputs)
-        if name in LINEAR:
-            return [Entries(self._linear(equation, inputs), shape)]
-        if name in FOLDS:
-            return [Entries(self._folded(inputs[0], equation.params["axes"], name), shape)]
         if name == "scan":
             return self.scan(equation, inputs)
-        if name == "dot_general":
-            return [Entries(self._product(inputs[0], inputs[1], equation.params["dimension_numbers"]), shape)]
-        raise self._refusal(equation)
+        if name in self.operations:
+            made = self._entrywise(equation, inputs, shape)
+        elif name in LINEAR:
+            made = self._linear(equation, inputs)
+        elif name in FOLDS:
+            made = self._folded(inputs[0], equation.params["axes"], FOLDS[name])
+        elif name == "dot_general":
+            made = self._product(inputs[0], inputs[1], equation.params["dimension_numbers"])
+        else:
+            raise self._refusal(equation)
+        return [Entries(made, shape)]
 
     def _refusal(self, equation: JaxprEqn, why: str = "") -> ValueError:
         name = equation.primitive.name
@@ -114,8 +116,9 @@ class Translation(ABC, Generic[Column]):
             raise self._refusal(equation, f" of {len(inputs) - 1} cases")
         if name == "convert_element_type" and not jnp.issubdtype(equation.params["new_dtype"], jnp.floating):
             raise self._refusal(equation, f" to {equation.params['new_dtype']}")
-        parameters = (equation.params["y"],) if name == "integer_pow" else ()
-        return self.entrywise(name, [self._spread(value, shape) for value in inputs], shape, parameters)
+        return self.entrywise(
+            name, [self._spread(value, shape) for value in inputs], shape, equation.params.get("y", 0)
+        )
 
     def _spread(self, value: Value, shape: tuple[int, ...]) -> Column:
         """Broadcast a value to a shape as in NumPy; single entries stay single."""
@@ -127,7 +130,7 @@ class Translation(ABC, Generic[Column]):
     def _moved(self, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         """Translate operations that only move entries, by applying them to indices in JAX."""
         columns, sent, count = [], list(inputs), 0
-        for i in MOVES[equation.primitive.name](len(inputs)):
+        for i in range(len(inputs))[MOVES[equation.primitive.name]]:
             places = _places(inputs[i])
             columns.append(self._column(inputs[i]))
             sent[i] = (count + places).astype(float)  # of the type of the entries, which JAX checks
@@ -158,13 +161,13 @@ class Translation(ABC, Generic[Column]):
             return self.matrix_product(self.known(matrix.ravel()), self._column(inputs[i]), (*matrix.shape, 1))
 
         shape = tuple(equation.outvars[0].aval.shape)  # type: ignore
-        return reduce(lambda a, b: self.entrywise("add", (a, b), shape, ()), map(part, data))
+        return reduce(lambda a, b: self.entrywise("add", (a, b), shape), map(part, data))
 
     def _folded(self, value: Value, axes: Sequence[int], name: str) -> Column:
         places = np.moveaxis(_places(value), axes, range(len(axes)))
         rows = places.reshape(int(np.prod(places.shape[: len(axes)])), -1)
         column = self._column(value)
-        return self.fold(FOLDS[name], [self.take(column, row.tolist()) for row in rows])
+        return self.fold(name, [self.take(column, row.tolist()) for row in rows])
 
     def _product(self, left: Value, right: Value, dimension_numbers) -> Column:
         """dot_general: the result's axes are the batch axes, then the left's, then the right's."""
@@ -191,28 +194,20 @@ def _evaluated(equation: JaxprEqn, inputs: Sequence[Any]) -> list[Any]:
     return [np.asarray(one) for one in (found if equation.primitive.multiple_results else [found])]
 
 
-def _sliced(params, a: np.ndarray) -> np.ndarray:
-    strides = params["strides"] or (1,) * a.ndim
-    return a[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
-
-
 def _broadcast(params, a: np.ndarray) -> np.ndarray:
-    shape = params["shape"]
-    aligned = [1] * len(shape)
-    for axis, size in zip(params["broadcast_dimensions"], a.shape, strict=True):
-        aligned[axis] = size
-    return np.broadcast_to(a.reshape(aligned), shape)
+    added = [axis for axis in range(len(params["shape"])) if axis not in params["broadcast_dimensions"]]
+    return np.broadcast_to(np.expand_dims(a, added), params["shape"])
+
+
+def _sliced(params, a: np.ndarray) -> np.ndarray:
+    return a[tuple(map(slice, params["start_indices"], params["limit_indices"], params["strides"] or (1,) * a.ndim))]
 
 
 def _padded(params, a: np.ndarray, value: np.ndarray) -> np.ndarray:
     pads = params["padding_config"]
-    if any(low < 0 or high < 0 for low, high, _ in pads):
+    if any(low < 0 or high < 0 or inner for low, high, inner in pads):
         return np.asarray(jax.lax.pad(a, value, pads))
-    lengths = [size + inner * max(size - 1, 0) for (*_, inner), size in zip(pads, a.shape, strict=True)]
-    sizes = [low + length + high for (low, high, _), length in zip(pads, lengths, strict=True)]
-    made, places = np.full(sizes, value, np.result_type(a, value)), zip(pads, lengths, strict=True)
-    made[tuple(slice(low, low + length, inner + 1) for (low, _, inner), length in places)] = a
-    return made
+    return np.pad(a, [(low, high) for low, high, _ in pads], constant_values=value)
 
 
 _BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
@@ -233,16 +228,16 @@ def _places(value: Value) -> np.ndarray:
 
 # Operations that call another program. Custom derivatives are replaced by those of the language.
 CALLS = ("jit", "closed_call", "remat2", "custom_jvp_call", "custom_vjp_call")
-_ONE_OPERAND = (
+_OF_ONE = (
     *("reshape", "squeeze", "expand_dims", "transpose", "rev", "tile", "split", "unstack", "slice", "gather"),
     *("broadcast_in_dim", "dynamic_slice"),
 )
-# Name → from the number of inputs, the indices of those whose entries are moved.
-MOVES: dict[str, Callable[[int], Sequence[int]]] = {
-    **dict.fromkeys(_ONE_OPERAND, lambda count: (0,)),
-    **dict.fromkeys(("concatenate", "stack", "pad"), range),
-    "dynamic_update_slice": lambda count: (0, 1),
-    "scatter": lambda count: (0, 2),
+# Name → those of the inputs whose entries are moved.
+MOVES = {
+    **dict.fromkeys(_OF_ONE, slice(1)),
+    **dict.fromkeys(("concatenate", "stack", "pad"), slice(None)),
+    "dynamic_update_slice": slice(2),
+    "scatter": slice(0, None, 2),
 }
 LINEAR = {"scatter-add": (0, 2), "cumsum": (0,)}
 FOLDS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}

@@ -63,8 +63,8 @@ class CasadiTranslation(Translation[Column]):
     def take(self, column, places):
         return column[list(places), 0]
 
-    def entrywise(self, name, columns, shape, parameters):
-        return OPERATIONS[name](*columns, *parameters)
+    def entrywise(self, name, columns, shape, exponent=0):
+        return columns[0] ** exponent if name == "integer_pow" else OPERATIONS[name](*columns)
 
     def fold(self, name, rows):
         return reduce(OPERATIONS[name], rows)

@@ -52,17 +52,13 @@ class Kernel:
     def apart(self, weights: Array) -> list[Array]:
         """Split the weights into arrays."""
         shapes = self.forward.shapes
-        parts = jnp.split(weights, np.cumsum([one.size for one in shapes])[:-1]) if shapes else []
+        parts = jnp.split(weights, self.forward.places()[1:]) if shapes else []
         return [part.reshape(one.shape) for part, one in zip(parts, shapes, strict=True)]
 
     def back_weights(self, weights: Array) -> Array:
         """Compute the weights of the backward pass."""
         assert self.back is not None
         return _joined(self.back, self.apart(weights))
-
-    def evaluate(self, weights: Array, x: Array, u: Array, n: Array) -> list[Array]:
-        """ẋ, z, W, γ and β, of one sample."""
-        return jaxpr_as_fun(self.forward.program)(*self.apart(weights), x, u, n)
 
 
 def _joined(apart: Split, arrays: Sequence[Array]) -> Array:
@@ -75,48 +71,58 @@ def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
     arrays, rest = eqx.partition(field, _is_array)
     shapes, structure = jax.tree.flatten(jax.tree.map(lambda leaf: Shape(jnp.shape(leaf), leaf.dtype), arrays))
     static, frame = jax.tree.flatten(rest)
+    key = tuple((*one.shape, str(one.dtype)) for one in shapes), structure, tuple(static), frame, d, m
     try:
-        key = tuple((*one.shape, str(one.dtype)) for one in shapes), structure, tuple(static), frame, d, m
         if (*key, training) not in _KNOWN:
+            _KNOWN[*key, training] = None  # unless what follows succeeds: GCC is not asked twice
             whole, both = eqx.combine(jax.tree.unflatten(structure, shapes), rest), _KNOWN.get((*key, True))
             _check_methods(whole, "train_batch" if training else "infer_batch")
             if both is None or both.sizes.units:  # or predictions are a part of training
                 with jax.ensure_compile_time_eval():  # this may be inside of a program that JAX traces
                     both = _made(whole, Sizes(d, m), training)
             _KNOWN[*key, training] = both
+        return _KNOWN[*key, training]
     except Exception as error:  # a user's code may raise anything
         known = isinstance(error, ValueError | library.Unusable)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
         REFUSED[_name(field)] = reason.removeprefix("field: ").partition("\n")[0]
         return None
-    return _KNOWN[*key, training]
 
 
-_KNOWN: dict[Any, Kernel] = {}
+_KNOWN: dict[Any, Kernel | None] = {}
 
 
 def _name(field: Any) -> str:
     """Name the class of a field with its modules' classes, or a function."""
-    modules = [part for part in vars(field).values() if isinstance(part, eqx.Module)] if _is_module(field) else []
+    parts = vars(field).values() if isinstance(field, eqx.Module) else ()
+    modules = ", ".join(_name(part) for part in parts if isinstance(part, eqx.Module))
     own = getattr(field, "__qualname__", type(field).__name__)
-    return f"{own}({', '.join(map(_name, modules))})" if modules else own
-
-
-def _is_module(node: Any) -> bool:
-    return isinstance(node, eqx.Module)
+    return f"{own}({modules})" if modules else own
 
 
 def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
     """Make the kernel of a field whose arrays are replaced by shapes."""
     shapes, structure = jax.tree.flatten(eqx.filter(field, _is_shape))
-    rest, norm = eqx.filter(field, _is_shape, inverse=True), _norm_of(field) if training else None
-    epsilon, units = (norm.epsilon, norm.gain.size) if norm else (0.0, 0)
+    rest, norms = eqx.filter(field, _is_shape, inverse=True), batch_norms(field) if training else []
+    if len(norms) > 1 or not all(isinstance(norm, BatchNorm) for norm in norms):
+        raise ValueError("it has more than one batch normalisation, or another than BatchNorm")
+    epsilon, units = (norms[0].epsilon, norms[0].gain.size) if norms else (0.0, 0)  # pyright: ignore[reportAttributeAccessIssue]
     of_sample = [Shape((size,), jnp.float32) for size in (sizes.d, sizes.m, units)]
 
     def evaluate(*arrays):
-        whole = eqx.combine(jax.tree.unflatten(structure, arrays[:-3]), rest)
-        x, u, n = arrays[-3:]
-        return _apart(whole, x, u, n) if norm else [whole(x, u), n, jnp.zeros((0, 0), n.dtype), n, n]
+        """ẋ with a given result n of batch normalisation, and its inputs z, W, γ and β."""
+        *arrays, x, u, n = arrays
+        whole = eqx.combine(jax.tree.unflatten(structure, arrays), rest)
+        if not norms:
+            return [whole(x, u), n, jnp.zeros((0, 0), n.dtype), n, n]
+        norm, read = batch_norms(whole)[0], []
+        given = _Given(norm, n, read.append)
+        slope = jax.tree.map(lambda node: given if node is norm else node, whole, is_leaf=lambda node: node is norm)(
+            x, u
+        )
+        if len(read) != 1:
+            raise ValueError(f"its batch normalisation is evaluated {len(read)} times")
+        return [slope, *read[0]]
 
     forward = split(traced(evaluate, *shapes, *of_sample), len(shapes))
     slope, read, weight, *_ = forward.program.out_avals
@@ -131,40 +137,19 @@ def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
     sizes, source = sizes._replace(reads=read.size, units=units), Source(forward, of_sample, training)
     constants = dict(zip("DMZH", sizes, strict=True)) | {"P": count}
     constants |= {name: forward.place(i) for i, name in enumerate(("WEIGHT", "GAIN", "SHIFT"), start=2)}
-    prefix = library.compiled(source.text(constants), source.needs_math())
-    return Kernel(prefix, sizes, forward, source.back, epsilon)
-
-
-def _norm_of(field: PyTree) -> BatchNorm | None:
-    norms = batch_norms(field)
-    if len(norms) > 1 or not all(isinstance(norm, BatchNorm) for norm in norms):
-        raise ValueError("it has more than one batch normalisation, or another than BatchNorm")
-    return norms[0] if norms else None  # pyright: ignore[reportReturnType]
+    return Kernel(library.compiled(source.text(constants)), sizes, forward, source.back, epsilon)
 
 
 class _Given(AbstractNorm):
-    """Replaces batch normalisation: records its arguments and returns a given result."""
+    """Replaces batch normalisation: passes its arguments on and returns a given result."""
 
-    norm: BatchNorm
+    norm: Any
     normal: Array
     tell: Any = eqx.field(static=True)
 
     def infer(self, weight, z):
         self.tell([z, weight, self.norm.gain, self.norm.shift])
         return self.normal
-
-
-def _apart(field: PyTree, x: Array, u: Array, n: Array) -> list[Array]:
-    """Compute ẋ with a given result n of batch normalisation, and its inputs z, W, γ and β."""
-    read: list[list[Array]] = []
-    norm = _norm_of(field)
-    assert norm is not None
-    given = _Given(norm, n, read.append)
-    whole = jax.tree.map(lambda node: given if node is norm else node, field, is_leaf=lambda node: node is norm)
-    slope = whole(x, u)
-    if len(read) != 1:
-        raise ValueError(f"its batch normalisation is evaluated {len(read)} times")
-    return [slope, *read[0]]
 
 
 def _check_methods(node: Any, method: str) -> None:

@@ -1,14 +1,13 @@
-"""Compile C++ with GCC for XLA at first use, cache it in the user's folder, verify it and load it.
+"""Compile C++ with GCC for XLA at first use, keep it in the user's cache folder, verify it and load it.
 
-GCC runs while XLA compiles the caller, and the first call waits for it, so results do not depend on timing. Because the
-cache contains code, its folder must belong to the user, and a library whose checksum is wrong is recompiled.
+The caller waits: GCC takes about a second, less than XLA saves where a kernel replaces its program. Because the cache
+contains code, its folder must belong to the user, and a library whose checksum is wrong is recompiled.
 HYBRID_JAX_NATIVE=0 disables kernels; `obstacle` reports other reasons.
 """
 
 import contextlib
 import ctypes
 import hashlib
-import itertools
 import os
 import shutil
 import stat
@@ -16,21 +15,18 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
 import jax
-import numpy as np
 import platformdirs
 
 from hybrid_jax import runtime
 
 SWITCH = "HYBRID_JAX_NATIVE"
 SOURCES = Path(__file__).parent / "cpp"
-HANDLERS = "forward", "backward"
 # Errors and exceptions of the square root are not asked for: without them several are taken at once.
-OPTIONS = ["-std=c++17", "-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
+OPTIONS = ["-std=c++17", "-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w", "-shared"]
 LONGEST = 300  # s to compile
 CHECKSUM = 32  # bytes
 # Runs a command; once standard input is closed, ends it with all that it began, and deletes the folder $0.
@@ -42,8 +38,6 @@ code=$?
 kill $!
 exit $code
 """
-
-Results = jax.ShapeDtypeStruct | Sequence[jax.ShapeDtypeStruct]
 _LOCK = threading.Lock()  # programs are traced in several threads
 
 
@@ -54,104 +48,50 @@ class Unusable(Exception):
 @cache
 def obstacle() -> str | None:
     """Return why kernels are unavailable in this process, or None."""
+    if os.environ.get(SWITCH) == "0":
+        return f"{SWITCH} is 0"
+    if jax.default_backend() != "cpu":
+        return f"arrays are on a {jax.default_backend()}"
+    if not {"avx2", "fma"} <= set(runtime.machine()[-1].split()):
+        return "the processor has no AVX2"
+    if not _compiler():
+        return "there is no g++"
     try:
-        _check_machine()
         _folder()
-    except Unusable as reason:
-        return str(reason)
-    except OSError as error:
-        return f"they could not be kept: {error}"
+    except (OSError, Unusable) as error:
+        return str(error) if isinstance(error, Unusable) else f"they could not be kept: {error}"
     return None
 
 
-def compiled(source: str, needs_math: bool) -> str:
+def compiled(source: str) -> str:
     """Compile and register a source; return the prefix of its XLA targets, or raise Unusable."""
     with _LOCK:
-        return _registered(source, needs_math)
+        return _registered(source)
 
 
-def call(handler: str, results: Results, *arrays, numbers: Sequence[float] = ()):
-    """Call a kernel on arrays, whose number, type and shapes are not checked, and constants; `vmap` makes one call."""
-    kernel = jax.ffi.ffi_call(handler, results, vmap_method="broadcast_all")
-    return kernel(*arrays, numbers=np.array(numbers, np.float32))
-
-
-def with_derivative(kernel: Callable, plain: Callable) -> Callable:
-    """Wrap a kernel so that its second derivative uses plain JAX."""
-    function = jax.custom_jvp(kernel)
-    function.defjvp(lambda arrays, tangents: jax.jvp(plain, arrays, tangents))
-    return function
-
-
-def _check_machine() -> None:
-    if os.environ.get(SWITCH) == "0":
-        raise Unusable(f"{SWITCH} is 0")
-    if jax.default_backend() != "cpu":
-        raise Unusable(f"arrays are on a {jax.default_backend()}")
-    if not {"avx2", "fma"} <= set(runtime.machine()[-1].split()):
-        raise Unusable("the processor has no AVX2")
-    if not _compiler():
-        raise Unusable("there is no g++")
+@cache
+def _registered(source: str) -> str:
+    begin = f"hybrid_jax_{_digest(source)}_"
+    try:
+        library = ctypes.CDLL(str(_checked_library(source)))
+        for handler in ("forward", "backward")[: 1 + source.count("#define TRAINING 1")]:
+            target = jax.ffi.pycapsule(ctypes.cast(library[handler], ctypes.c_void_p).value)
+            jax.ffi.register_ffi_target(begin + handler, target, platform="cpu")
+    except (OSError, AttributeError) as error:
+        raise Unusable(f"its library could not be kept, or not be loaded: {error}") from error
+    return begin
 
 
 def _compiler() -> str | None:
     return shutil.which(os.environ.get("CXX") or "g++")
 
 
-@cache
-def _registered(source: str, needs_math: bool) -> str:
-    """Register the library if it exists, else placeholders that wait for its compilation."""
-    begin = f"hybrid_jax_{_digest(source)}_"
-    handlers = HANDLERS if "#define TRAINING 1" in source else HANDLERS[:1]
-    try:
-        doors, places = _doors(), [next(_PLACES) for _ in handlers]
-        whole = _is_whole(_folder() / f"{_digest(source)}.so") or not doors.door_at(places[-1])
-        found = _addresses(source, needs_math, handlers) if whole else [doors.door_at(place) for place in places]
-    except OSError as error:
-        raise Unusable(f"they could not be kept, or not be loaded: {error}") from error
-    for handler, address in zip(handlers, found, strict=True):
-        jax.ffi.register_ffi_target(begin + handler, jax.ffi.pycapsule(address), platform="cpu")
-    if not whole:
-        threading.Thread(target=_open, args=(doors, places, source, needs_math, handlers), daemon=True).start()
-    return begin
-
-
-def _open(doors: ctypes.CDLL, places: Sequence[int], source: str, needs_math: bool, handlers: Sequence[str]) -> None:
-    behind = (ctypes.c_void_p * (places[-1] + 1)).in_dll(doors, "behind")
-    try:
-        found = _addresses(source, needs_math, handlers)
-    except (OSError, Unusable):  # then whoever waits must not wait on
-        found = [ctypes.cast(doors.refuse, ctypes.c_void_p).value for _ in handlers]
-    for place, address in zip(places, found, strict=True):
-        behind[place] = address
-
-
-def _addresses(source: str, needs_math: bool, handlers: Sequence[str]) -> list[int | None]:
-    library = ctypes.CDLL(str(_checked_library(_digest(source), source, needs_math)))
-    return [ctypes.cast(getattr(library, one), ctypes.c_void_p).value for one in handlers]
-
-
-@cache
-def _doors() -> ctypes.CDLL:
-    source = (SOURCES / "doors.cc").read_text()
-    doors = ctypes.CDLL(str(_checked_library(_digest(source), source, needs_math=False)))
-    doors.door_at.restype = ctypes.c_void_p
-    return doors
-
-
-_PLACES = itertools.count()
-
-
 def _digest(source: str) -> str:
-    return hashlib.sha256((source + _made_by()).encode()).hexdigest()[:16]
-
-
-@cache
-def _made_by() -> str:
-    """Describe what a library depends on besides its source."""
+    """Identify a source, the compiler and the machine."""
     compiler = Path(_compiler() or "").resolve()
+    parts = [source, *(path.read_text() for path in sorted(SOURCES.iterdir()))]
     made_by = compiler, compiler.stat().st_mtime_ns, OPTIONS, jax.__version__, runtime.machine()[-2:]
-    return "".join(path.read_text() for path in sorted(SOURCES.iterdir())) + repr(made_by)
+    return hashlib.sha256("".join([*parts, repr(made_by)]).encode()).hexdigest()[:16]
 
 
 def _folder() -> Path:
@@ -166,11 +106,11 @@ def _folder() -> Path:
     return folder
 
 
-def _checked_library(digest: str, source: str, needs_math: bool) -> Path:
+def _checked_library(source: str) -> Path:
     """Return the library's file, compiled if it is missing or corrupt."""
-    library = _folder() / f"{digest}.so"
+    library = _folder() / f"{_digest(source)}.so"
     if not _is_whole(library):
-        _compile(library, source, needs_math)
+        _compile(library, source)
     library.touch()  # it was used
     return library
 
@@ -181,12 +121,11 @@ def _is_whole(library: Path) -> bool:
     return content[-CHECKSUM:] == hashlib.sha256(content[:-CHECKSUM]).digest()
 
 
-def _compile(library: Path, source: str, needs_math: bool) -> None:
+def _compile(library: Path, source: str) -> None:
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        (text := Path(folder) / "field.cc").write_text(source)
-        include = [f"-I{jax.ffi.include_dir()}", f"-I{SOURCES}"]
-        linked = Path(folder) / library.name
-        _run_compiler(["-shared", *include, str(text), *["-lmvec"] * needs_math, "-o", str(linked)])
+        linked, text = Path(folder) / library.name, Path(folder) / "field.cc"
+        text.write_text(source)
+        _run_compiler([f"-I{jax.ffi.include_dir()}", f"-I{SOURCES}", str(text), "-lmvec", "-o", str(linked)])
         with linked.open("r+b") as file:
             file.write(hashlib.sha256(file.read()).digest())
             file.flush()

@@ -1,5 +1,6 @@
 """Rollouts of many windows by a field's kernel: one call for all intervals, and one for the derivative."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -7,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, Float
 
 from hybrid_jax.integrate import RK4, Solver, integrate
@@ -60,7 +62,8 @@ def _plain(kernel_and_dt: tuple[Kernel, float], weights: Array, x0: Array, u: Ar
     kernel, dt = kernel_and_dt
 
     def evaluate(x, u, n):
-        return jax.vmap(partial(kernel.evaluate, weights), in_axes=-1, out_axes=-1)(x, u, n)
+        one = partial(jaxpr_as_fun(kernel.forward.program), *kernel.apart(weights))
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(x, u, n)
 
     def field(x, u):
         n = jnp.zeros((kernel.sizes.units, x.shape[1]), x.dtype)
@@ -79,13 +82,23 @@ def _called(kernel_and_dt: tuple[Kernel, float], kept: int, *arrays: Array) -> l
     (kernel, dt), x0, u = kernel_and_dt, *arrays[-2:]
     results = [jax.ShapeDtypeStruct(shape, x0.dtype) for shape in ((len(u), *x0.shape), (kept,))]
 
-    def call(*arrays):
-        return library.call(kernel.prefix + "forward", results, *arrays, numbers=[dt, kernel.epsilon])
-
     def plain(*arrays):
         return [_plain(kernel_and_dt, *arrays), jnp.zeros(kept, x0.dtype)]
 
-    return library.with_derivative(call, plain)(*arrays)
+    return _call((kernel.prefix + "forward", results, dt, kernel.epsilon), plain, *arrays)
+
+
+def _call(kernel: tuple, plain: Callable, *arrays: Array) -> Any:
+    """Call a kernel on arrays, which it does not check; it is differentiated as `plain`, and `vmap` makes one call."""
+    target, results, *numbers = kernel
+
+    @jax.custom_jvp
+    def call(*arrays):
+        kernel = jax.ffi.ffi_call(target, results, vmap_method="broadcast_all")
+        return kernel(*arrays, numbers=np.array(numbers, np.float32))
+
+    call.defjvp(lambda arrays, tangents: jax.jvp(plain, arrays, tangents))
+    return call(*arrays)
 
 
 def _forward(kernel_and_dt: tuple[Kernel, float], *arrays: Array):
@@ -105,16 +118,13 @@ def _backward(kernel_and_dt: tuple[Kernel, float], saved: tuple[Array, ...], d_s
     kernel, dt = kernel_and_dt
     results = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in saved[:-1]]
 
-    def call(*arrays):
-        back = kernel.back_weights(arrays[0])
-        whole = *arrays[:-2], back, *arrays[-2:]
-        return tuple(library.call(kernel.prefix + "backward", results, *whole, numbers=[dt, kernel.epsilon]))
-
     def plain(*arrays):
-        *arrays, _, d_states = arrays
+        *arrays, _, _, d_states = arrays
         return jax.vjp(partial(_plain, kernel_and_dt), *arrays)[1](d_states)
 
-    return library.with_derivative(call, plain)(*saved, d_states)
+    *given, kept = saved
+    given += [kernel.back_weights(given[0]), kept, d_states]
+    return tuple(_call((kernel.prefix + "backward", results, dt, kernel.epsilon), plain, *given))
 
 
 _rollout.defvjp(_forward, _backward)

@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
-INLINED = ("jit", "closed_call", "core_call", "remat2")  # a derivative of its own is needed, so such calls stay
 Shape = jax.ShapeDtypeStruct
 Products = dict[int, list[tuple[int, int]]]  # output → rows and columns of each product in its sum
 _NAMELESS = jax.make_jaxpr(lambda: ())().jaxpr.debug_info
@@ -19,51 +19,34 @@ class Split(NamedTuple):
     program: ClosedJaxpr
     shapes: list[Any]  # of the weights
 
+    def places(self) -> list[int]:
+        """Return where each weight begins in the concatenation of all."""
+        return np.cumsum([0, *(one.size for one in self.shapes)])[:-1].tolist()
+
     def place(self, output: int) -> int:
-        """Return an output's offset among all weights, 0 if it is empty; raise ValueError if it is not a weight."""
+        """Return where an output begins among all weights, 0 if it is empty; ValueError if it is not a weight."""
         found, weights = self.program.jaxpr.outvars[output], self.program.jaxpr.invars[: len(self.shapes)]
         if not found.aval.size:  # pyright: ignore[reportAttributeAccessIssue]
             return 0
         if found not in weights:
             raise ValueError("the weights before its batch normalisation are not learned")
-        return sum(one.size for one in self.shapes[: weights.index(found)])  # pyright: ignore[reportArgumentType]
+        return self.places()[weights.index(found)]  # pyright: ignore[reportArgumentType]
 
 
 def traced(function: Callable, *shapes: Any) -> ClosedJaxpr:
     """Trace a function of arrays and inline its calls."""
-    program = jax.make_jaxpr(function)(*shapes)
-    return jax.make_jaxpr(lambda *arrays: _evaluated(program.jaxpr, program.consts, arrays))(*shapes)
-
-
-def _evaluated(program: Jaxpr, constants: Sequence[Any], arrays: Sequence[Any]) -> list[Any]:
-    values: dict[Any, Any] = dict(zip([*program.constvars, *program.invars], [*constants, *arrays], strict=True))
-
-    def read(atom):
-        return atom.val if isinstance(atom, Literal) else values[atom]
-
-    for equation in program.eqns:
-        given = {one: values[one] for one in _variables(equation.invars)}
-        if equation.primitive.name in INLINED:
-            inner = equation.params["jaxpr"]
-            closed = isinstance(inner, ClosedJaxpr)
-            every = [read(atom) for atom in equation.invars]
-            found = _evaluated(inner.jaxpr if closed else inner, inner.consts if closed else (), every)
-        else:
-            alone = Jaxpr((), list(given), equation.outvars, [equation], debug_info=_NAMELESS)
-            found = jaxpr_as_fun(ClosedJaxpr(alone, ()))(*given.values())
-        values.update(zip(equation.outvars, found, strict=True))
-    return [read(atom) for atom in program.outvars]
-
-
-def _variables(atoms: Sequence[Any]) -> list[Var]:
-    return [one for one in atoms if not isinstance(one, Literal)]
+    with jax.disable_jit():
+        return jax.make_jaxpr(function)(*shapes)
 
 
 def outputs_of(program: ClosedJaxpr, outputs: Sequence[Any]) -> ClosedJaxpr:
     """Reduce a program to these outputs, given as values or indices."""
-    jaxpr = program.jaxpr
-    outs = [jaxpr.outvars[one] if isinstance(one, int) else one for one in outputs]
-    return _program(jaxpr.eqns, jaxpr.invars, outs, program)
+    outs = [program.jaxpr.outvars[one] if isinstance(one, int) else one for one in outputs]
+    return _program(program.jaxpr.eqns, program.jaxpr.invars, outs, program)
+
+
+def _variables(atoms: Sequence[Any]) -> list[Var]:
+    return [one for one in atoms if not isinstance(one, Literal)]
 
 
 def _program(equations: Sequence[JaxprEqn], inputs: Sequence[Var], outputs: Sequence[Any], of: ClosedJaxpr):
@@ -77,7 +60,10 @@ def _program(equations: Sequence[JaxprEqn], inputs: Sequence[Var], outputs: Sequ
 
 
 def split(program: ClosedJaxpr, parameters: int) -> Split:
-    """Split a program whose first `parameters` inputs are parameters; the others are samples."""
+    """Split a program whose first `parameters` inputs are parameters; the others are samples.
+
+    What parameters make of other types, as a comparison, belongs to the samples: weights are in single precision.
+    """
     inputs, outputs = program.jaxpr.invars, program.jaxpr.outvars
     constant, known = set(program.jaxpr.constvars), set(inputs[:parameters])
     ahead, after, wanted = [], [], []
@@ -85,14 +71,14 @@ def split(program: ClosedJaxpr, parameters: int) -> Split:
         read = set(_variables(equation.invars))
         if read <= constant:
             constant |= set(equation.outvars)
-        elif read <= constant | known:
+            after.append(equation)
+        elif read <= constant | known and all(out.aval.dtype.kind == "f" for out in equation.outvars):  # type: ignore
             known |= set(equation.outvars)
         else:
             wanted += [one for one in _variables(equation.invars) if one in known]
             after.append(equation)
             continue
         ahead.append(equation)
-        after += [equation] if read <= constant else []
     frontier = list(dict.fromkeys([*wanted, *(one for one in _variables(outputs) if one in known)]))
     weights = _program(ahead, inputs[:parameters], frontier, program)
     samples = _program(after, [*frontier, *inputs[parameters:]], outputs, program)

@@ -1,11 +1,9 @@
 """A library of kernels is kept as long as somebody uses it, and only one that is whole and one's own is loaded."""
 
 import hashlib
-import itertools
 import os
 import subprocess
 import sys
-import threading
 import time
 
 import jax
@@ -15,7 +13,6 @@ import pytest
 
 from benchmarks.subjects import DT, untrained
 from hybrid_jax import kernels, runtime
-from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.kernels import fields, library
 from hybrid_jax.rollouts import predict
@@ -31,13 +28,11 @@ def anew():
     fields._KNOWN.clear()
     library.obstacle.cache_clear()
     library._registered.cache_clear()
-    library._doors.cache_clear()
     yield
     fields._KNOWN.clear()
     fields.REFUSED.clear()
     library.obstacle.cache_clear()
     library._registered.cache_clear()
-    library._doors.cache_clear()
 
 
 @pytest.fixture
@@ -56,7 +51,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def checked():
-    return library._checked_library("0123", "int source;", needs_math=False)
+    return library._checked_library("int source;")
 
 
 def test_a_library_is_compiled_once_and_whole_beside_its_checksum(cache):
@@ -75,7 +70,7 @@ def test_a_killed_process_leaves_no_compiler_and_no_file(tmp_path):
     os.mkfifo(alive)
     compiler.write_text(f"#!/bin/sh\nexec 9>{alive}\ntouch $TMPDIR/part\nsleep 40\n")  # sleep is a child, as cc1plus
     compiler.chmod(0o700)
-    code = "from hybrid_jax.kernels import library; library._checked_library('0123', 'int source;', False)"
+    code = "from hybrid_jax.kernels import library; library._checked_library('int source;')"
     environment = os.environ | {"CXX": str(compiler), "XDG_CACHE_HOME": str(tmp_path)}
     process = subprocess.Popen([sys.executable, "-c", code], env=environment)
     with alive.open() as held:  # once the compiler runs
@@ -138,6 +133,22 @@ def open_folder(tmp_path, monkeypatch):
     (tmp_path / "hybrid_jax" / "kernels").chmod(0o777)
 
 
+def compiler_that(does):
+    """A change that puts a compiler in the place of g++; "$last" is the file that it should write."""
+
+    def change(tmp_path, monkeypatch):
+        compiler = tmp_path / "compiler"
+        compiler.write_text(f"#!/bin/sh\nfor last; do true; done\n{does}\n")
+        compiler.chmod(0o700)
+        monkeypatch.setenv("CXX", str(compiler))
+
+    return change
+
+
+def rejected(tmp_path, monkeypatch):
+    monkeypatch.setattr(library, "OPTIONS", [*library.OPTIONS, "-Dfloat=none"])
+
+
 def without_avx2(tmp_path, monkeypatch):
     found = runtime.machine()
     monkeypatch.setattr(runtime, "machine", lambda: (*found[:-1], "sse4_2"))
@@ -147,7 +158,10 @@ WITHOUT = {
     "no AVX2": (without_avx2, "no AVX2"),
     "switched off": (lambda _, patch: patch.setenv(library.SWITCH, "0"), "HYBRID_JAX_NATIVE is 0"),
     "no compiler": (lambda _, patch: patch.setenv("CXX", "no-such-compiler"), "no g++"),
-    "a compiler that fails": (lambda _, patch: patch.setenv("CXX", "false"), "could not be compiled"),
+    "a compiler that fails": (compiler_that("exit 1"), "could not be compiled"),
+    "source that GCC rejects": (rejected, "could not be compiled: "),
+    "a library that does not load": (compiler_that('echo no > "$last"'), "not be loaded"),
+    "a library without its functions": (compiler_that('g++ -shared -x c /dev/null -o "$last"'), "not be loaded"),
     "a folder of all": (open_folder, "0700"),
     "no folder": (lambda path, _: (path / "hybrid_jax").touch(), "not be kept"),
 }
@@ -164,35 +178,4 @@ def test_without_kernels_jax_does_the_same(change, reason, anew, tmp_path, monke
     np.testing.assert_array_equal(predicted, jax.jit(rollout_batch)(field, x0, u, DT))
     assert reason in kernels.status()
     assert len(kernels.status().splitlines()) <= 2
-    assert not list(tmp_path.rglob("*.so"))
-
-
-class Odd(AbstractVectorField):
-    """A field that no other test has, as a name of a kernel stays for as long as the process."""
-
-    def __call__(self, x, u):
-        return 0.12345 * x
-
-
-@needs_kernels
-@pytest.mark.parametrize("fails", [False, True])
-def test_the_first_call_waits_for_the_compiler(fails, anew, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    compiler, go, count = library._run_compiler, threading.Event(), itertools.count()
-
-    def slow(arguments):
-        if next(count):  # the first are the doors
-            go.wait()
-            if fails:
-                raise library.Unusable("it failed")
-        compiler(arguments)
-
-    monkeypatch.setattr(library, "_run_compiler", slow)
-    x0, u = jnp.full((17, 3 + fails), 0.5), jnp.zeros((17, 2, 1))
-    program = jax.jit(lambda x0, u: predict(Odd(), x0, u, DT)).lower(x0, u).compile()  # nothing waits here
-    go.set()
-    if fails:
-        with pytest.raises(Exception, match="could not be compiled; HYBRID_JAX_NATIVE=0"):
-            jax.block_until_ready(program(x0, u))
-    else:
-        np.testing.assert_allclose(program(x0, u), rollout_batch(Odd(), x0, u, DT), rtol=1e-6)
+    assert not list(tmp_path.glob("*/*/*.so")) or "loaded" in reason

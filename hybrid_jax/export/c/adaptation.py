@@ -10,66 +10,12 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from hybrid_jax.codegen.loops import Tables
 from hybrid_jax.codegen.printer import CPrinter
-from hybrid_jax.codegen.tables import Tables
 from hybrid_jax.export.c.fields import body_of, check_name, written
+from hybrid_jax.export.c.templates import ADAPTATION_HEADER, ADAPTATION_SOURCE
 from hybrid_jax.export.program import Size, sizes_of
 from hybrid_jax.runtime import entry
-
-HEADER = """\
-/* A filter that adapts a model while it runs, written by hybrid_jax.
-
-   state: $layout.
-   theta holds the changes of $names,
-   in the standard deviations of their prior.
-   No function allocates or keeps a state; results must not overlap what is read. */
-#ifndef ${NAME}_H
-#define ${NAME}_H
-
-#define ${NAME}_STATE_SIZE $d
-#define ${NAME}_INPUT_SIZE $m
-#define ${NAME}_PARAMETERS $p
-#define ${NAME}_SIZE $size /* of the filter's state */
-#define ${NAME}_TRUSTED $trusted /* where the last good theta begins in it */
-#define ${NAME}_DT $dt /* time between two samples [s] */
-
-#ifdef __cplusplus
-extern "C" {
-#endif
-
-/* The state of the filter before the first sample x. */
-void ${name}_begin(const $type x[$d], $type state[$size]);
-
-/* After a sample x, NaN where nothing was measured, and the mean input u since the last update, $elapsed. */
-void ${name}_update(const $type state[$size], const $type x[$d], const $type u[$m], $type periods, $type next[$size]);
-
-#ifdef __cplusplus
-}
-#endif
-#endif
-"""
-
-SOURCE = """\
-/* See $name.h; written by hybrid_jax. */
-#include "$name.h"
-
-#include <math.h>
-
-typedef $type real;
-
-$tables
-
-$helpers
-void ${name}_begin(const real x[$d], real state[$size]) {
-$begin
-}
-
-void ${name}_update(const real state[$size], const real x[$d], const real u[$m], real periods, real next[$size]) {
-    const real elapsed[1] = {periods};
-    (void)elapsed;
-$update
-}
-"""
 
 
 @entry
@@ -115,20 +61,10 @@ def export_adaptation_c(
 
         stepped = body_of(update, list(likes.values()), tables, ("next",), tuple(likes))
         begun = body_of(begin, [likes["x"]], tables, ("state",), ("x",))
-    parts = (
-        _parts(exact, first)
-        | printer.shared(tables, stepped, begun)
-        | {
-            "d": d,
-            "m": m,
-            "dt": printer.number(float(adaptation.dt)),
-            "size": flat.size,
-            "begin": printer.body(begun),
-            "update": printer.body(stepped),
-            "elapsed": f"periods of {name.upper()}_DT ago",
-        }
-    )
-    return written(folder, name, HEADER, SOURCE, parts)
+    parts = {"d": d, "m": m, "size": flat.size, "dt": printer.number(float(adaptation.dt))}
+    parts |= {"elapsed": f"periods of {name.upper()}_DT ago"} | _parts(exact, first)
+    parts |= printer.parts(tables, begin=begun, update=stepped)
+    return written(folder, name, ADAPTATION_HEADER, ADAPTATION_SOURCE, parts)
 
 
 def _in_turn(one: Callable) -> Callable:

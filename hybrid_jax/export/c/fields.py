@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from hybrid_jax import checks
+from hybrid_jax.codegen.loops import Tables
 from hybrid_jax.codegen.nodes import Entry, Statement
 from hybrid_jax.codegen.operations import CTranslation, column
 from hybrid_jax.codegen.printer import CPrinter
-from hybrid_jax.codegen.tables import Tables
 from hybrid_jax.codegen.translation import Entries
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.export.c.templates import HEADER, SOURCE
@@ -68,15 +68,9 @@ def export_c(
         fused = as_field(prepared(field, likes, smooth)).fuse_for_inference()
         values = body_of(fused, likes, tables, ("xdot",))
         slopes = body_of(lambda x, u: _with_slopes(fused, x, u), likes, tables, ("xdot", "jacobian"))
-    parts = printer.shared(tables, values, slopes) | {
-        "d": d,
-        "m": m,
-        "dt": printer.number(float(dt)),
-        "about": _about(vehicle_in(field) is not None, smooth),
-        "values": printer.body(values),
-        "slopes": printer.body(slopes),
-    }
-    return written(folder, name, HEADER, SOURCE, parts)
+    about = _about(vehicle_in(field) is not None, smooth)
+    parts = {"d": d, "m": m, "dt": printer.number(float(dt)), "about": about}
+    return written(folder, name, HEADER, SOURCE, parts | printer.parts(tables, values=values, slopes=slopes))
 
 
 def check_name(name: str) -> None:

@@ -1,24 +1,51 @@
-"""The text of the header and of the source of `export_c`, as `string.Template`."""
+"""The text of the header and of the source of `export_c` and `export_adaptation_c`, as `string.Template`."""
 
-HEADER = """\
-/* A model dx/dt = f(x, u), written by hybrid_jax.
+
+def _header(about: str, definitions: str, functions: str) -> str:
+    return f"""\
+/* {about} */
+#ifndef ${{NAME}}_H
+#define ${{NAME}}_H
+
+#define ${{NAME}}_STATE_SIZE $d
+#define ${{NAME}}_INPUT_SIZE $m
+{definitions}
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+{functions}
+
+#ifdef __cplusplus
+}}
+#endif
+#endif
+"""
+
+
+_BEGINNING = """\
+/* See $name.h; written by hybrid_jax. */
+#include "$name.h"
+
+#include <math.h>
+
+typedef $type real;
+
+$tables
+
+$helpers
+"""
+
+HEADER = _header(
+    """A model dx/dt = f(x, u), written by hybrid_jax.
 $about
 
    Matrices are in row-major order: dx[i][j] is the derivative of entry i of the result by x[j].
    No function allocates, keeps a state or changes what it reads; results must not overlap what is read.
-   A number that is not finite in x or u goes on into the result: test it there. */
-#ifndef ${NAME}_H
-#define ${NAME}_H
-
-#define ${NAME}_STATE_SIZE $d
-#define ${NAME}_INPUT_SIZE $m
-#define ${NAME}_DT $dt /* length of a step [s] */
-
-#ifdef __cplusplus
-extern "C" {
-#endif
-
-/* dx/dt at the state x under the input u. */
+   A number that is not finite in x or u goes on into the result: test it there.""",
+    "#define ${NAME}_DT $dt /* length of a step [s] */",
+    """/* dx/dt at the state x under the input u. */
 void ${name}_derivative(const $type x[$d], const $type u[$m], $type xdot[$d]);
 
 /* The state ${NAME}_DT after x with u held: one step of the classical Runge-Kutta method of order 4.
@@ -31,27 +58,14 @@ void ${name}_derivative_jacobian(const $type x[$d], const $type u[$m], $type xdo
 
 /* As ${name}_step, with its Jacobians. */
 void ${name}_step_jacobian(const $type x[$d], const $type u[$m], $type next[$d],
-                           $type dx[$d][$d], $type du[$d][$m]);
+                           $type dx[$d][$d], $type du[$d][$m]);""",
+)
 
-#ifdef __cplusplus
-}
-#endif
-#endif
-"""
-
-SOURCE = """\
-/* See $name.h; written by hybrid_jax. */
-#include "$name.h"
-
-#include <math.h>
-
-typedef $type real;
-
+SOURCE = (
+    _BEGINNING
+    + """\
 enum { D = $d, M = $m, C = D + M };
 
-$tables
-
-$helpers
 static void derivative(const real *x, const real *u, real *xdot) {
     (void)x;
     (void)u;
@@ -87,22 +101,20 @@ static void shifted(const real *a, real h, const real *b, real *out, int n) {
     for (int i = 0; i < n; ++i) { out[i] = a[i] + h * b[i]; }
 }
 
-static const real H = $dt / 2;
+#define H ($dt / 2)
+static const real WEIGHT[4] = {1, 2, 2, 1}, AHEAD[4] = {H, H, 2 * H, 0};
 
 void ${name}_derivative(const real x[D], const real u[M], real xdot[D]) { derivative(x, u, xdot); }
 
 void ${name}_step(const real x[D], const real u[M], real next[D]) {
     real k[D], y[D], sum[D];
-    derivative(x, u, sum);
-    shifted(x, H, sum, y, D);
-    derivative(y, u, k);
-    shifted(sum, 2, k, sum, D);
-    shifted(x, H, k, y, D);
-    derivative(y, u, k);
-    shifted(sum, 2, k, sum, D);
-    shifted(x, 2 * H, k, y, D);
-    derivative(y, u, k);
-    for (int i = 0; i < D; ++i) { next[i] = x[i] + H / 3 * (sum[i] + k[i]); }
+    for (int i = 0; i < D; ++i) { y[i] = x[i]; sum[i] = 0; }
+    for (int stage = 0; stage < 4; ++stage) {
+        derivative(y, u, k);
+        shifted(sum, WEIGHT[stage], k, sum, D);
+        shifted(x, AHEAD[stage], k, y, D);
+    }
+    shifted(x, H / 3, sum, next, D);
 }
 
 static void split(const real *both, real dx[D][D], real du[D][M]) {
@@ -120,19 +132,55 @@ void ${name}_derivative_jacobian(const real x[D], const real u[M], real xdot[D],
 
 /* The derivative of a Runge-Kutta step is a step of the same method along the directions. */
 void ${name}_step_jacobian(const real x[D], const real u[M], real next[D], real dx[D][D], real du[D][M]) {
-    const real weight[4] = {1, 2, 2, 1}, ahead[4] = {H, H, 2 * H, 0};
     real k[D], y[D], sum[D], dk[D * C], s[D * C], total[D * C];
     for (int i = 0; i < D; ++i) { y[i] = x[i]; sum[i] = 0; }
     for (int i = 0; i < D * C; ++i) { s[i] = i % C == i / C; total[i] = 0; }
     for (int stage = 0; stage < 4; ++stage) {
         directions(y, s, u, k, dk);
-        shifted(sum, weight[stage], k, sum, D);
-        shifted(total, weight[stage], dk, total, D * C);
-        shifted(x, ahead[stage], k, y, D);
-        for (int i = 0; i < D * C; ++i) { s[i] = (real)(i % C == i / C) + ahead[stage] * dk[i]; }
+        shifted(sum, WEIGHT[stage], k, sum, D);
+        shifted(total, WEIGHT[stage], dk, total, D * C);
+        shifted(x, AHEAD[stage], k, y, D);
+        for (int i = 0; i < D * C; ++i) { s[i] = (real)(i % C == i / C) + AHEAD[stage] * dk[i]; }
     }
     shifted(x, H / 3, sum, next, D);
     for (int i = 0; i < D * C; ++i) { s[i] = (real)(i % C == i / C) + H / 3 * total[i]; }
     split(s, dx, du);
 }
 """
+)
+
+ADAPTATION_HEADER = _header(
+    """A filter that adapts a model while it runs, written by hybrid_jax.
+
+   state: $layout.
+   theta holds the changes of $names,
+   in the standard deviations of their prior.
+   No function allocates or keeps a state; results must not overlap what is read.""",
+    """\
+#define ${NAME}_PARAMETERS $p
+#define ${NAME}_SIZE $size /* of the filter's state */
+#define ${NAME}_TRUSTED $trusted /* where the last good theta begins in it */
+#define ${NAME}_DT $dt /* time between two samples [s] */""",
+    """\
+/* The state of the filter before the first sample x. */
+void ${name}_begin(const $type x[$d], $type state[$size]);
+
+/* After a sample x, NaN where nothing was measured, and the mean input u since the last update, $elapsed. */
+void ${name}_update(const $type state[$size], const $type x[$d], const $type u[$m], $type periods,
+                    $type next[$size]);""",
+)
+
+ADAPTATION_SOURCE = (
+    _BEGINNING
+    + """\
+void ${name}_begin(const real x[$d], real state[$size]) {
+$begin
+}
+
+void ${name}_update(const real state[$size], const real x[$d], const real u[$m], real periods, real next[$size]) {
+    const real elapsed[1] = {periods};
+    (void)elapsed;
+$update
+}
+"""
+)

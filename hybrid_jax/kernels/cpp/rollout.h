@@ -11,8 +11,8 @@
 
 #pragma once
 
-#include "arrays.h"
 #include "samples.h"
+#include "xla/ffi/api/c_api.h"
 
 namespace {
 
@@ -21,11 +21,34 @@ constexpr int UNITS = 8;  // of the layer at a time
 constexpr int64_t SLOTS = 16;  // of factors, which wait for their products
 constexpr int64_t U = H ? H | 1 : 0;  // vectors from one n to the next: an even number may put all into the same lines of the cache
 
-// What each stage's slope counts for in the step, and how far along it the next point lies.
-struct Stages {
-  float share[STAGES], ahead[STAGES];
-  explicit Stages(float dt) : share{dt / 6, dt / 3, dt / 3, dt / 6}, ahead{dt / 2, dt / 2, dt, 0} {}
+// A lane of a call of XLA: the lanes of a sweep are the first axes of all arrays. These are in single precision, and the
+// caller in Python keeps to number and shapes. By the interface in C: GCC takes longer for the other than for the kernels.
+struct Call {
+  const XLA_FFI_CallFrame* frame;
+  int64_t lane = 0, lanes = 1;
+
+  int64_t size(int i, int64_t axis) const {  // of an argument; the last axis is −1
+    auto* array = static_cast<const XLA_FFI_Buffer*>(frame->args.args[i]);
+    return array->dims[array->rank + axis];
+  }
+  static int64_t count(const void* array) {
+    int64_t n = 1, *dims = static_cast<const XLA_FFI_Buffer*>(array)->dims;
+    for (int64_t i = static_cast<const XLA_FFI_Buffer*>(array)->rank; i--;) n *= dims[i];
+    return n;
+  }
+  float* part(const void* array) const {
+    return static_cast<float*>(static_cast<const XLA_FFI_Buffer*>(array)->data) + lane * (count(array) / lanes);
+  }
+  float* argument(int i) const { return part(frame->args.args[i]); }
+  float* result(int i) const { return part(frame->rets.rets[i]); }
+  float number(int i) const {
+    return static_cast<const float*>(static_cast<const XLA_FFI_Array*>(frame->attrs.attrs[0])->data)[i];
+  }
 };
+
+// Arguments: the weights, x0 (d, b) and u (t, m, b), on the way back also those of the kernels there, what was kept, and
+// the derivatives with respect to the states.
+enum Argument { WEIGHTS, X0, INPUTS, BACK, KEPT, D_STATES };
 
 // An array (t, rows, count) of windows.
 struct Windows {
@@ -49,27 +72,28 @@ struct Windows {
   }
 };
 
-// A lane: b windows of `steps` intervals, and what is kept of each evaluation for the way back, or nothing: x, h and q.
+// b windows of `steps` intervals, and what is kept of each evaluation for the way back, or nothing: x, h and q.
 struct Lane {
-  int64_t steps, b;
-  float dt, epsilon;
-  const float* w;
-  Windows x0, u, states;
+  const Call& call;
   Vec* kept;
-  Room& room;
+  const int64_t steps = call.size(INPUTS, -3), b = call.size(INPUTS, -1), blocks = (b + V - 1) / V;
+  const int64_t group = H ? blocks : 1, n = group * D;  // vectors of windows, and of their states
+  const int64_t size = group * (D + U) + (H + V - 1) / V;  // of what is kept of an evaluation
+  // What each stage's slope counts for in the step, and how far along it the next point lies.
+  const float dt = call.number(0), share[STAGES] = {dt / 6, dt / 3, dt / 3, dt / 6}, ahead[STAGES] = {dt / 2, dt / 2, dt, 0};
+  const float epsilon = call.number(1), *w = call.argument(WEIGHTS);
+  const Windows x0{call.argument(X0), D, b}, u{call.argument(INPUTS), M, b};
+  mutable Room room{};
 
-  int64_t blocks() const { return (b + V - 1) / V; }
-  int64_t group() const { return H ? blocks() : 1; }  // vectors of windows
-  int64_t size() const { return group() * (D + U) + (H + V - 1) / V; }  // of what is kept of an evaluation
-  Vec* point(int64_t first, int64_t t, int stage) const { return kept + ((first * steps + t) * STAGES + stage) * size(); }
-  Vec* h(Vec* point) const { return point + group() * D; }
-  float* q(Vec* point) const { return reinterpret_cast<float*>(h(point) + group() * U); }
+  Vec* point(int64_t first, int64_t t, int stage) const { return kept + ((first * steps + t) * STAGES + stage) * size; }
+  Vec* h(Vec* point) const { return point + n; }
+  float* q(Vec* point) const { return reinterpret_cast<float*>(h(point) + group * U); }
 };
 
 // The layer that couples all windows of a lane: z less its mean, n of a block of windows, and the derivatives.
 struct Coupling {
   const Lane& lane;
-  const int64_t blocks = lane.group();
+  const int64_t blocks = lane.group;
   Vec *z = lane.room(blocks * Z), *dz = lane.room(blocks * Z), *n = lane.room(U), *dn = lane.room(blocks * U);
   float* scale = reinterpret_cast<float*>(lane.room(U));
 
@@ -129,74 +153,48 @@ struct Coupling {
   }
 };
 
-void forward_lane(const Lane& lane) {
-  const int64_t group = lane.group(), n = group * D;
-  const Stages stages(lane.dt);
-  Vec *x = lane.room(n), *slopes = lane.room(n), *total = lane.room(n), *u = lane.room(group * M), *passing = lane.room(lane.size());
+// Results: the states and what is kept, of no size if nothing is.
+void forward_lane(const Call& call) {
+  const Lane lane{call, Call::count(call.frame->rets.rets[1]) ? vectors(call.result(1)) : nullptr};
+  const Windows states{call.result(0), D, lane.b};
+  const int64_t group = lane.group, n = lane.n;
+  Vec *x = lane.room(n), *slopes = lane.room(n), *total = lane.room(n), *u = lane.room(group * M), *passing = lane.room(lane.size);
   const Coupling coupling{lane};
-  for (int64_t first = 0; first < lane.blocks(); first += group) {
+  for (int64_t first = 0; first < lane.blocks; first += group) {
     for (int64_t j = 0; j < group; ++j) lane.x0.gather(0, (first + j) * V, false, x + j * D);
     for (int64_t t = 0; t < lane.steps; ++t) {
       for (int64_t j = 0; j < group; ++j) lane.u.gather(t, (first + j) * V, false, u + j * M);
       for (int stage = 0; stage < STAGES; ++stage) {
         Vec *point = lane.kept ? lane.point(first, t, stage) : passing, *h = lane.h(point);
-        for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + stages.ahead[stage - 1] * slopes[i] : x[i];
+        for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + lane.ahead[stage - 1] * slopes[i] : x[i];
         if (H) coupling.evaluate(point, u, h, lane.q(point), false);
         for (int64_t j = 0; j < group; ++j) {
           coupling.normalise(h + j * U);
           slope(lane.w, point + j * D, u + j * M, coupling.n, slopes + j * D);
         }
-        for (int64_t i = 0; i < n; ++i) total[i] = (stage ? total[i] : x[i]) + stages.share[stage] * slopes[i];
+        for (int64_t i = 0; i < n; ++i) total[i] = (stage ? total[i] : x[i]) + lane.share[stage] * slopes[i];
       }
       std::swap(x, total);
-      for (int64_t j = 0; j < group; ++j) lane.states.scatter(x + j * D, t, (first + j) * V);
+      for (int64_t j = 0; j < group; ++j) states.scatter(x + j * D, t, (first + j) * V);
     }
   }
 }
 
 #if TRAINING
-
-// Derivatives with respect to weights, summed over windows within each place of a vector.
-struct Weights {
-  Vec *sums, *factors;
-  int64_t used = 0;
-  explicit Weights(Room& room) : sums(room(P)), factors(room(F * SLOTS)) { std::fill_n(sums, P, Vec{}); }
-
-  Vec* next() {
-    if (used == SLOTS) flush();
-    return factors + F * used++;
-  }
-  void flush() { products(sums, factors, used), used = 0; }
-};
-
-// The derivatives with respect to points of a group, from those with respect to slopes; adds those to inputs and weights.
-void evaluate_back(const Coupling& c, const float* back, Vec* point, const Vec* u, const Vec* d_slope, Weights& weights,
-                   Vec* d_point, Vec* d_u) {
-  HELD Vec dx[D + 1], du[M + 1];
-  Vec* h = c.lane.h(point);
-  float* q = c.lane.q(point);
-  if (H) c.evaluate(point, u, h, q, true);
-  for (int64_t j = 0; j < c.blocks; ++j) {
-    c.normalise(h + j * U);
-    slope_back(back, point + j * D, u + j * M, c.n, d_slope + j * D, d_point + j * D, du, c.dn + j * U, {weights.sums}, weights.next());
-    for (int i = 0; i < M; ++i) d_u[j * M + i] += du[i];
-  }
-  if (H) c.back(h, q, weights.sums);
-  for (int64_t j = 0; j < c.blocks && H; ++j) {
-    read_back(back, point + j * D, u + j * M, c.dz + j * Z, dx, du, {weights.sums});
-    for (int i = 0; i < D; ++i) d_point[j * D + i] += dx[i];
-    for (int i = 0; i < M; ++i) d_u[j * M + i] += du[i];
-  }
-}
-
-void backward_lane(const Lane& lane, const float* back, const Windows& d_states, const Windows& d_x0, const Windows& d_u, float* d_w) {
-  const int64_t group = lane.group(), n = group * D;
-  const Stages stages(lane.dt);
+// Results: the derivatives with respect to the weights, x0 and u. Those with respect to weights are summed over windows
+// within each place of a vector; their factors wait in slots for the products.
+void backward_lane(const Call& call) {
+  const Lane lane{call, vectors(call.argument(KEPT))};
+  const Windows d_states{call.argument(D_STATES), D, lane.b}, d_x0{call.result(X0), D, lane.b}, d_u{call.result(INPUTS), M, lane.b};
+  const int64_t group = lane.group, n = lane.n;
+  const float* back = call.argument(BACK);
   Vec *dx = lane.room(n), *next = lane.room(n), *d_slope = lane.room(n), *d_point = lane.room(n);
-  Vec *u = lane.room(group * M), *du = lane.room(group * M), *more = lane.room(D);
-  const Coupling coupling{lane};
-  Weights weights(lane.room);
-  for (int64_t first = 0; first < lane.blocks(); first += group) {
+  Vec *u = lane.room(group * M), *du = lane.room(group * M), *more = lane.room(D), *more_u = lane.room(M);
+  Vec *sums = lane.room(P), *factors = lane.room(F * SLOTS);
+  int64_t used = 0;
+  const Coupling c{lane};
+  std::fill_n(sums, P, Vec{});
+  for (int64_t first = 0; first < lane.blocks; first += group) {
     std::fill_n(dx, n, Vec{});
     for (int64_t t = lane.steps; t--;) {
       for (int64_t j = 0; j < group; ++j) {
@@ -205,44 +203,49 @@ void backward_lane(const Lane& lane, const float* back, const Windows& d_states,
       }
       std::copy_n(dx, n, next), std::fill_n(du, group * M, Vec{});
       for (int stage = STAGES; stage--;) {
-        for (int64_t i = 0; i < n; ++i) d_slope[i] = stages.share[stage] * next[i] + (stage < STAGES - 1 ? stages.ahead[stage] * d_point[i] : Vec{});
-        evaluate_back(coupling, back, lane.point(first, t, stage), u, d_slope, weights, d_point, du);
+        Vec *point = lane.point(first, t, stage), *h = lane.h(point);
+        for (int64_t i = 0; i < n; ++i) d_slope[i] = lane.share[stage] * next[i] + (stage < STAGES - 1 ? lane.ahead[stage] * d_point[i] : Vec{});
+        if (H) c.evaluate(point, u, h, lane.q(point), true);
+        for (int64_t j = 0; j < group; ++j) {
+          if (used == SLOTS) products(sums, factors, used), used = 0;
+          c.normalise(h + j * U);
+          slope_back(back, point + j * D, u + j * M, c.n, d_slope + j * D, d_point + j * D, more_u, c.dn + j * U, {sums}, factors + F * used++);
+          for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
+        }
+        if (H) c.back(h, lane.q(point), sums);
+        for (int64_t j = 0; j < group && H; ++j) {
+          read_back(back, point + j * D, u + j * M, c.dz + j * Z, more, more_u, {sums});
+          for (int i = 0; i < D; ++i) d_point[j * D + i] += more[i];
+          for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
+        }
         for (int64_t i = 0; i < n; ++i) dx[i] += d_point[i];
       }
       for (int64_t j = 0; j < group; ++j) d_u.scatter(du + j * M, t, (first + j) * V);
     }
     for (int64_t j = 0; j < group; ++j) d_x0.scatter(dx + j * D, 0, (first + j) * V);
   }
-  weights.flush();
-  for (int64_t i = 0; i < P; ++i) d_w[i] = sum(weights.sums[i]);
+  products(sums, factors, used);
+  for (int64_t i = 0; i < P; ++i) call.result(WEIGHTS)[i] = sum(sums[i]);
 }
-
 #endif
 
-// Arguments are the weights, x0 (d, b) and u (t, m, b); results are the states and what is kept, of no size if nothing is.
-enum Argument { WEIGHTS, X0, INPUTS, BACK, KEPT, D_STATES };
-
-Lane lane_of(const LaneOf& of, float* states, Vec* kept, Room& room) {
-  const Array u = of.call.argument(INPUTS);
-  const int64_t b = u.size(-1);
-  return {u.size(-3), b, of.call.number(0), of.call.number(1), of.argument(WEIGHTS), {of.argument(X0), D, b},
-          {of.argument(INPUTS), M, b}, {states, D, b}, kept, room};
+XLA_FFI_Error* each_lane(const XLA_FFI_CallFrame* frame, void (*run)(const Call&)) {
+  auto* asked = frame->extension_start;
+  if (asked && asked->type == XLA_FFI_Extension_Metadata) {  // nothing, but for the version of the interface
+    XLA_FFI_Metadata* about = reinterpret_cast<XLA_FFI_Metadata_Extension*>(asked)->metadata;
+    about->api_version = {XLA_FFI_Api_Version_STRUCT_SIZE, nullptr, XLA_FFI_API_MAJOR, XLA_FFI_API_MINOR};
+    about->traits = 0;
+    about->state_type_id = XLA_FFI_UNKNOWN_TYPE_ID;
+    return nullptr;
+  }
+  const int64_t lanes = Call::count(frame->args.args[X0]) / (D * Call{frame}.size(X0, -1));
+  for (int64_t lane = 0; lane < lanes; ++lane) run({frame, lane, lanes});
+  return nullptr;
 }
-
-void forward_call(const LaneOf& of) {
-  Room room;
-  forward_lane(lane_of(of, of.result(0), of.call.result(1).count() ? vectors(of.result(1)) : nullptr, room));
-}
-HANDLER(forward)
-
-#if TRAINING
-// Results: the derivatives with respect to the weights, x0 and u.
-void backward_call(const LaneOf& of) {
-  Room room;
-  const Lane lane = lane_of(of, nullptr, vectors(of.argument(KEPT)), room);
-  backward_lane(lane, of.argument(BACK), {of.argument(D_STATES), D, lane.b}, {of.result(X0), D, lane.b}, {of.result(INPUTS), M, lane.b}, of.result(WEIGHTS));
-}
-HANDLER(backward)
-#endif
 
 }  // namespace
+
+extern "C" XLA_FFI_Error* forward(XLA_FFI_CallFrame* frame) { return each_lane(frame, forward_lane); }
+#if TRAINING
+extern "C" XLA_FFI_Error* backward(XLA_FFI_CallFrame* frame) { return each_lane(frame, backward_lane); }
+#endif
