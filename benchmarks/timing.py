@@ -94,26 +94,27 @@ class Times:
         return statistics.median(a / b for a, b in zip(self.seconds[name], self.seconds[other], strict=True))
 
 
-def stopwatch(call: Callable[[], Any]) -> tuple[Any, float]:
+def stopwatch(call: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> tuple[Any, float]:
     """The result of a call, once computed, and its duration [s]."""
-    before = time.perf_counter()
+    before = clock()
     result = jax.block_until_ready(call())
-    return result, time.perf_counter() - before
+    return result, clock() - before
 
 
-def in_turns(calls: Mapping[Any, Call], turns: int, *, warm: bool = False) -> Times:
+def in_turns(calls: Mapping[Any, Call], turns: int, *, warm: bool = False, clock=time.perf_counter) -> Times:
     """Time each call once per turn, in alternating order. Call each once before.
 
     Args:
         warm: call each once more in every turn before it is timed, for work that usually goes on for long: a call of
             milliseconds after another program's seconds took up to three times as long.
+        clock: `time.process_time` on one core of a machine on which other programs run.
     """
     taken: dict[Any, list[float]] = {name: [] for name in calls}
     for turn in range(turns):
         for name in list(calls)[:: -1 if turn % 2 else 1]:
             if warm:
                 jax.block_until_ready(calls[name]())
-            taken[name].append(stopwatch(calls[name])[1])
+            taken[name].append(stopwatch(calls[name], clock)[1])
     return Times(taken)
 
 

@@ -5,8 +5,8 @@ ours: ours without the kernels of `hybrid_jax.kernels`; the same written plainly
 `vmap`; PyTorch with torchdiffeq, one interval after another; PyTorch with an RK4 by hand; the same with its loss under
 `torch.compile`. All start from our parameters; loss, gradient and running statistics must agree. torchdiffeq's rk4 is
 the 3/8 rule, so it is compared with our step by that rule. A turn is steps in a row, as in training, and as many before
-that are not timed: in JAX in one compiled loop, in PyTorch in a Python loop. The first call, in which PyTorch compiles,
-is apart. smoke: `torch.compile` generates no code. full: some five minutes, most of it compiling.
+that are not timed: in JAX in one compiled loop, in PyTorch in a Python loop. Times are the processor's. The first call,
+in which PyTorch compiles, is apart. smoke: `torch.compile` generates no code. full: some five minutes, mostly of that.
 """
 
 # PyTorch is of the extra `peers`.
@@ -15,6 +15,7 @@ is apart. smoke: `torch.compile` generates no code. full: some five minutes, mos
 import os
 import shutil
 import signal
+import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -63,7 +64,7 @@ class PeerOptions(Options):
     model: Literal["paper", "vehicle", "pendulum", "car", "pde"] = "paper"
     """paper: rigid body, 64 units, batch norm. vehicle: with drag, 32 tanh units, no norm. Others: plain JAX alone."""
     most_seconds: int = 900
-    """A rival that takes longer to compile is skipped."""
+    """A rival that takes more processor time to compile is skipped."""
 
 
 @dataclass(frozen=True)
@@ -193,20 +194,24 @@ def rival_steps(arguments: tuple, preset: Preset, name: str) -> Steps:
     return Steps(in_a_row, training.result(value), seconds)
 
 
+class TooLate(BaseException):
+    """Not an Exception, which PyTorch's compiler would wrap in one of its own."""
+
+
 @contextmanager
 def at_most(seconds: int):
-    """TimeoutError after so many seconds."""
+    """TooLate after so many seconds of processor time."""
 
     def stop(*_):
-        raise TimeoutError
+        raise TooLate
 
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(seconds)
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def prepare(preset: Preset, model: str, names: Sequence[str], most_seconds: int):
@@ -217,7 +222,7 @@ def prepare(preset: Preset, model: str, names: Sequence[str], most_seconds: int)
         try:
             with at_most(most_seconds):
                 steps[name] = rival_steps(arguments, preset, name)
-        except TimeoutError:
+        except TooLate:
             late.append(skipped(name, f"not compiled in {most_seconds} s; --most-seconds allows more"))
     alike = {}
     if TORCHDIFFEQ in steps:
@@ -268,7 +273,8 @@ def measure(preset: Preset, model: str, most_seconds: int) -> Findings:
     with TemporaryDirectory() as cache:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache  # empty, so that compilation is timed
         programs, differences, late = prepare(preset, model, names, most_seconds)
-        times = in_turns({name: steps.call for name, steps in programs.items()}, preset.turns, warm=True)
+        calls = {name: steps.call for name, steps in programs.items()}
+        times = in_turns(calls, preset.turns, warm=True, clock=time.process_time)
     rows, absent = [row_of(name, one, differences, times, preset) for name, one in programs.items()], [*absent, *late]
     ratios = [
         Ratio(f"{row['program']} / ours", row["times_ours"], at_least=REACH[model].get(row["program"]))
