@@ -1,15 +1,23 @@
 """The numbers of the results and the guides are those of the committed reports."""
 
 import json
+import re
+from functools import cache
 
 import numpy as np
 import pytest
 from committed import committed, lines
 from smoke import ROOT
 
+from experiments.online.results import error
 from experiments.paper.regret import AUTO, CHANGES, of_each_case, over, regret
 from experiments.reporting.tables import measured
 
+DOCS, README = ROOT / "docs", ROOT / "README.md"
+REFERENCE = DOCS / "reference"
+FROM_COMMANDS = re.compile(r"python -m |hybrid-jax \w+|experiments\.|benchmarks|tests/")
+DECIMAL = re.compile(r"(?<![\w.])\d+\.\d+(?!\.?\d)")
+NOT_MEASURED = {"2.785", "0.1", "3.11"}  # where RK4 stops being stable; seconds of a window; a version
 PAPER = {"inertia": "param_shift", "wind": "external_force"}
 METHODS = (("hybrid", "fine_tuned"), ("hybrid", "target_only"), ("no_physics", "fine_tuned"))
 METHODS += (("constant_disturbance", "fine_tuned"),)
@@ -113,3 +121,78 @@ def test_adapting_in_flight():
     assert f"false alarm in {alarms} of {len(low['nothing'])} flights" in page
     fast = rows.where(change="inertia", reference="fast_figure_eight")
     assert f"true value in {100 * fast.spread('inside.Ix').mean:.0f} % of the time" in page
+
+
+def decimals(page, linked):
+    """The decimals of a page that no report has, by heading, but those of sections that name a command.
+
+    `linked`: the report must be one that the page links.
+    """
+    text = page.read_text()
+    targets = [(page.parent / target).resolve() for target in re.findall(r"\]\(([^)#]*reference/[^)#]*)", text)]
+    reports = {target.parent / "report.md" for target in targets} if linked else REFERENCE.rglob("report.md")
+    known = {number for path in reports if path.exists() for number in DECIMAL.findall(path.read_text())}
+    text = re.sub(r"^```(?!bash|sh|console).*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    for section in re.split(r"^(?=#{1,3} )", text, flags=re.MULTILINE):
+        if not FROM_COMMANDS.search(section):
+            prose = re.sub(r"`[^`]*`|\]\([^)]*\)", "", section)
+            # Tables of results are looked up line by line above.
+            prose = re.sub(r"^\|.*", "", prose, flags=re.MULTILINE) if linked else prose
+            yield from set(DECIMAL.findall(prose)) - known
+
+
+@pytest.mark.parametrize("page", [README, *sorted((DOCS / "results").glob("*.md"))], ids=lambda page: page.stem)
+def test_results_link_the_report_of_each_number(page):
+    assert {*decimals(page, linked=True)} - said() - NOT_MEASURED == set()
+
+
+@pytest.mark.parametrize("folder", ["howto", "explanation"])
+def test_numbers_of_guides_are_in_a_report_or_come_from_a_command(folder):
+    found = {number for page in (DOCS / folder).glob("*.md") for number in decimals(page, linked=False)}
+    assert found - NOT_MEASURED == set()
+
+
+@cache
+def said():
+    """The numbers that results say beside their tables, from rows: each is looked for in its page."""
+    online, flown = committed("online"), committed("closed_loop")
+    wind = flown.where(domain="external_force", reference="hover", distance=60.0, model="hybrid", n_train=100)
+    lost = wind.where(observer=False)["crashed"]
+    settled = [
+        np.divide(*(np.mean(own.where(agent=agent).numbers(error("settled"))) for agent in ("online", "oracle")))
+        for own in online.group("change", "reference").values()
+    ]
+    inside = [
+        np.mean([np.mean([*row["inside"].values()]) for row in own])
+        for own in online.where(agent="online").group("change").values()
+    ]
+    better = [float(lines("docs/results/control.md")[name][-1]) for name in ("hover", "figure-8, 3.5 m/s", "low pass")]
+    fitted = committed("coverage").where(lambda row: row["inside"] is not None)
+    wide = {}
+    for (domain, *_), own in fitted.group("domain", "noise", "parameter").items():
+        needed = np.quantile(np.abs(own.numbers("error")), 0.95)
+        wide.setdefault(domain == "gusty_wind", []).append(np.median(own.numbers("half_width")) / needed)
+    expected = np.mean(committed("changes").where(lambda row: row["expected_inside"] is not None)["expected_inside"])
+    inertia = [
+        row["theta"][name] / size
+        for row in committed("real_flight/payload")
+        for name, size in (("Ix", 1.66e-5), ("Iy", 1.67e-5))
+        if row["theta"] and name in row["theta"]
+    ]
+    claimed = {
+        "control": [
+            f"{min(better):.1f} to {max(better):.1f} times",
+            f"{max(settled):.2f} times",
+            f"{100 * min(inside):.0f} to {100 * max(inside):.0f} %",
+            f"{sum(lost)} of {len(lost)} hovers",
+        ],
+        "intervals": [
+            *(f"{min(each):.1f} to {max(each):.1f} times as wide" for each in wide.values()),
+            f"error on another flight in {100 * expected:.0f} %",
+            f"up to {max(inertia):.0f} times the vehicle's inertia",
+        ],
+    }
+    for page, sentences in claimed.items():
+        text = " ".join((DOCS / f"results/{page}.md").read_text().split())
+        assert [sentence for sentence in sentences if " ".join(sentence.split()) not in text] == []
+    return {number for each in claimed.values() for sentence in each for number in DECIMAL.findall(sentence)}
