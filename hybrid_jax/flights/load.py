@@ -4,6 +4,7 @@ import contextlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -14,7 +15,7 @@ from hybrid_jax.flights.checks.consistency import FAILS, WARNS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import DT, flight_at, own_rows
 from hybrid_jax.flights.formats.blackbox import read_blackbox
-from hybrid_jax.flights.formats.column_map import read_mapped
+from hybrid_jax.flights.formats.column_map import load_column_map, read_mapped
 from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
 from hybrid_jax.flights.formats.raw import GZIP, readable
 from hybrid_jax.flights.formats.rosbag import read_rosbag
@@ -192,20 +193,22 @@ def read_recording(
     Raises:
         ValueError: the log is invalid: file, topic or column, time and what was expected.
     """
+    column_map = load_column_map(columns) if columns is not None else None
+    readers = {ULOG: read_ulog, CRAZYFLIE: read_crazyflie, BLACKBOX: read_blackbox}
+    readers |= {CSV: partial(read_mapped, column_map=column_map), ROSBAG: partial(read_rosbag, topics=topics or {})}
     kind, why = format_of(path)
     if not Path(path).exists():
-        raise ValueError(f"{path}: no such file")
-    if kind == CSV:
-        found = read_mapped(path, columns)
+        why = "no such file"
     elif kind == ROSBAG and Path(path).is_file() and _head(path, unpack=False).startswith(GZIP):
-        raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
-    elif kind == ROSBAG:
-        found = read_rosbag(path, topics or {})
-    elif kind:
-        found = {ULOG: read_ulog, CRAZYFLIE: read_crazyflie, BLACKBOX: read_blackbox}[kind](path)
-    else:
-        why = f"is none of {', '.join(dict.fromkeys(SUFFIXES.values()))}, {CRAZYFLIE}" if why == OTHER else why
-        raise ValueError(f"{path}: {why}")
+        kind, why = "", f"a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}"
+    elif why == OTHER:
+        why = f"is none of {', '.join(dict.fromkeys(SUFFIXES.values()))}, {CRAZYFLIE}"
+    try:
+        if why:
+            raise ValueError(why)
+        found = readers[kind](path)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     return reordered(found, motor_order) if len(motor_order) else found
 
 

@@ -140,9 +140,7 @@ def test_damaged_files_are_refused(flight, written, tmp_path):
 def test_too_many_rows_are_refused(flight, written):
     path = written("\n".join([HEADER, *rows_of(flight)]))
     assert len(read_table(path, COLUMNS, max_rows=len(flight))[0]) == len(flight)
-    refusal(
-        lambda: read_table(path, COLUMNS, max_rows=len(flight) - 1), path, f"row {len(flight) + 1}", "split the file"
-    )
+    refusal(lambda: read_table(path, COLUMNS, max_rows=len(flight) - 1), f"row {len(flight) + 1}", "split the file")
 
 
 def test_memory_is_bounded_by_the_numbers_kept(flight, written):

@@ -17,8 +17,8 @@ from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight, what_to_log
 from hybrid_jax.flights.formats import raw
-from hybrid_jax.flights.formats.ulog import SOURCES, read_ulog
-from hybrid_jax.flights.load import reordered
+from hybrid_jax.flights.formats.ulog import SOURCES
+from hybrid_jax.flights.load import read_recording, reordered
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.vehicle import IRIS
 
@@ -29,7 +29,7 @@ pytest.importorskip("pyulog", reason="reading ULog needs the extra `logs`")
 def test_a_flight_with_esc_rpm_is_read(flight, topics, written, packed):
     t = flight.t - flight.t[0]
     content = ulog(topics | {"esc_status": escs(t, flight.u)})
-    log = to_flight(read_ulog(written(gzip.compress(content) if packed else content)))
+    log = to_flight(read_recording(written(gzip.compress(content) if packed else content)))
     np.testing.assert_allclose(np.diff(log.t), 0.01, atol=1e-9)
     truth = CubicSpline(t, flight.x)(log.t + 0.003)
     # Linear between samples: ẍ / (8 · 50²) of position and velocity, ω̈ / (8 · 200²) of rates; slerp of attitude.
@@ -43,17 +43,17 @@ def test_a_flight_with_esc_rpm_is_read(flight, topics, written, packed):
 
 def test_commands_are_shares_that_the_polynomial_converts(flight, topics, written):
     path = written(topics | {"actuator_motors": commands(flight.t - flight.t[0] + 0.003, flight.u)})
-    log = to_flight(reordered(read_ulog(path), (2, 0, 3, 1)), polynomial=(100.0, 1000.0))
+    log = to_flight(reordered(read_recording(path), (2, 0, 3, 1)), polynomial=(100.0, 1000.0))
     np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1][:, [2, 0, 3, 1]], rtol=1e-5)
-    refusal(lambda: to_flight(read_ulog(path)), path, "actuator_motors", "polynomial=")
-    refusal(lambda: reordered(read_ulog(path), (0, 1, 2, 2)), path, "motor_order must")
-    refusal(lambda: to_flight(read_ulog(path), dt=0.0), "dt must be")
+    refusal(lambda: to_flight(read_recording(path)), path, "actuator_motors", "polynomial=")
+    refusal(lambda: reordered(read_recording(path), (0, 1, 2, 2)), path, "motor_order must")
+    refusal(lambda: to_flight(read_recording(path), dt=0.0), "dt must be")
 
 
 def test_commands_are_used_if_escs_report_zero(flight, topics, written):
     t = flight.t - flight.t[0] + 0.003
     both = topics | {"esc_status": escs(t, 0 * flight.u), "actuator_motors": commands(t, flight.u)}
-    log = to_flight(read_ulog(written(both)), polynomial=(100.0, 1000.0))
+    log = to_flight(read_recording(written(both)), polynomial=(100.0, 1000.0))
     np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1], rtol=1e-5)
 
 
@@ -70,7 +70,7 @@ def test_old_logs_hold_pwm_and_the_rates_beside_the_attitude(flight, topics, wri
     ):
         old["vehicle_attitude"].append(struct.pack("<Q7f", at, *(omega @ BODIES["FRD"]), *q))
         old["actuator_outputs"].append(struct.pack("<QI16f", at, 6, *(1000 + u), *[900.0] * 2, *[0.0] * 10))
-    recording = read_ulog(written(ulog(old, formats)))
+    recording = read_recording(written(ulog(old, formats)))
     np.testing.assert_allclose(recording.signals["rates"].values, flight.x[:, 10:], atol=1e-5)
     np.testing.assert_allclose(recording.signals["command"].values, flight.u / 1000, atol=1e-6)
     refusal(lambda: to_flight(recording, polynomial=(0, 1000.0)), "no position and no velocity", "logger_topics.txt")
@@ -88,7 +88,7 @@ def test_motors_are_found_in_any_instance_and_unit(flight, topics, written, rest
     share[:50] = 0.05  # idle on the ground
     instances = {("actuator_outputs", number): outputs(t, rest + share * (full - rest))}
     instances |= {("actuator_outputs", 1 - number): outputs(t, 0 * share + 900)}
-    recording = read_ulog(written(ulog(topics | instances, OUTPUTS)))
+    recording = read_recording(written(ulog(topics | instances, OUTPUTS)))
     np.testing.assert_allclose(recording.signals["command"].values, share, atol=1e-5)
     assert any(f"instance {1 - number} is left out" in note for note in recording.notes)
 
@@ -100,7 +100,7 @@ def test_rotor_speeds_of_a_simulator_may_be_in_radians(flight, topics, written, 
     """Gazebo's esc_rpm was in rad/s until PX4-Autopilot #22721; no rotor of a simulated vehicle is that slow."""
     t = flight.t - flight.t[0]
     speeds = escs(t, flight.u * np.pi / 30 / unit)
-    recording = read_ulog(written(ulog(topics | {"esc_status": speeds}, hardware=hardware)))
+    recording = read_recording(written(ulog(topics | {"esc_status": speeds}, hardware=hardware)))
     np.testing.assert_allclose(recording.signals["rotor_speed"].values[:, :4], flight.u, atol=1)
     assert any("rad/s" in note for note in recording.notes) == (unit == 1.0)
 
@@ -110,19 +110,19 @@ def test_a_moving_motor_is_never_dropped_and_another_airframe_is_refused(flight,
     moving = np.concatenate([flight.u[:, :2]] * 3, axis=1)
     rows = stamped(t, np.concatenate([moving / 2000, np.full((len(t), 6), np.nan)], axis=1))
     path = written(ulog(topics | {"actuator_motors": rows}, parameters={"MAV_TYPE": 2, "SYS_AUTOSTART": 4001}))
-    assert read_ulog(path).rotors == 6
-    (line,) = failures(check_recording(read_ulog(path), IRIS), "log")
+    assert read_recording(path).rotors == 6
+    (line,) = failures(check_recording(read_recording(path), IRIS), "log")
     assert "6 motors are logged" in line
     assert "motor_order=(0, 1, 2, 3)" in line
-    assert not failures(check_recording(reordered(read_ulog(path), (0, 1, 2, 3)), IRIS), "log")
+    assert not failures(check_recording(reordered(read_recording(path), (0, 1, 2, 3)), IRIS), "log")
     path = written(ulog(topics | {"actuator_motors": rows}, parameters={"MAV_TYPE": 2, "SYS_AUTOSTART": 13014}))
-    assert any("VTOL (SYS_AUTOSTART 13014)" in line for line in failures(check_recording(read_ulog(path)), "log"))
+    assert any("VTOL (SYS_AUTOSTART 13014)" in line for line in failures(check_recording(read_recording(path)), "log"))
 
 
 def test_slow_signals_fail_at_their_own_rates(flight, topics, written):
     """ESC telemetry at 4 Hz may not become rotor speeds at 100 Hz."""
     t = flight.t - flight.t[0]
-    recording = read_ulog(written(topics | {"esc_status": escs(t[::25], flight.u[::25])}))
+    recording = read_recording(written(topics | {"esc_status": escs(t[::25], flight.u[::25])}))
     (line,) = failures(check_recording(recording, IRIS, 0.03), "log")
     assert "motors 4 Hz" in line
     assert "dt=0.25" in line
@@ -151,7 +151,7 @@ def test_every_topic_of_a_quantity_is_read_in_its_frame(written, quantity, topic
     form = "".join(f"float[{n}] {name};" if "[" in " ".join(fields) else f"float {name};" for name, n in counts.items())
     formats = {topic: f"uint64_t timestamp;uint64_t timestamp_sample;{form}"}
     content = ulog({topic: stamped(0.01 * np.arange(50), values)}, formats)
-    found = read_ulog(written(content)).signals[quantity].values
+    found = read_recording(written(content)).signals[quantity].values
     own = raw.attitude(values, "NED", "FRD") if quantity == "attitude" else values
     frame = WORLDS["NED"] if quantity in ("position", "velocity") else BODIES["FRD"]
     np.testing.assert_allclose(found, own @ frame.T if len(fields) == 3 else own, atol=1e-6)
@@ -161,7 +161,7 @@ def test_what_the_estimator_calls_invalid_resets_and_dropouts_are_said(written):
     form = "uint64_t timestamp;float x;float y;float z;uint8_t xy_valid;uint8_t z_valid;uint8_t z_reset_counter;"
     rows = [struct.pack("<Q3f3B", START + 10_000 * i, i, 0, 0, i >= 10, 1, i >= 30) for i in range(50)]
     content = ulog({"vehicle_local_position": rows}, {"vehicle_local_position": form})
-    recording = read_ulog(written(content + message("O", struct.pack("<H", 120))))
+    recording = read_recording(written(content + message("O", struct.pack("<H", 120))))
     assert len(recording.signals["position"]) == 40
     for words in ("not valid in 10 of 50", "reset the position (z_reset_counter) at 0.3 s", "longest of 120 ms"):
         assert any(words in note for note in recording.notes)
@@ -172,13 +172,13 @@ def test_a_missing_topic_is_named(flight, topics, written, missing):
     motors = {"esc_status": escs(flight.t - flight.t[0], flight.u)}
     path = written({name: samples for name, samples in (topics | motors).items() if name != missing})
     quantity = dict(zip((*PX4_STATES, "esc_status"), ("position", "attitude", "rates", "motors"), strict=True))[missing]
-    refusal(lambda: to_flight(read_ulog(path)), path, f"no {quantity}", "logger_topics.txt", f"{missing} ")
+    refusal(lambda: to_flight(read_recording(path)), path, f"no {quantity}", "logger_topics.txt", f"{missing} ")
 
 
 def test_a_dropout_becomes_a_gap(flight, topics, written):
     t = flight.t - flight.t[0]
     holed = topics["vehicle_attitude"][:500] + topics["vehicle_attitude"][550:]  # 0.4 s from 4.003 s on
-    log = to_flight(read_ulog(written(topics | {"vehicle_attitude": holed, "esc_status": escs(t, flight.u)})))
+    log = to_flight(read_recording(written(topics | {"vehicle_attitude": holed, "esc_status": escs(t, flight.u)})))
     intervals = np.diff(log.t)
     assert intervals.max() == pytest.approx(0.4, abs=0.02)
     assert np.count_nonzero(intervals > 0.015) == 1
@@ -190,27 +190,27 @@ def test_other_files_are_refused(flight, topics, written, tmp_path):
     topics = topics | {"esc_status": escs(flight.t - flight.t[0], flight.u)}
     whole = ulog(topics)
     for content in (b"", b"t,px,py\n", whole[:7]):
-        refusal(lambda content=content: read_ulog(written(content)), "flight.log")
-    refusal(lambda: read_ulog(tmp_path / "none.ulg"), "none.ulg", "no such file")
+        refusal(lambda content=content: read_recording(written(content)), "flight.log")
+    refusal(lambda: read_recording(tmp_path / "none.ulg"), "none.ulg", "no such file")
     zero = stamped(np.arange(0.0, 5, 0.01), np.zeros((500, 4)))
-    refusal(lambda: read_ulog(written(topics | {"vehicle_attitude": zero})), "vehicle_attitude", "norm")
+    refusal(lambda: read_recording(written(topics | {"vehicle_attitude": zero})), "vehicle_attitude", "norm")
     bad = stamped(np.arange(0.0, 5, 0.01), np.full((500, 3), np.nan))
-    refusal(lambda: read_ulog(written(topics | {"vehicle_angular_velocity": bad})), "xyz[0]", "x is nan at 0 s")
+    refusal(lambda: read_recording(written(topics | {"vehicle_angular_velocity": bad})), "xyz[0]", "x is nan at 0 s")
 
 
 def test_a_log_that_was_cut_off_is_read_and_fails(flight, topics, written):
     whole = ulog(topics | {"esc_status": escs(flight.t - flight.t[0], flight.u)})
-    (line,) = failures(check_recording(read_ulog(written(whole[:-500])), IRIS), "log")
+    (line,) = failures(check_recording(read_recording(written(whole[:-500])), IRIS), "log")
     assert "ends in the middle of a message, after 11" in line
     assert 'failed="warn"' in line
 
 
 def test_a_clock_that_jumps_is_refused_or_a_gap(flight, topics, written):
     rates, late = topics["vehicle_angular_velocity"], stamped(np.arange(0.0, 1, 0.005) + 3600, np.ones((200, 3)))
-    recording = read_ulog(written(topics | {"vehicle_angular_velocity": rates + late}))
+    recording = read_recording(written(topics | {"vehicle_angular_velocity": rates + late}))
     (line,) = [line for line in failures(check_recording(recording), "log") if "longest gap" in line]
     assert "vehicle_angular_velocity" in line
     assert "split the file" in line
     back = rates[:1000] + stamped(np.arange(0.0, 1, 0.005), np.ones((200, 3)))
     content = ulog({"vehicle_angular_velocity": back}, ordered=False)
-    refusal(lambda: read_ulog(written(content)), "flight.log", "vehicle_angular_velocity", "time goes back from")
+    refusal(lambda: read_recording(written(content)), "flight.log", "vehicle_angular_velocity", "time goes back from")

@@ -31,7 +31,7 @@ def read_blackbox(path: str | Path) -> Recording:
     try:
         import orangebox  # noqa: F401
     except ImportError as error:
-        raise ValueError(f"{path}: reading blackbox needs orangebox: pip install 'hybrid_jax[logs]'") from error
+        raise ValueError("reading blackbox needs orangebox: pip install 'hybrid_jax[logs]'") from error
     logging.getLogger("orangebox").setLevel(logging.ERROR)
     content, flights, why = raw.unpacked(path), [], []
     begins = [found.start() for found in re.finditer(re.escape(MAGIC), content)]
@@ -43,12 +43,12 @@ def read_blackbox(path: str | Path) -> Recording:
     parser, rows, damage = max(flights, key=lambda flight: len(flight[1]), default=(None, np.zeros((0, 0)), ""))
     if parser is None:
         said = f" ({why[0]})" if why else ""
-        raise ValueError(f"{path}: is not a blackbox log or is damaged; save it again{said}")
+        raise ValueError(f"is not a blackbox log or is damaged; save it again{said}")
     if not len(rows):
-        raise ValueError(f"{path}: holds no frames; save the log again")
+        raise ValueError("holds no frames; save the log again")
     columns = dict(zip(parser.field_names, rows.T, strict=False))
     if "time" not in columns:
-        raise ValueError(f"{path}: has no field time; save the log again")
+        raise ValueError("has no field time; save the log again")
     headers = parser.headers
     program = str(headers.get("Firmware revision", headers.get("Firmware type", "unknown")))
     facts = {"format": "Betaflight blackbox", "program": program, "vehicle": "multirotor"}
@@ -58,7 +58,7 @@ def read_blackbox(path: str | Path) -> Recording:
     notes += [f"holds {flown} flights: the longest is read; save each by itself"] * (flown > 1)
     empty = len(begins) - flown
     notes += [f"{empty} times the vehicle was armed and nothing was recorded: left out"] * (empty > 0)
-    return raw.record(path, dict(_parts(path, columns, headers)), 1e-6, notes, facts)
+    return raw.record(path, dict(_parts(columns, headers)), 1e-6, notes, facts)
 
 
 @cache
@@ -112,7 +112,7 @@ def _frames(content: bytes) -> tuple[Any, np.ndarray, str]:
     return parser, np.array(sound, float).reshape(len(sound), width), damage
 
 
-def _parts(path, columns, headers) -> Iterator[tuple[str, Samples]]:
+def _parts(columns, headers) -> Iterator[tuple[str, Samples]]:
     def part(names: list[str], factor: float, rest: float = 0.0) -> Samples:
         values = (np.stack([columns[name] for name in names], axis=1) - rest) * factor
         return Samples(columns["time"], values, " ".join(names))
@@ -122,9 +122,9 @@ def _parts(path, columns, headers) -> Iterator[tuple[str, Samples]]:
 
     if len(gyro := of("gyroADC", 3)) == 3:
         fine = 0.1 if headers.get("blackbox_high_resolution") == 1 else 1.0
-        yield "rates", part(gyro, _scale(path, headers) * fine * np.pi / 180)
+        yield "rates", part(gyro, _scale(headers) * fine * np.pi / 180)
     if len(acc := of("accSmooth", 3)) == 3:
-        yield "specific_force", part(acc, GRAVITY / _number(path, headers, "acc_1G"))
+        yield "specific_force", part(acc, GRAVITY / _number(headers, "acc_1G"))
     if "vbatLatest" in columns:
         # Cells in 0.1 V until Betaflight 3, in 0.01 V from 4 on.
         yield "voltage", part(["vbatLatest"], 0.01 if _most(headers.get("vbatcellvoltage")) > 100 else 0.1)
@@ -133,17 +133,17 @@ def _parts(path, columns, headers) -> Iterator[tuple[str, Samples]]:
         found = part(names, 1 / (high - low), low)
         yield "command", found._replace(values=np.maximum(found.values, 0.0))
     if (names := of("eRPM", MOST)) and columns[names[0]].any():
-        yield "rotor_speed", part(names, 100 * 2 / _number(path, headers, "motor_poles", POLES) * np.pi / 30)
+        yield "rotor_speed", part(names, 100 * 2 / _number(headers, "motor_poles", POLES) * np.pi / 30)
 
 
-def _scale(path, headers) -> float:
+def _scale(headers) -> float:
     """Decode gyro_scale [deg/s per count] from the bits of a float."""
     given = headers.get("gyro_scale", 0x3F800000)
     with contextlib.suppress(struct.error):
         (scale,) = struct.unpack("<f", struct.pack("<I", given))
         if 0 < scale < 100:
             return scale
-    raise ValueError(f"{path}: header gyro_scale must be the bits of a float, got {str(given)[:40]!r}")
+    raise ValueError(f"header gyro_scale must be the bits of a float, got {str(given)[:40]!r}")
 
 
 def _most(given) -> float:
@@ -152,8 +152,8 @@ def _most(given) -> float:
     return max((number for number in each if isinstance(number, int | float)), default=0)
 
 
-def _number(path, headers, name: str, usual: float | None = None) -> float:
+def _number(headers, name: str, usual: float | None = None) -> float:
     given = headers.get(name, usual)
     if not isinstance(given, int | float) or given <= 0:
-        raise ValueError(f"{path}: header {name} must be a positive number, got {str(given)[:40]!r}")
+        raise ValueError(f"header {name} must be a positive number, got {str(given)[:40]!r}")
     return float(given)

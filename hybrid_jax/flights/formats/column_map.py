@@ -129,9 +129,9 @@ def library_map(path: str | Path) -> ColumnMap:
     )
 
 
-def read_mapped(path: str | Path, columns: str | Path | None = None) -> Recording:
+def read_mapped(path: str | Path, column_map: ColumnMap | None) -> Recording:
     """Read the mapped quantities of a CSV file; a quantity has the times of the rows in which it is given."""
-    column_map = library_map(path) if columns is None else load_column_map(columns)
+    column_map = column_map or library_map(path)
     form, stated, frames = column_map.format, column_map.quantities, column_map.frames
     table, notes = read_table(path, column_map.names, delimiter=form.delimiter, decimal=form.decimal)
     named = dict(zip(column_map.names, table.T, strict=True))
@@ -146,7 +146,7 @@ def read_mapped(path: str | Path, columns: str | Path | None = None) -> Recordin
         if each.polynomial:
             values = np.polynomial.polynomial.polyval(values, each.polynomial)
         if name == "attitude":
-            values = _attitude(values, each, path)
+            values = _attitude(values, each)
         commands = each.unit in SHARES and not each.polynomial
         quantity = {"body_rates": "rates", "motors": "command" if commands else "rotor_speed"}.get(name, name)
         quantity = "body_velocity" if name == "velocity" and frames.velocity == "body" else quantity
@@ -161,13 +161,13 @@ def of_unit(motors: Float[np.ndarray, "n m"], unit: str) -> Float[np.ndarray, "n
     return np.where(disarmed, 0.0, motors - rest) * SCALES["motors"][unit]
 
 
-def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str | Path) -> Float[np.ndarray, "n 4"]:
+def _attitude(values: Float[np.ndarray, "n k"], stated: Columns) -> Float[np.ndarray, "n 4"]:
     fields = " ".join(stated.columns)
     if len(stated.columns) == 3:
         # Yaw may be counted over turns, tilt may not.
         if (np.abs(values[:, :2]) > 2 * math.pi).any():
             advice = 'roll or pitch above 2π; are the angles degrees? set [attitude] unit = "deg"'
-            raise ValueError(f"{origin}: field {fields}: {advice}")
+            raise ValueError(f"field {fields}: {advice}")
         return from_euler(values)
     return np.roll(values, 1, axis=1) if stated.unit == "xyzw" else values
 

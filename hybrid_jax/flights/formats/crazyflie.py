@@ -108,24 +108,24 @@ def read_crazyflie(path: str | Path) -> Recording:
     """Read one log. Commands are the PWM or, without it, the mixer's output, as shares of 65536."""
     content = raw.unpacked(path)
     try:
-        events, at = _header(path, content)
+        events, at = _header(content)
     except (struct.error, IndexError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: the header of the µSD log is cut off or damaged; copy the file again") from error
+        raise ValueError("the header of the µSD log is cut off or damaged; copy the file again") from error
     whole = len(content) > at + 4 and zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
     columns, end = _columns(content, at, len(content) - 4 * whole, events)
     if not columns:
-        raise ValueError(f"{path}: holds no records; record the flight again, or copy the file again")
+        raise ValueError("holds no records; record the flight again, or copy the file again")
     facts, notes = {"format": "Crazyflie µSD", "vehicle": "multirotor of 4 rotors"}, []
     if not whole:
         last = max(ticks[-1] for ticks, _ in columns.values()) - min(ticks[0] for ticks, _ in columns.values())
         facts["damage"] = f"its CRC-32 is wrong: cut off or changed; records end at {1e-6 * float(last):.4g} s"
     elif end != len(content) - 4:
-        raise ValueError(f"{path}: byte {end}: a record of no known event; was the file written by another firmware?")
+        raise ValueError(f"byte {end}: a record of no known event; was the file written by another firmware?")
     for name, (ticks, values) in columns.items():
         jumps = np.flatnonzero(np.abs(np.diff(values.astype(float))) > 0.98 * LIMITED) + 1
         for row in jumps[:1] if values.dtype == np.int16 else ():
             at, numbers = 1e-6 * float(ticks[row] - ticks[0]), f"{values[row - 1]:g} to {values[row]:g}"
-            raise ValueError(f"{path}: {name}: goes from {numbers} at {at:.4g} s: 16 bits wrapped; log it as a float")
+            raise ValueError(f"{name}: goes from {numbers} at {at:.4g} s: 16 bits wrapped; log it as a float")
     parts = dict(_parts(columns, notes))
     used = {name for part in parts.values() for name in part.source.split()}
     if rest := sorted({name.split(".")[0] for name in columns.keys() - used}):
@@ -138,10 +138,10 @@ def is_crazyflie(head: bytes) -> bool:
     return len(head) >= 3 and head[0] == MAGIC and head[1:3] == VERSION.to_bytes(2, "little")
 
 
-def _header(path, content: bytes) -> tuple[dict[bytes, tuple[list[str], np.dtype]], int]:
+def _header(content: bytes) -> tuple[dict[bytes, tuple[list[str], np.dtype]], int]:
     """Return the variables and type of each event by its id, and where the records begin."""
     if not is_crazyflie(content):
-        raise ValueError(f"{path}: is not a µSD log of version {VERSION} of a Crazyflie; copy the file again")
+        raise ValueError(f"is not a µSD log of version {VERSION} of a Crazyflie; copy the file again")
     count, at, events = *struct.unpack_from("<H", content, 3), 5, {}
     for _ in range(count):
         key = content[at : at + 2]
@@ -152,9 +152,7 @@ def _header(path, content: bytes) -> tuple[dict[bytes, tuple[list[str], np.dtype
             text, at = _text(content, at)
             match = _VARIABLE.fullmatch(text)
             if match is None:
-                raise ValueError(
-                    f"{path}: byte {at}: {text[:40]!r} is not a variable with its type; copy the file again"
-                )
+                raise ValueError(f"byte {at}: {text[:40]!r} is not a variable with its type; copy the file again")
             names.append(match[1])
             kinds.append((str(i), f"<{match[2].translate(KINDS)}"))
         events[key] = names, np.dtype(kinds)

@@ -42,7 +42,7 @@ def read_table(
             names, header, above = _header(text, delimiter)
             for name in columns:
                 if names.count(name) != 1:
-                    raise ValueError(_header_complaint(path, name, names, header, delimiter))
+                    raise ValueError(_header_complaint(name, names, header, delimiter))
             picked, row = [names.index(name) for name in columns], above + 1
             while more := text.read(BLOCK):
                 block = more + text.readline(MAX_ROW_LENGTH)
@@ -51,15 +51,15 @@ def read_table(
                     lines.pop()
                 elif len(lines[-1]) >= MAX_ROW_LENGTH:
                     last = row + len(lines) - 1
-                    raise ValueError(f"{path}: row {last}: is too long for a row of numbers; is this a CSV file?")
+                    raise ValueError(f"row {last}: is too long for a row of numbers; is this a CSV file?")
                 if row - above - 1 + len(lines) > max_rows:
-                    raise ValueError(f"{path}: row {max_rows + 2}: more than {max_rows} rows; split the file by flight")
-                parts.append(_numbers(path, lines, row, names, picked, delimiter))
+                    raise ValueError(f"row {max_rows + 2}: more than {max_rows} rows; split the file by flight")
+                parts.append(_numbers(lines, row, names, picked, delimiter))
                 row += len(lines)
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is not text; export the log as CSV in UTF-8") from error
+        raise ValueError("is not text; export the log as CSV in UTF-8") from error
     if not parts:
-        raise ValueError(f"{path}: row {row}: there are no samples below the header; record or export the flight again")
+        raise ValueError(f"row {row}: there are no samples below the header; record or export the flight again")
     return np.concatenate(parts), () if block.endswith("\n") else (CUT,)
 
 
@@ -79,27 +79,27 @@ def _header(text: IO[str], delimiter: str) -> tuple[list[str], str, int]:
     return [name.strip() for name in line.split(delimiter)], line, row
 
 
-def _header_complaint(path, name: str, names: list[str], header: str, delimiter: str) -> str:
+def _header_complaint(name: str, names: list[str], header: str, delimiter: str) -> str:
     if not header.strip():
-        return f"{path}: row 1: the file is empty or has no header; export the log again"
+        return "row 1: the file is empty or has no header; export the log again"
     if name in names:
-        return f"{path}: row 1, field {name}: stands {names.count(name)} times in the header; rename all but one"
+        return f"row 1, field {name}: stands {names.count(name)} times in the header; rename all but one"
     for other in (";", "\t", ",", " "):
         if len(names) == 1 and other != delimiter and header.count(other) > 2:
             advice = f"set format = {{delimiter = {json.dumps(other)}}} in a column map, columns=…"
-            return f"{path}: row 1: the fields are separated by {other!r}, not {delimiter!r}; {advice}"
+            return f"row 1: the fields are separated by {other!r}, not {delimiter!r}; {advice}"
     named = [each for each in names if each]  # a table's index has no name
     found = ", ".join(named[:20])[:200].encode("unicode_escape").decode()
-    return f"{path}: row 1, field {name}: no such column among {found}; rename a column or use a column map"
+    return f"row 1, field {name}: no such column among {found}; rename a column or use a column map"
 
 
-def _numbers(path, lines: list[str], row: int, names, picked, delimiter: str) -> Float[np.ndarray, "n c"]:
+def _numbers(lines: list[str], row: int, names, picked, delimiter: str) -> Float[np.ndarray, "n c"]:
     """Parse the picked cells of some lines, whose first is the given row."""
     for at, line in enumerate(lines):
         if (count := line.count(delimiter) + 1) != len(names):
             found = f"{count} fields" if line.strip() else "a blank line"
             mend = LISTS if "[" in line else "repair or cut the row out"
-            raise ValueError(f"{path}: row {row + at}: {found}, the header has {len(names)}; {mend}")
+            raise ValueError(f"row {row + at}: {found}, the header has {len(names)}; {mend}")
     for told in (str, lambda line: delimiter.join(map(_told, line.split(delimiter)))):
         with contextlib.suppress(ValueError):
             table = np.loadtxt(list(map(told, lines)), delimiter=delimiter, usecols=picked, comments=None, ndmin=2)
@@ -109,8 +109,8 @@ def _numbers(path, lines: list[str], row: int, names, picked, delimiter: str) ->
         cells = line.split(delimiter)
         for column in picked:
             if said := _bad_cell(cells[column].strip(), delimiter):
-                raise ValueError(f"{path}: row {row + at}, field {names[column]}: {said}")
-    raise ValueError(f"{path}: rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again")
+                raise ValueError(f"row {row + at}, field {names[column]}: {said}")
+    raise ValueError(f"rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again")
 
 
 def _told(cell: str) -> str:

@@ -60,13 +60,13 @@ class _Unpacked(io.RawIOBase):
         self.left -= count
         if self.left < 0:
             most = f"{self.most / 2**20:.0f} MiB"
-            raise ValueError(f"{self.path}: unpacks to over {most}, as no log does; unpack it first")
+            raise ValueError(f"unpacks to over {most}, as no log does; unpack it first")
         return count
 
 
 @contextlib.contextmanager
 def readable(path: str | Path, unpack: bool = True) -> Iterator[IO[bytes]]:
-    """Open a file, plain or gzip; raise ValueError, with the file and what to do, if it cannot be read."""
+    """Open a file, plain or gzip; raise ValueError, with what to do, if it cannot be read."""
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
@@ -76,11 +76,11 @@ def readable(path: str | Path, unpack: bool = True) -> Iterator[IO[bytes]]:
             plain.seek(0)
             yield io.BufferedReader(_Unpacked(path, plain)) if packed else plain
     except FileNotFoundError as error:
-        raise ValueError(f"{path}: no such file") from error
+        raise ValueError("no such file") from error
     except (EOFError, zlib.error) as error:
-        raise ValueError(f"{path}: the gzip data are truncated or damaged; copy the file again") from error
+        raise ValueError("the gzip data are truncated or damaged; copy the file again") from error
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise ValueError(f"cannot be read: {error.strerror or error}") from error
 
 
 def unpacked(path: str | Path) -> bytes:
@@ -104,13 +104,13 @@ def record(
     parts = {name: part for name, part in parts.items() if len(part.ticks)}
     if not parts:
         said = "".join(f" ({note})" for note in notes)
-        raise ValueError(f"{path}: holds no quantity of a flight{said}; see docs/howto/logs.md for what to log")
+        raise ValueError(f"holds no quantity of a flight{said}; see docs/howto/logs.md for what to log")
     said, signals, ordered = list(notes), {}, {}
     for name, part in parts.items():
-        kept, lines = _in_order(f"{path}: {part.source}", part.ticks, tick)
+        kept, lines = _in_order(part.source, part.ticks, tick)
         same = np.flatnonzero(np.diff(part.ticks) == 0)
         if (part.values[same + 1] != part.values[same]).any(axis=1).sum() > SHARED * len(part.ticks):
-            raise ValueError(f"{path}: {part.source}: many samples share a time: {FEW_DIGITS}")
+            raise ValueError(f"{part.source}: many samples share a time: {FEW_DIGITS}")
         ordered[name] = part._replace(ticks=part.ticks[kept], values=part.values[kept])
         said += [f"{part.source}: {line}: left out" for line in lines]
     start = min(part.ticks[0] for part in ordered.values())
@@ -125,17 +125,14 @@ def record(
             said.append(f"{part.source}: {why}, the first at {t[gone][0]:.4g} s: left out")
             t, part = t[~gone], part._replace(values=part.values[~gone])
         elif gone.any():
-            raise ValueError(f"{path}: {part.source}: {_wrong(name, part, int(gone.argmax()), t)}")
+            raise ValueError(f"{part.source}: {_wrong(name, part, int(gone.argmax()), t)}")
         own, values = own_samples(t, part.values, name not in AS_TOLD)
         if len(own) < len(t):
             apart = float(np.median(np.diff(own)))
             drawn = f"values repeated, or lines between samples {apart:.3g} s apart"
             said.append(f"{part.source}: {drawn}: read as these samples")
-        try:
-            found = Signal(own, values, axes_of(name, values.shape[1]), part.source)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-        signals |= {name: found} if len(t) else {}
+        if len(t):
+            signals[name] = Signal(own, values, axes_of(name, values.shape[1]), part.source)
     return Recording(str(path), signals, tuple(dict.fromkeys(said)), facts or {})
 
 

@@ -69,7 +69,7 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
     for role, (topic, field, unit) in chosen.items():
         heard, ticks = [message for _, message in messages[topic]], _stamps(messages[topic])
         if role == "motors":
-            values, name = _motors(path, topic, field, heard)
+            values, name = _motors(topic, field, heard)
             kind = "command" if unit in SHARES else "rotor_speed"
             parts[kind] = Samples(ticks, of_unit(values, unit), f"{topic} {name}")
             continue
@@ -93,11 +93,11 @@ def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, t
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise ValueError(f"{path}: reading bags needs rosbags: pip install 'hybrid_jax[logs]'") from error
+        raise ValueError("reading bags needs rosbags: pip install 'hybrid_jax[logs]'") from error
     try:
         with AnyReader([Path(path)], default_typestore=get_typestore(Stores.LATEST)) as bag:
             types = {each.topic: each.msgtype for each in bag.connections if each.msgcount}
-            chosen = _chosen(path, types, topics)
+            chosen = _chosen(types, topics)
             names = {topic for topic, *_ in chosen.values()} | {
                 topic for topic in types if _px4(types[topic]) in TOPICS
             }
@@ -110,10 +110,10 @@ def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, t
     except Exception as error:  # a damaged bag makes its libraries raise any exception
         why = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
         raise ValueError(
-            f"{path}: is not a bag, or is cut off or damaged: ros2 bag reindex, or copy it again ({why})"
+            f"is not a bag, or is cut off or damaged: ros2 bag reindex, or copy it again ({why})"
         ) from error
     if empty := [topic for topic, found in messages.items() if not found]:
-        raise ValueError(f"{path}: topic {empty[0]} has lost its messages; ros2 bag reindex, or copy it again")
+        raise ValueError(f"topic {empty[0]} has lost its messages; ros2 bag reindex, or copy it again")
     return types, chosen, messages
 
 
@@ -150,7 +150,7 @@ def _fields(message, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + name, value
 
 
-def _chosen(path, types: Mapping[str, str], topics: Mapping[str, str]) -> dict[str, tuple[str, str, str]]:
+def _chosen(types: Mapping[str, str], topics: Mapping[str, str]) -> dict[str, tuple[str, str, str]]:
     """Map role → topic and, for motors, field and unit."""
     found = {}
     for role, kinds in READERS.items():
@@ -158,17 +158,17 @@ def _chosen(path, types: Mapping[str, str], topics: Mapping[str, str]) -> dict[s
         # Of mavros: the same velocity in the body.
         fitting = [topic for topic, kind in types.items() if kind.split("/")[-1] in known and "body" not in topic]
         if role in topics:
-            _require(path, topics[role], types, role, known)
+            _require(topics[role], types, role, known)
             fitting = [topics[role]]
         if len(fitting) > 1:
             first, *_ = names = sorted(fitting)
             choose = f'choose one: topics={{"{role}": "{first}"}}'
-            raise ValueError(f"{path}: topics {' and '.join(names)} hold {role}; {choose}")
+            raise ValueError(f"topics {' and '.join(names)} hold {role}; {choose}")
         if fitting:
             found[role] = (fitting[0], "", "")
     if "motors" in topics:
         topic, *given = topics["motors"].split(":")
-        _require(path, topic, types)
+        _require(topic, types)
         if len(given) != 2 or given[1] not in SCALES["motors"] or given[1] == "command":
             units = ", ".join(unit for unit in SCALES["motors"] if unit != "command")
             raise ValueError(
@@ -180,14 +180,14 @@ def _chosen(path, types: Mapping[str, str], topics: Mapping[str, str]) -> dict[s
     return found
 
 
-def _require(path, topic: str, types: Mapping[str, str], role: str = "", kinds: Collection[str] = ()) -> None:
+def _require(topic: str, types: Mapping[str, str], role: str = "", kinds: Collection[str] = ()) -> None:
     if topic not in types:
-        raise ValueError(f"{path}: has no messages of topic {topic}, only of {', '.join(sorted(types)) or 'none'}")
+        raise ValueError(f"has no messages of topic {topic}, only of {', '.join(sorted(types)) or 'none'}")
     kind = types[topic].split("/")[-1]
     if role and kind not in kinds:
         others = [other for other, readers in READERS.items() if kind in readers]
         mend = f'; it can be {others[0]}: topics={{"{others[0]}": "{topic}"}}' if others else ""
-        raise ValueError(f"{path}: topics: {role} must be of type {', '.join(sorted(kinds))}; {topic} is {kind}{mend}")
+        raise ValueError(f"topics: {role} must be of type {', '.join(sorted(kinds))}; {topic} is {kind}{mend}")
 
 
 def _stamps(messages) -> np.ndarray:
@@ -205,17 +205,17 @@ def _numbers(message, field: str):
     return [getattr(each, part, None) for each in found] if part else np.ravel(found)
 
 
-def _motors(path, topic: str, field: str, messages) -> tuple[np.ndarray, str]:
+def _motors(topic: str, field: str, messages) -> tuple[np.ndarray, str]:
     """Return the numbers of each motor and the name of their field."""
     fields = field.split("|")
     name = next((name for name in fields if len(_numbers(messages[0], name))), fields[0])
     try:
         rows = [np.asarray(_numbers(message, name), float).ravel() for message in messages]
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {topic}: field {name} must hold a number for each motor") from error
+        raise ValueError(f"{topic}: field {name} must hold a number for each motor") from error
     counts = {len(row) for row in rows}
     if len(counts) > 1 or min(counts) < FEWEST_ROTORS:
         known = ", ".join(each for each in vars(messages[0]) if not each.startswith("_"))
         found = f"{', '.join(map(str, sorted(counts)))} numbers, must be one for each motor; its fields are {known}"
-        raise ValueError(f"{path}: {topic}: field {name} holds {found}")
+        raise ValueError(f"{topic}: field {name} holds {found}")
     return np.stack(rows), name

@@ -93,7 +93,7 @@ def _load(path: str | Path) -> tuple[Any, str]:
     try:
         import pyulog
     except ImportError as error:
-        raise ValueError(f"{path}: reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
+        raise ValueError("reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
     content = raw.unpacked(path)
     try:
         # pyulog reports damage on standard output only. In memory, where a seek stops at 0, it may go round for ever.
@@ -103,10 +103,10 @@ def _load(path: str | Path) -> tuple[Any, str]:
             log = pyulog.ULog(file, TOPICS)
         cut = _cut(content)
     except Exception as error:  # pyulog raises any exception for a damaged file
-        raise ValueError(f"{path}: is not a ULog or is damaged; download it again ({type(error).__name__})") from error
+        raise ValueError(f"is not a ULog or is damaged; download it again ({type(error).__name__})") from error
     seconds = (log.last_timestamp - log.start_timestamp) * 1e-6
     if log.file_corruption:
-        raise ValueError(f"{path}: is damaged before {seconds:.4g} s (corrupt messages); download it again")
+        raise ValueError(f"is damaged before {seconds:.4g} s (corrupt messages); download it again")
     return log, f"ends in the middle of a message, after {seconds:.4g} s" * cut
 
 
