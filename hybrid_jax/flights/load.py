@@ -4,7 +4,6 @@ import contextlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -17,7 +16,7 @@ from hybrid_jax.flights.conversion import DT, flight_at, own_rows
 from hybrid_jax.flights.formats.blackbox import read_blackbox
 from hybrid_jax.flights.formats.column_map import load_column_map, read_mapped
 from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
-from hybrid_jax.flights.formats.raw import GZIP, readable
+from hybrid_jax.flights.formats.raw import GZIP, readable, record, unpacked
 from hybrid_jax.flights.formats.rosbag import read_rosbag
 from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.log import FlightLog, unevenness
@@ -194,8 +193,6 @@ def read_recording(
         ValueError: the log is invalid: file, topic or column, time and what was expected.
     """
     column_map = load_column_map(columns) if columns is not None else None
-    readers = {ULOG: read_ulog, CRAZYFLIE: read_crazyflie, BLACKBOX: read_blackbox}
-    readers |= {CSV: partial(read_mapped, column_map=column_map), ROSBAG: partial(read_rosbag, topics=topics or {})}
     kind, why = format_of(path)
     if not Path(path).exists():
         why = "no such file"
@@ -206,7 +203,13 @@ def read_recording(
     try:
         if why:
             raise ValueError(why)
-        found = readers[kind](path)
+        if kind == CSV:
+            parts = read_mapped(path, column_map)
+        elif kind == ROSBAG:
+            parts = read_rosbag(path, topics or {})
+        else:
+            parts = {ULOG: read_ulog, CRAZYFLIE: read_crazyflie, BLACKBOX: read_blackbox}[kind](unpacked(path))
+        found = record(path, *parts)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return reordered(found, motor_order) if len(motor_order) else found

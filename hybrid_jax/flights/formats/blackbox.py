@@ -11,14 +11,11 @@ import struct
 import tempfile
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hybrid_jax.flights.formats import raw
-from hybrid_jax.flights.formats.raw import Samples
-from hybrid_jax.flights.recording import Recording
+from hybrid_jax.flights.formats.raw import Parts, Samples
 
 GRAVITY, MOST, POLES, DSHOT = 9.81, 12, 14, 2047
 MAGIC = b"H Product:Blackbox"
@@ -26,14 +23,14 @@ ADJUSTED, RESUMED, DISARMED, ENDED = 13, 14, 15, 255  # events
 FULL = {True: (48.0, 2047.0), False: (1000.0, 2000.0)}  # motors at rest and at most: of DShot and of PWM
 
 
-def read_blackbox(path: str | Path) -> Recording:
+def read_blackbox(content: bytes) -> Parts:
     """Read the longest flight of a file. Commands are in 0 … 1; rotor speeds need bidirectional DShot."""
     try:
         import orangebox  # noqa: F401
     except ImportError as error:
         raise ValueError("reading blackbox needs orangebox: pip install 'hybrid_jax[logs]'") from error
     logging.getLogger("orangebox").setLevel(logging.ERROR)
-    content, flights, why = raw.unpacked(path), [], []
+    flights, why = [], []
     begins = [found.start() for found in re.finditer(re.escape(MAGIC), content)]
     for begin, end in zip(begins, [*begins[1:], len(content)], strict=True):
         try:  # each by itself, as orangebox goes through the whole file for each
@@ -58,7 +55,7 @@ def read_blackbox(path: str | Path) -> Recording:
     notes += [f"holds {flown} flights: the longest is read; save each by itself"] * (flown > 1)
     empty = len(begins) - flown
     notes += [f"{empty} times the vehicle was armed and nothing was recorded: left out"] * (empty > 0)
-    return raw.record(path, dict(_parts(columns, headers)), 1e-6, notes, facts)
+    return dict(_parts(columns, headers)), 1e-6, notes, facts
 
 
 @cache

@@ -26,7 +26,6 @@ from jaxtyping import Float
 from hybrid_jax.flights.attitude import Frames, from_euler
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.csv import header_of, read_table
-from hybrid_jax.flights.recording import Recording
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_NAMES, VELOCITY, input_names
 from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS, from_table, read_tables, require_known
 
@@ -129,7 +128,7 @@ def library_map(path: str | Path) -> ColumnMap:
     )
 
 
-def read_mapped(path: str | Path, column_map: ColumnMap | None) -> Recording:
+def read_mapped(path: str | Path, column_map: ColumnMap | None) -> raw.Parts:
     """Read the mapped quantities of a CSV file; a quantity has the times of the rows in which it is given."""
     column_map = column_map or library_map(path)
     form, stated, frames = column_map.format, column_map.quantities, column_map.frames
@@ -151,7 +150,7 @@ def read_mapped(path: str | Path, column_map: ColumnMap | None) -> Recording:
         quantity = {"body_rates": "rates", "motors": "command" if commands else "rotor_speed"}.get(name, name)
         quantity = "body_velocity" if name == "velocity" and frames.velocity == "body" else quantity
         found[quantity] = raw.Samples(t[told], values, f"columns {source}")
-    return raw.record(path, raw.turned(found, frames.world, frames.body), notes=notes, facts={"format": "CSV"})
+    return raw.turned(found, frames.world, frames.body), 1.0, notes, {"format": "CSV"}
 
 
 def of_unit(motors: Float[np.ndarray, "n m"], unit: str) -> Float[np.ndarray, "n m"]:

@@ -12,14 +12,11 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 
 import numpy as np
 
 from hybrid_jax.flights.attitude import from_euler
-from hybrid_jax.flights.formats import raw
-from hybrid_jax.flights.formats.raw import Samples
-from hybrid_jax.flights.recording import Recording
+from hybrid_jax.flights.formats.raw import Parts, Samples
 
 MAGIC, VERSION, GRAVITY, FULL = 0xBC, 2, 9.81, 65536.0
 _VARIABLE = re.compile(r"(.+)\(([?bBhHiIlLqQefd])\)")
@@ -104,9 +101,8 @@ SOURCES: dict[str, list[tuple[tuple[str, ...], Conversion, str]]] = {
 Variables = dict[str, tuple[np.ndarray, np.ndarray]]  # variable → its ticks [µs] and values
 
 
-def read_crazyflie(path: str | Path) -> Recording:
+def read_crazyflie(content: bytes) -> Parts:
     """Read one log. Commands are the PWM or, without it, the mixer's output, as shares of 65536."""
-    content = raw.unpacked(path)
     try:
         events, at = _header(content)
     except (struct.error, IndexError, UnicodeDecodeError) as error:
@@ -130,7 +126,7 @@ def read_crazyflie(path: str | Path) -> Recording:
     used = {name for part in parts.values() for name in part.source.split()}
     if rest := sorted({name.split(".")[0] for name in columns.keys() - used}):
         notes.append(f"groups with variables that are not used: {', '.join(rest)}")
-    return raw.record(path, parts, 1e-6, notes, facts)
+    return parts, 1e-6, notes, facts
 
 
 def is_crazyflie(head: bytes) -> bool:

@@ -45,6 +45,9 @@ class Samples(NamedTuple):
     source: str
 
 
+Parts = tuple[Mapping[str, Samples], float, Sequence[str], Mapping[str, str]]  # what readers give to `record`
+
+
 class _Unpacked(io.RawIOBase):
     """Bytes of a gzip file, up to the size that a log may have."""
 

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 
 from hybrid_jax.flights.attitude import rotation_of
-from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.column_map import SCALES, SHARES, of_unit
-from hybrid_jax.flights.formats.raw import Samples
+from hybrid_jax.flights.formats.raw import Parts, Samples
 from hybrid_jax.flights.formats.ulog import TOPICS, motors, states
 from hybrid_jax.flights.log import unlike_one
-from hybrid_jax.flights.recording import AXES, Recording
+from hybrid_jax.flights.recording import AXES
 from hybrid_jax.vehicle import FEWEST_ROTORS
 
 PX4 = "px4_msgs/"
@@ -59,9 +58,8 @@ ROLES = (*READERS, "motors")
 Messages = dict[str, list[tuple[int, Any]]]  # topic → time [ns] and content of each
 
 
-def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Recording:
+def read_rosbag(path: str | Path, topics: Mapping[str, str]) -> Parts:
     """Read one bag: a folder with metadata.yaml, or a .mcap, .db3 or .bag file."""
-    topics = topics or {}
     if unknown := topics.keys() - set(ROLES):
         raise ValueError(f"topics: must name {', '.join(ROLES)}, got {', '.join(sorted(unknown))}")
     types, chosen, messages = _heard(path, topics)
@@ -84,7 +82,7 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
     own = states(tables, notes) | motors(tables, {}, 0, notes)
     parts = {name: part._replace(ticks=1000 * part.ticks) for name, part in own.items()} | parts  # µs, the bag ns
     notes += [f"topics that are not used: {', '.join(sorted(types.keys() - used))}"] if types.keys() - used else []
-    return raw.record(path, parts, 1e-9, notes, {"format": "ROS bag"})
+    return parts, 1e-9, notes, {"format": "ROS bag"}
 
 
 def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, tuple[str, str, str]], Messages]:

@@ -8,14 +8,11 @@ import contextlib
 import io
 import struct
 import tempfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hybrid_jax.flights.formats import raw
-from hybrid_jax.flights.formats.raw import Samples, turned
-from hybrid_jax.flights.recording import Recording
+from hybrid_jax.flights.formats.raw import Parts, Samples, turned
 from hybrid_jax.vehicle import FEWEST_ROTORS
 
 ODOMETRY, LOCAL, ATTITUDE = "vehicle_odometry", "vehicle_local_position", "vehicle_attitude"
@@ -50,9 +47,9 @@ SLOWEST_RPM = 1500.0  # rpm: the largest of a simulated multirotor is more
 MOST = 16  # motors or outputs in any topic
 
 
-def read_ulog(path: str | Path) -> Recording:
+def read_ulog(content: bytes) -> Parts:
     """Read one log. Commands are in 0 … 1; PWM is scaled by the log's minimum and maximum."""
-    log, damage = _load(path)
+    log, damage = _load(content)
     tables, notes = _instances(log.data_list)
     kinds = {0: "generic"} | OTHERS | {kind: f"multirotor of {count} rotors" for kind, count in ROTORS.items()}
     kind = _kind(log.initial_parameters, tables)
@@ -68,7 +65,7 @@ def read_ulog(path: str | Path) -> Recording:
     simulated = "SITL" in facts["program"]
     parts = states(tables, notes)
     parts |= motors(tables, log.initial_parameters, ROTORS.get(kind, 0), notes, simulated)
-    return raw.record(path, parts, 1e-6, notes, facts)
+    return parts, 1e-6, notes, facts
 
 
 def _instances(data) -> tuple[dict[str, Any], list[str]]:
@@ -88,13 +85,12 @@ def _instances(data) -> tuple[dict[str, Any], list[str]]:
     return {name: kept.data for name, (kept, _) in chosen.items()}, notes
 
 
-def _load(path: str | Path) -> tuple[Any, str]:
+def _load(content: bytes) -> tuple[Any, str]:
     """Return the log and a description of any damage."""
     try:
         import pyulog
     except ImportError as error:
         raise ValueError("reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
-    content = raw.unpacked(path)
     try:
         # pyulog reports damage on standard output only. In memory, where a seek stops at 0, it may go round for ever.
         with contextlib.redirect_stdout(io.StringIO()), tempfile.TemporaryFile() as file:
