@@ -30,7 +30,7 @@ class Options:
     only: tuple[Benchmark, ...] = get_args(Benchmark)
     """Which benchmarks to run."""
     peers: bool = False
-    """Also run training_peers, a gradient step beside plain JAX and PyTorch on one core: some five minutes more, mostly
+    """Also run training_peers, a gradient step beside JAX alone and PyTorch on one core: some five minutes more, mostly
     in `torch.compile`. Libraries that are not installed are skipped: pip install -e '.[peers]'."""
 
 

@@ -225,17 +225,9 @@ def count_alarms(folder: Path) -> int:
         lines += [f"  {path.name}: {c.name} {c.value:.3g}: {c.suggestion}" for c in judged if c.verdict == FAILS]
         alone.update([why.removeprefix(f"{path}: ").split(";")[0]] if why else [])
     alarms = len(lines)
-    print(
-        f"{folder}: {len(paths)} logs, {run} checks, {alarms} fail ({100 * alarms / max(run, 1):.2f} %)",
-        *lines,
-        sep="\n",
-    )
-    print(
-        f"  warnings: {dict(warning)}",
-        *(f"  {n} not compared: {why}" for why, n in alone.items()),
-        sep="\n",
-        flush=True,
-    )
+    counted = f"{len(paths)} logs, {run} checks, {alarms} fail ({100 * alarms / max(run, 1):.2f} %)"
+    lines += [f"  warnings: {dict(warning)}", *(f"  {n} not compared: {why}" for why, n in alone.items())]
+    print(f"{folder}: {counted}", *lines, sep="\n", flush=True)
     return alarms
 
 

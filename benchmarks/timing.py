@@ -130,14 +130,6 @@ def compiled_with_memory(function: Callable[..., PyTree], *arguments: PyTree) ->
     return lambda: program(*arguments), seconds, program.memory_analysis().temp_size_in_bytes
 
 
-def compile_all(
-    functions: Mapping[str, Callable[..., PyTree]], *arguments: PyTree
-) -> tuple[dict[str, Call], dict[str, float]]:
-    """`compiled` for each function: the calls and the seconds, by name."""
-    programs = {name: compiled(function, *arguments) for name, function in functions.items()}
-    return {name: call for name, (call, _) in programs.items()}, {name: taken for name, (_, taken) in programs.items()}
-
-
 def agree(what: str, ours: PyTree, theirs: PyTree, tolerance: float) -> float:
     """The largest difference of any two arrays, relative to the largest number in the second.
 

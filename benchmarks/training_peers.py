@@ -1,12 +1,12 @@
-"""How long does a gradient step take, beside plain JAX, the paper's stack and PyTorch written for speed, on one core?
+"""How long does a gradient step take, beside JAX alone, the paper's stack and PyTorch written for speed, on one core?
 
 A step is 100 windows of 10 intervals: RK4, batch normalisation, regulariser, gradient, Adam, running statistics. Beside
-ours: ours without the kernels of `hybrid_jax.kernels`; the same written plainly in JAX, one sample at a time under
-`vmap`; PyTorch with torchdiffeq, one interval after another; PyTorch with an RK4 by hand; the same with its loss under
-`torch.compile`. All start from our parameters; loss, gradient and running statistics must agree. torchdiffeq's rk4 is
-the 3/8 rule, so it is compared with our step by that rule. A turn is steps in a row, as in training, and as many before
-that are not timed: in JAX in one compiled loop, in PyTorch in a Python loop. Times are the processor's. The first call,
-in which PyTorch compiles, is apart. smoke: `torch.compile` generates no code. full: some five minutes, mostly of that.
+ours: ours without the kernels of `hybrid_jax.kernels`; PyTorch with torchdiffeq, one interval after another; PyTorch
+with an RK4 by hand; the same with its loss under `torch.compile`. All start from our parameters; loss, gradient and
+running statistics must agree. torchdiffeq's rk4 is the 3/8 rule, so it is compared with our step by that rule. A turn
+is steps in a row, as in training, and as many before that are not timed: in JAX in one compiled loop, in PyTorch in a
+Python loop. Times are the processor's. The first call, in which PyTorch compiles, is apart. smoke: `torch.compile`
+generates no code. full: some five minutes, most of it compiling.
 """
 
 # PyTorch is of the extra `peers`.
@@ -33,7 +33,6 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from benchmarks import plain
 from benchmarks.subjects import SETTINGS, subject
 from benchmarks.timing import Call, Findings, Options, Ratio, Times, agree, compiled, in_turns, run, stopwatch
 from hybrid_jax.dynamics.base import trainable
@@ -44,12 +43,12 @@ from hybrid_jax.training.fitting import gradient_step
 PEERS = "pip install -e '.[peers]'"
 # Sums of 100 windows × 40 evaluations in another order, in float32; and 1e-4 of a leaf's largest entry moves no rate.
 AGREEMENT = 1e-4
-OURS, BARE, PLAIN = "ours", "ours without kernels", "plain JAX"
+OURS, BARE = "ours", "ours without kernels"
 TORCHDIFFEQ, BY_HAND, COMPILED = "PyTorch, torchdiffeq", "PyTorch by hand", "PyTorch, torch.compile"
 RIVALS = TORCHDIFFEQ, BY_HAND, COMPILED
 OF_TORCH = "paper", "vehicle"  # models that are written in PyTorch
 REACH = {  # times our time
-    "paper": {PLAIN: 1.0, BARE: 1.1, TORCHDIFFEQ: 90.0, COMPILED: 15.0},
+    "paper": {BARE: 1.1, TORCHDIFFEQ: 90.0, COMPILED: 15.0},
     "vehicle": {TORCHDIFFEQ: 40.0, COMPILED: 8.0},
     "pendulum": {BARE: 2.5},
     "car": {BARE: 2.5},
@@ -62,7 +61,7 @@ class PeerOptions(Options):
     """Measure a gradient step of one model."""
 
     model: Literal["paper", "vehicle", "pendulum", "car", "pde"] = "paper"
-    """paper: rigid body, 64 units, batch norm. vehicle: with drag, 32 tanh units, no norm. Others: plain JAX alone."""
+    """paper: rigid body, 64 units, batch norm. vehicle: with drag, 32 tanh units, no norm. Others: JAX alone."""
     most_seconds: int = 900
     """A rival that takes more processor time to compile is skipped."""
 
@@ -164,11 +163,9 @@ def without_kernels():
 
 
 def jax_steps(arguments: tuple, preset: Preset) -> dict[str, Steps]:
-    """Ours, and the same in JAX by other ways."""
-    ours = partial(gradient_step, settings=SETTINGS)
-    ways = {OURS: (ours, nullcontext), PLAIN: (plain.training_step, nullcontext), BARE: (ours, without_kernels)}
-    steps = {}
-    for name, (step, context) in ways.items():
+    """Ours, with kernels and without."""
+    step, steps = partial(gradient_step, settings=SETTINGS), {}
+    for name, context in {OURS: nullcontext, BARE: without_kernels}.items():
         with context():
             steps[name] = our_steps(step, arguments, preset.in_a_row)
     return steps

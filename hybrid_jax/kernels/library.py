@@ -142,16 +142,9 @@ def _run_compiler(arguments: list[str]) -> None:
     command, folder = [_compiler() or "g++", *OPTIONS, *arguments], Path(arguments[-1]).parent
     inside, held = os.pipe()  # closed by the system when this process ends, also by SIGKILL
     try:
-        subprocess.run(
-            ["sh", "-c", WATCHED, folder, *command],
-            check=True,
-            capture_output=True,
-            text=True,
-            timeout=LONGEST,
-            stdin=inside,
-            env=os.environ | {"TMPDIR": str(folder)},
-            start_new_session=True,
-        )
+        watched, alone = ["sh", "-c", WATCHED, folder, *command], os.environ | {"TMPDIR": str(folder)}
+        options = {"capture_output": True, "text": True, "timeout": LONGEST, "start_new_session": True}
+        subprocess.run(watched, check=True, stdin=inside, env=alone, **options)
     except subprocess.SubprocessError as error:
         said = [line for line in (getattr(error, "stderr", None) or "").splitlines() if "error" in line]
         raise Unusable(f"it could not be compiled: {(said or [f'{command[0]} fails'])[0]}") from error

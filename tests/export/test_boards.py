@@ -63,13 +63,15 @@ def flash_of(compiled):
 def test_casadis_generator_needs_more_flash(tmp_path, monkeypatch):
     """Its matrix graph of a step and its Jacobians, beside all that we write; it generates into the working folder."""
     ca = pytest.importorskip("casadi", reason="casadi is an extra")
+    from hybrid_jax.codegen.translation import Entries
     from hybrid_jax.export.casadi_operations import CasadiTranslation
 
     with jax.enable_x64(True):
         likes = [jax.ShapeDtypeStruct((size,), float) for size in (13, 4)]
         program = jax.make_jaxpr(program_of(HYBRID, likes, 0.01, None))(*likes)
     x, u = ca.MX.sym("x", 13), ca.MX.sym("u", 4)
-    (step,) = map(ca.densify, CasadiTranslation().run(program, [x, u], [13, 4]))
+    arguments = [Entries(one, (one.numel(),)) for one in (x, u)]
+    (step,) = map(ca.densify, CasadiTranslation().run(program, arguments))
     monkeypatch.chdir(tmp_path)
     flash = {}
     for name, results in {"step": [step], "both": [step, ca.jacobian(step, x), ca.jacobian(step, u)]}.items():

@@ -70,13 +70,6 @@ def test_smooth_takes_the_place_of_relu_alone():
     assert abs(casadi_function(relu)(x, u) - casadi_function(relu, smooth=30.0)(x, u)).full().max() > 1e-6
 
 
-def test_it_is_the_same_after_a_file(tmp_path):
-    function = casadi_function(field_of("hybrid, norm layer"))
-    function.save(str(tmp_path / "f.casadi"))
-    x, u = (part[0] for part in samples())
-    np.testing.assert_array_equal(ca.Function.load(str(tmp_path / "f.casadi"))(x, u), function(x, u))
-
-
 def everything(x, u):
     """What no field of the library needs and one of a user's own may."""
     matrix = jnp.outer(x, u)
