@@ -29,7 +29,16 @@ from .dynamics import (
     with_disturbance,
     with_hidden,
 )
-from .estimation import covariance_of, fit_least_squares, fit_records, intervals, predict, simulate
+from .estimation import (
+    covariance_of,
+    fit_disturbance,
+    fit_least_squares,
+    fit_records,
+    intervals,
+    observe,
+    predict,
+    simulate,
+)
 from .flights import load_log, load_windows
 from .integrate import RK4, SOLVERS, rollout, rollout_batch
 from .io import Model, check_savable, load, portable, save
@@ -56,3 +65,4 @@ __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridg
 __all__ += ["Excitation", "FlightBounds", "Hypothesis", "InputBounds", "OnlineAdaptation", "excitation"]
 __all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]
 __all__ += ["Record", "StateSpaceModel", "fit_records", "predict", "simulate", "with_hidden"]
+__all__ += ["fit_disturbance", "observe"]

@@ -3,6 +3,7 @@
 `fit_least_squares` uses windows of full states; `fit_records` uses records in which only some states were measured.
 """
 
+from hybrid_jax.estimation.disturbances import fit_disturbance, observe
 from hybrid_jax.estimation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.estimation.record_fit import RecordFit, fit_records, predict, simulate
 from hybrid_jax.estimation.uncertainty import (
@@ -15,4 +16,4 @@ from hybrid_jax.estimation.uncertainty import (
 
 __all__ = ["DisturbanceSelection", "Interval", "LeastSquaresFit", "covariance_of", "fit_least_squares", "intervals"]
 __all__ += ["select_disturbance"]
-__all__ += ["RecordFit", "fit_records", "predict", "simulate"]
+__all__ += ["RecordFit", "fit_disturbance", "fit_records", "observe", "predict", "simulate"]

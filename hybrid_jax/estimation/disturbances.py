@@ -1,0 +1,170 @@
+"""Learn to predict a disturbance from its own past, and estimate its hidden state from measured states."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space
+from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
+from hybrid_jax.estimation.least_squares import Solver
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.trajectories import Trajectories, windows_of
+
+FILTERS = 5, 20, 60  # time constants, in intervals
+PENALTIES = 0.03, 0.1, 0.3, 1.0, np.inf  # of the weights, over the variance of what they explain
+CHUNK = 512  # intervals that are compared at once
+PARTS, WINDOWS = 3, 200  # parts that are left out in turn, and windows of each part that judge a penalty
+
+
+def fit_disturbance(
+    field: AbstractVectorField, sequences: Sequence[Trajectories], *, steps: int = 10, solver: Solver = None
+) -> DisturbanceModel:
+    """Learn a linear model of the disturbance that a field lacks, by ridge regression on its errors after one interval.
+
+    Use it when the errors of a model last, because the system has states that you do not measure. Parts of the
+    sequences that are left out in turn choose the penalty; an infinite one leaves the field's predictions unchanged.
+
+    Example:
+        model = hj.fit_disturbance(result.field, flights)
+        state = hj.observe(model, past)[:, -1]  # at the end of each window
+        x = hj.rollout_batch(model, state, u, dt)[..., :d]
+
+    Args:
+        field: the field, or a `DisturbanceModel` whose weights the new ones are drawn to.
+        sequences: long windows, each without a gap; for one or two, parts of them are left out.
+        steps: intervals after which predictions are compared.
+        solver: of diffrax, by default `RK4`.
+
+    Raises:
+        ValueError: no sequence, or one that is shorter than twice the steps.
+    """
+    before = field if isinstance(field, DisturbanceModel) else None
+    field = field if before is None else before.field
+    flights = _parts(field, sequences, steps)
+    places = _states(field, flights[0])
+    taus = tuple(k * flights[0].dt for k in FILTERS) if before is None else before.time_constants
+    e = state_space(field, flights[0].x0.shape[-1]).tangent_size
+    empty = DisturbanceModel(field, jnp.zeros((e, e * len(taus) + len(places) + 1)), taus, places)
+    start = empty if before is None else before
+    seen = [observe(empty, one, solver)[0] for one in flights]
+    errors = [errors_after_one(field, one, solver)[0] for one in flights]
+    groups = [range(i, len(flights), PARTS) for i in range(PARTS)]
+
+    def solved(of: Sequence[int]) -> Float[Array, "penalties e f"]:
+        states, goals = (np.concatenate([each[i] for i in of]) for each in ([one[:-1] for one in seen], errors))
+        return jnp.stack([_ridge(start, states, goals, penalty) for penalty in PENALTIES])
+
+    scores = []
+    for group in groups:
+        weights = solved([i for i in range(len(flights)) if i not in group])
+        scores.append(_scores(start, weights, [(seen[i], flights[i]) for i in group], steps, solver))
+    best = int(np.argmin(np.mean(scores, axis=0)))
+    return eqx.tree_at(lambda model: model.weights, start, solved(range(len(flights)))[best])
+
+
+def observe(model: DisturbanceModel, past: Trajectories, solver: Solver = None) -> Float[np.ndarray, "n t+1 d+f"]:
+    """The states of a model (x, z₁, …, z_k) at the start and after each interval, from measured states x.
+
+    Args:
+        model: as returned by `fit_disturbance`.
+        past: measured windows; the filters start at zero, so the first slowest time constant is less accurate.
+        solver: of diffrax, by default `RK4`.
+    """
+    errors = errors_after_one(model.field, past, solver)
+    shares = [-np.expm1(-past.dt / tau) for tau in model.time_constants]
+    filtered = np.concatenate([scipy.signal.lfilter([a], [1, a - 1], errors, axis=1) for a in shares], axis=-1)
+    x = np.concatenate([past.x0[:, None], past.x], axis=1)
+    return np.concatenate([x, np.pad(filtered, ((0, 0), (1, 0), (0, 0)))], axis=-1).astype(x.dtype)
+
+
+def errors_after_one(
+    field: AbstractVectorField, past: Trajectories, solver: Solver = None
+) -> Float[np.ndarray, "n t e"]:
+    """The error of a field after each interval over its length, in the tangent space of the state, per second."""
+    before = np.concatenate([past.x0[:, None], past.x[:, :-1]], axis=1)
+    (n, t, d), m = before.shape, past.u.shape[-1]
+    count = -(-n * t // CHUNK) * CHUNK  # so that all sequences share a program
+    rows = [
+        np.resize(each, (count, each.shape[-1]))
+        for each in (before.reshape(-1, d), past.u.reshape(-1, m), past.x.reshape(-1, d))
+    ]
+    parts = [_one_step(field, *(row[i : i + CHUNK] for row in rows), past.dt, solver) for i in range(0, count, CHUNK)]
+    return np.concatenate(parts)[: n * t].reshape(n, t, -1)
+
+
+@eqx.filter_jit
+def _one_step(field, x, u, after, dt: float, solver: Solver) -> Float[Array, "n e"]:
+    space = state_space(field, x.shape[-1])
+    return jax.vmap(space.difference)(after, rollout_batch(field, x, u[:, None], dt, solver)[:, 0]) / dt
+
+
+def _parts(field: AbstractVectorField, sequences: Sequence[Trajectories], steps: int) -> list[Trajectories]:
+    """Sequences of one window each, at least PARTS of them; ValueError for wrong ones."""
+    checks.count("steps", steps)
+    found = [
+        each[i : i + 1]
+        for j, each in enumerate(checks.list_of("sequences", sequences, Trajectories))
+        for i in range(len(check_windows(field, each, f"sequences[{j}]")))
+    ]
+    if not found:
+        raise ValueError("sequences: at least one is needed")
+    if len(found) < PARTS:
+        pieces = -(-PARTS // len(found))
+        found = [
+            windows_of(np.concatenate([one.x0, one.x[0]]), one.u[0], one.dt, steps=one.horizon // pieces)[i : i + 1]
+            for one in found
+            for i in range(pieces if one.horizon >= pieces else 0)
+        ]
+    shortest = min((one.horizon for one in found), default=0)
+    if shortest < 2 * steps:
+        raise ValueError(f"sequences: each needs {2 * steps} intervals at least, one has {shortest}")
+    return found
+
+
+def _states(field: AbstractVectorField, windows: Trajectories) -> tuple[int, ...]:
+    """The states that the field depends on; for example, a vehicle's position has no effect on its motion."""
+    slope = jax.vmap(jax.jacfwd(field))(jnp.asarray(windows.x[0]), jnp.asarray(windows.u[0]))
+    return tuple(np.flatnonzero(np.abs(np.asarray(slope)).max(axis=(0, 1)) > 0).tolist())
+
+
+def _ridge(start: DisturbanceModel, states: np.ndarray, errors: np.ndarray, penalty: float) -> Float[Array, "e f"]:
+    """Weights by ridge regression on scaled features, with the penalty on what differs from the start's weights."""
+    before = np.asarray(start.weights, float)
+    if not np.isfinite(penalty):
+        return jnp.asarray(before, start.weights.dtype)
+    d, e = states.shape[1] - start.filters, errors.shape[1]
+    features = np.concatenate([states[:, d:], states[:, list(start.states)], np.ones((len(states), 1))], axis=1)
+    scale = np.sqrt(np.mean(np.square(states[:, d : d + e]), axis=0)) + 1e-12
+    size = np.concatenate([*[scale] * len(start.time_constants), features[:, start.filters : -1].std(axis=0), [1.0]])
+    scaled = features / (size := np.where(size > 1e-9, size, np.inf))
+    goals = (errors - features @ before.T) / scale
+    gram = scaled.T @ scaled + penalty * len(scaled) * np.eye(scaled.shape[1])
+    change = np.linalg.solve(gram, scaled.T @ goals) / size[:, None] * scale
+    return jnp.asarray(before + change.T, start.weights.dtype)
+
+
+def _scores(start: DisturbanceModel, weights, flights: Sequence, steps: int, solver: Solver) -> np.ndarray:
+    """Mean logarithm of the squared error after `steps` intervals, over the quantities of the state, of all weights."""
+    cut = [windows_of(seen, one.u[0], one.dt, steps=steps, stride=1) for seen, one in flights]
+    x0, u, end = (np.concatenate(parts) for parts in zip(*((w.x0, w.u, w.x[:, -1]) for w in cut), strict=True))
+    chosen = np.round(np.linspace(0, len(x0) - 1, WINDOWS)).astype(int)
+    dt, space = cut[0].dt, state_space(start.field, x0.shape[1] - start.filters)
+    found = [_squares(start, each, *(part[chosen] for part in (x0, u, end)), dt, solver) for each in weights]
+    sizes = np.cumsum([one.tangent_size for one in space.quantities])[:-1]
+    of_quantity = np.stack([each.sum(axis=1) for each in np.split(np.asarray(found, float), sizes, axis=1)])
+    return np.nan_to_num(np.log(of_quantity).mean(axis=0), nan=np.inf)
+
+
+@eqx.filter_jit
+def _squares(model, weights, x0, u, end, dt: float, solver: Solver) -> Float[Array, " e"]:
+    """Mean squared error at the end of windows, number by number."""
+    model = eqx.tree_at(lambda each: each.weights, model, weights)
+    d = x0.shape[-1] - model.filters
+    reached = rollout_batch(model, x0, u, dt, solver)[:, -1, :d]
+    return jnp.mean(jnp.square(jax.vmap(state_space(model.field, d).difference)(reached, end[:, :d])), axis=0)

@@ -1,0 +1,90 @@
+"""A disturbance with a hidden state is predicted from its past, and white noise changes little."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from surface import refusal
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
+
+DT, STEPS = 0.05, 10
+
+
+class Spring(hj.AbstractVectorField):
+    """A mass on a spring, x = [position, velocity]."""
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1], u[0] - 4 * x[0]])
+
+
+def swinging(x, u):
+    """The mass with an oscillator that it drives and that no sensor shows."""
+    slope, (_, speed, swing, turn) = Spring()(x[:2], u), x
+    return jnp.stack([slope[0], slope[1] + 2 * swing, turn, 0.5 * speed - 9 * swing])
+
+
+def flights(seed, swing=1.0, noise=0.0, count=4, t=200):
+    random = np.random.default_rng(seed)
+    x0 = random.normal(size=(count, 4)) * [1, 1, swing, swing]
+    u = np.repeat(random.normal(size=(count, t // 10, 1)), 10, axis=1)
+    field = swinging if swing else lambda x, u: jnp.concatenate([Spring()(x[:2], u), 0 * x[2:]])
+    x = np.concatenate([x0[:, None], hj.rollout_batch(field, x0, u, DT)], axis=1)[..., :2]
+    x = (x + noise * random.normal(size=x.shape)).astype("f4")
+    return hj.Trajectories(x[:, 0], u.astype("f4"), x[:, 1:], DT)
+
+
+def error(model, tested):
+    """RMS of the states after STEPS intervals, from every tenth sample after the first 50."""
+    starts, x = np.arange(50, tested.horizon - STEPS, 10), np.concatenate([tested.x0[:, None], tested.x], axis=1)
+    states = hj.observe(model, tested) if isinstance(model, DisturbanceModel) else x
+    u = np.stack([tested.u[:, i : i + STEPS] for i in starts], axis=1).reshape(-1, STEPS, 1)
+    found = hj.rollout_batch(model, states[:, starts].reshape(-1, states.shape[-1]), u, DT)[:, -1, :2]
+    return float(jnp.sqrt(jnp.mean(jnp.square(found - x[:, starts + STEPS].reshape(-1, 2)))))
+
+
+def test_a_hidden_swing_is_predicted_from_its_past():
+    model = hj.fit_disturbance(Spring(), [flights(0)])
+    assert error(model, flights(1)) < 0.3 * error(Spring(), flights(1))
+
+
+def test_white_noise_on_a_true_model_changes_little():
+    noisy = flights(2, swing=0.0, noise=0.01)
+    tested = flights(3, swing=0.0, noise=0.01)
+    assert error(hj.fit_disturbance(Spring(), [noisy]), tested) < 1.1 * error(Spring(), tested)
+
+
+def test_weights_of_zero_predict_as_the_field_does():
+    model = DisturbanceModel(Spring(), jnp.zeros((2, 7)), (0.1, 0.3), (0, 1))
+    tested = flights(4)
+    assert error(model, tested) == pytest.approx(error(Spring(), tested), rel=1e-5)
+
+
+def test_attitudes_are_corrected_in_their_tangent_space():
+    """A constant torque that the model lacks, as an angular acceleration of 0.3 rad/s²."""
+    body, random = hj.rigid_body(hj.IRIS), np.random.default_rng(5)
+    pushed = hj.dynamics.disturbed(body, jnp.array([0, 0, 0, 0.3, 0, 0]))
+    u = (hj.IRIS.hover_speed * (1 + 0.02 * random.normal(size=(3, 12, 4)))).repeat(10, axis=1).astype("f4")
+    x0 = np.tile(np.eye(13, dtype="f4")[3], (3, 1))
+    windows = hj.Trajectories(x0, u, np.asarray(hj.rollout_batch(pushed, x0, u, 0.01)), 0.01)
+    model = hj.fit_disturbance(body, [windows])
+    states = hj.observe(model, windows)
+    reached = hj.rollout_batch(model, states[:, 100], u[:, 100:], 0.01)[:, -1]
+    plain = hj.rollout_batch(body, windows.x[:, 99], u[:, 100:], 0.01)[:, -1]
+    off, before = (np.abs(each[:, :13] - windows.x[:, -1])[:, 10:].max() for each in (reached, plain))
+    assert off < 0.2 * before
+    np.testing.assert_allclose(np.linalg.norm(reached[:, 3:7], axis=1), 1, atol=1e-4)
+
+
+def test_a_model_is_refitted_near_the_one_before_and_saved(tmp_path):
+    model = hj.fit_disturbance(Spring(), [flights(0)])
+    again = hj.fit_disturbance(model, [flights(6, count=1, t=60)])
+    assert again.time_constants == model.time_constants
+    assert error(again, flights(1)) < 0.5 * error(Spring(), flights(1))
+    hj.save(tmp_path / "m.npz", again)
+    assert error(hj.load(tmp_path / "m.npz").field, flights(1)) == error(again, flights(1))
+
+
+def test_what_does_not_fit_is_refused():
+    refusal(lambda: hj.fit_disturbance(Spring(), []), "sequences")
+    refusal(lambda: hj.fit_disturbance(Spring(), [flights(0, t=20)], steps=30), "sequences", 60)
