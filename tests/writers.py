@@ -5,9 +5,11 @@ import zlib
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS
+from hybrid_jax.state import QUATERNION
 
 STATES = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "stateEstimate.vx", "stateEstimate.vy"]
 STATES += ["stateEstimate.vz", *(f"stateEstimate.q{axis}" for axis in "wxyz"), "gyro.x", "gyro.y", "gyro.z"]
@@ -197,6 +199,24 @@ def stamped(times, values, delay=0):
     ]
 
 
+def px4_topics(flight, rate=50):
+    """States of a flight as PX4 logs them: NED and FRD, position at a rate in Hz, attitude at 125 Hz, gyro at 200."""
+    t = flight.t - flight.t[0]
+    body, world = BODIES["FRD"], WORLDS["NED"]
+
+    def at(rate, columns):
+        times = np.arange(0.003, t[-1], 1 / rate)
+        return times, CubicSpline(t, flight.x[:, columns])(times)
+
+    times, moving = at(rate, [0, 1, 2, 7, 8, 9])
+    local = stamped(times, np.concatenate([moving[:, :3] @ world, moving[:, 3:] @ world], axis=1), delay=4000)
+    times, q = at(125, QUATERNION)
+    turned = Rotation.from_matrix(world.T @ Rotation.from_quat(np.roll(q, -1, axis=1)).as_matrix() @ body)
+    attitude = stamped(times, np.roll(turned.as_quat(), 1, axis=1), delay=2000)
+    times, omega = at(200, slice(10, 13))
+    return dict(zip(PX4_STATES, (local, attitude, stamped(times, omega @ body)), strict=True))
+
+
 def escs(t, u):
     rpm = np.round(np.concatenate([u, 0 * u], axis=1) * 30 / np.pi).astype(int)
     stamps = (START + np.round(t * 1e6)).astype(int).tolist()
@@ -215,3 +235,42 @@ def outputs(t, values):
     rows = np.concatenate([values, np.zeros((len(t), 16 - values.shape[1]))], axis=1)
     stamps = (START + np.round(t * 1e6)).astype(int).tolist()
     return [struct.pack("<QI16f", at, 16, *row) for at, row in zip(stamps, rows.tolist(), strict=True)]
+
+
+MAP = """
+frames = {world = "NED", body = "FRD", velocity = "body"}
+time = {columns = ["stamp"], unit = "us"}
+position = {columns = ["x", "y", "z"], unit = "mm"}
+attitude = {columns = ["q1", "q2", "q3", "q4"], unit = "xyzw"}
+velocity = {columns = ["u", "v", "w"], unit = "cm/s"}
+body_rates = {columns = ["p", "q", "r"], unit = "deg/s"}
+motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}
+[format]
+delimiter = ";"
+"""
+
+
+def foreign(flight):
+    """The flight as a logger in NED, FRD and the units of MAP writes it, by name of column."""
+    world, body = WORLDS["NED"], BODIES["FRD"]
+    to_world = Rotation.from_quat(np.roll(flight.x[:, 3:7], -1, axis=1))
+    attitude = Rotation.from_matrix(world.T @ to_world.as_matrix() @ body)
+    u = flight.u
+    command = (u - 100) / 1000
+    squared = (-200 + np.sqrt(200**2 + 4 * 800 * (u - 50))) / 1600
+    yaw, pitch, roll = attitude.as_euler("ZYX", degrees=True).T
+    columns = {"stamp": flight.t * 1e6 + 7e9, "roll": roll, "pitch": pitch, "yaw": yaw}
+    columns |= dict(zip("xyz", 1000 * world.T @ flight.x[:, :3].T, strict=True))
+    columns |= dict(zip(("q1", "q2", "q3", "q4"), attitude.as_quat().T, strict=True))
+    columns |= dict(zip("uvw", 100 * body @ to_world.inv().apply(flight.x[:, 7:10]).T, strict=True))
+    columns |= dict(zip("pqr", np.rad2deg(body @ flight.x[:, 10:].T), strict=True))
+    for name, motors in (("rpm", u * 30 / np.pi), ("affine", command), ("quadratic", squared)):
+        columns |= dict(zip((f"{name}_{m}" for m in ("m3", "m1", "m4", "m2")), motors.T, strict=True))
+    return columns
+
+
+def table_of(columns, motors="rpm"):
+    """The text of such a log, with one kind of motors."""
+    names = [name.removeprefix(f"{motors}_") for name in columns]
+    rows = [";".join(map(repr, row)) for row in np.column_stack(list(columns.values())).tolist()]
+    return "\n".join([";".join(names), *rows])

@@ -57,32 +57,35 @@ def run(options: Options) -> int:
     with step("adapting") as told:
         found = adapted(known.field, flights.logs, known.windows)
         told(f"{found.windows} windows, chose {found.chosen}")
-    changed = _changed(known, found)
-    different = bool(changed) or found.alone or found.candidates["source"] < UNLIKELY
+    changes = _changes(known, found)
+    different = any(map(_significant, changes)) or found.alone or found.candidates["source"] < UNLIKELY
     if different:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
         save(options.output, found.field, json_value(about))
     told = found.to_dict() | {"model": options.output if different else None}
-    page.write(options.out, "adapt", _page(options, known, flights, found, changed, different), told)
+    page.write(options.out, "adapt", _page(options, known, flights, found, changes, different), told)
     return 0 if different else NOTHING_CHANGED
 
 
-def _changed(known: Known, found: Adaptation) -> list[Change]:
-    """Return the parameters whose intervals exclude the previous value, most significant first."""
+def _changes(known: Known, found: Adaptation) -> list[Change]:
+    """Return the change of each parameter, the most significant first."""
     before = {name: float(value) for name, value in named_parameters(known.field).items()}
     # A term that was not there was 0, an efficiency 1.
     every = [
         (name, before.get(name, float(name.startswith("efficiency"))), one) for name, one in found.parameters.items()
     ]
-    changed = [each for each in every if each[2].has_interval and not each[2].low <= each[1] <= each[2].high]
-    return sorted(changed, key=lambda each: -abs(each[2].value - each[1]) / max(each[2].high - each[2].low, 1e-30))
+    return sorted(every, key=lambda each: -abs(each[2].value - each[1]) / max(each[2].high - each[2].low, 1e-30))
+
+
+def _significant(change: Change) -> bool:
+    return change[2].has_interval and not change[2].low <= change[1] <= change[2].high
 
 
 def _page(
-    options: Options, known: Known, flights: Flights, found: Adaptation, changed: Sequence[Change], different: bool
+    options: Options, known: Known, flights: Flights, found: Adaptation, changes: Sequence[Change], different: bool
 ) -> page.Page:
-    learned = named_parameters(known.field)
+    learned, changed = named_parameters(known.field), [*filter(_significant, changes)]
     own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
     curves = {
         name: errors.rmse_by_flight(field, flights.logs, known.steps)
@@ -90,14 +93,16 @@ def _page(
     }
     seconds, (old, new) = known.steps * known.dt, (errors.texts(each.mean(axis=0)[-1]) for each in curves.values())
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
-    told = f"Changed: {what}." if own else "These flights differ from the model; no parameter of its own says how."
+    answer = "These flights differ from the model, but do not determine which of its parameters changed."
+    answer = f"Changed: {what}." if own else answer
     if not changed and found.candidates["source"] >= UNLIKELY:
-        told = f"These flights show no change; {ALONE}"
-    todo = [f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."]
+        answer = f"These flights show no change; {ALONE}"
+    todo = f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."
     if not different:
-        told = "These flights show no change."
-        todo = ["Keep the model. If something did change, you should fly manoeuvres that excite it more."]
-    rows = [(name, f"{value:.4g}", str(one)) for name, value, one in [*own, *lacked][:SHOWN]]
+        answer = "These flights show no change."
+        todo = "Keep the model. If something did change, you should fly manoeuvres that excite it more."
+    rows = [(name, f"{value:.4g}", str(one)) for name, value, one in (changed or changes)[:SHOWN]]
+    title = "What changed" if changed else "Parameters, none of which clearly changed"
     expected = [
         (horizon, name, *(f"{number:.3g}" for number in one))
         for horizon, each in found.expected.items()
@@ -106,8 +111,8 @@ def _page(
     header = ("after", "of", "RMSE", "from", "to")
     return page.Page(
         f"What changed, by {len(flights.logs)} flights of {options.after}, {flights.seconds:.0f} s?",
-        told,
-        page.Table("What changed (95 % intervals)", ("parameter", "before", "after"), rows) if rows else None,
+        answer,
+        page.Table(f"{title} (95 % intervals)", ("parameter", "before", "after"), rows) if rows else None,
         [("RMSE on these flights, to which the model was adapted", errors.figure(curves, known.dt))],
         [
             f"Velocity after {seconds:g} s was off by {old[1]}, and is by {new[1]}, on these flights.",
@@ -116,7 +121,7 @@ def _page(
             *errors.unknown(found),
             *unlike(known, flights),
         ],
-        todo,
+        [todo],
         [
             errors.parameter_table(found),
             page.Table("Error to expect on a flight not seen (80 % intervals)", header, expected),

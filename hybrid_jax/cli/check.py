@@ -75,7 +75,7 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
         f"Its predictions of {known.steps * known.dt:g} s are {beaten}.",
         page.Table(f"RMSE after {known.steps * known.dt:g} s", header, rows),
         [("RMSE over the time since a prediction began, all flights", errors.figure(curves, known.dt))],
-        [*meaning, *unlike(known, flights)],
+        [*meaning, errors.BASELINE, *unlike(known, flights)],
         ["If it is wrong for long, adapt it to such flights: hybrid-jax adapt."],
         [
             page.Table("When it is most wrong", ("flight", "at", *header[1:]), _worst(known, flights, names, each)),

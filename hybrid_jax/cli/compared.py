@@ -14,12 +14,11 @@ from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, rotation_of
 from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, Check, check_log
-from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.flights.checks.suitability import failures
 from hybrid_jax.flights.conversion import DT, STATES, to_flight
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import AXES, Recording, Signal
 from hybrid_jax.identification.slow_commands import SLOW
-from hybrid_jax.vehicle import Vehicle
 
 MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
 NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
@@ -38,17 +37,8 @@ COMPARED = (
 )
 
 
-def check_whole(recordings: Sequence[Recording], vehicle: Vehicle, anyway: bool) -> list[str]:
-    """Check raw logs; return a line for each failed check, or raise ChecksFailed without `anyway`."""
-    return _require([(each, check_recording(each, vehicle)) for each in recordings], anyway)
-
-
-def check_consistent(recordings: Sequence[Recording], field: Any, learn: Sequence[str], anyway: bool) -> list[str]:
-    """Compare the signals of each log with each other and the vehicle; returns and raises like `check_whole`."""
-    return _require([(each, compared(each, field, learn)) for each in recordings], anyway)
-
-
-def _require(found: Sequence[tuple[Recording, list[Check]]], anyway: bool) -> list[str]:
+def require_passed(found: Sequence[tuple[Recording, list[Check]]], anyway: bool) -> list[str]:
+    """Return a line for each failed check of each log, or raise ChecksFailed without `anyway`."""
     needed = [(Path(log.name).name, [each for each in checks if each.name not in NOT_NEEDED]) for log, checks in found]
     lines = [line for name, checks in needed for line in failures(checks, name)]
     if lines and not anyway:

@@ -15,6 +15,7 @@ from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import flight_errors
 
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
+BASELINE = "Frozen rates are a baseline: the thrust of the motors acts, and body rates stay as they are."
 MOST = 500  # windows of a flight
 
 
@@ -41,14 +42,14 @@ def ratio(errors: Float[np.ndarray, "*n 4"], others: Float[np.ndarray, "*n 4"]) 
 
 
 def texts(values: Float[np.ndarray, " 4"]) -> list[str]:
-    """Format numbers with their UNITS."""
-    return [f"{value:.3g} {unit}" for value, unit in zip(values, UNITS.values(), strict=True)]
+    """Format numbers with their UNITS, which a page keeps on one line."""
+    return [f"{value:.3g}\N{NO-BREAK SPACE}{unit}" for value, unit in zip(values, UNITS.values(), strict=True)]
 
 
 @mpl.rc_context(STYLE)
 def figure(errors: Mapping[str, Float[np.ndarray, "flights t 4"]], dt: float) -> Figure:
     """Plot the RMSE against prediction time, with a panel per unit and a line per model."""
-    drawn = Figure(figsize=(7.5, 4.5), layout="constrained")
+    drawn = Figure(figsize=(6.0, 4.8), layout="constrained")
     panels = drawn.subplots(2, 2, sharex=True)
     for i, (panel, (name, unit)) in enumerate(zip(panels.flat, UNITS.items(), strict=True)):
         for label, found in errors.items():

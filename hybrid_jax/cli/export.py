@@ -7,28 +7,34 @@ from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
+from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.export import casadi_function, export_adaptation_c, export_c, export_program
-from hybrid_jax.export.program import sizes_of
+from hybrid_jax.export.program import sizes_of, vehicle_in
+from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.models import load
 from hybrid_jax.networks import smoothed
 from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.online import OnlineAdaptation
-from hybrid_jax.state import SENSOR_NOISE, STATE_SIZE
+from hybrid_jax.state import BODY_RATES, SENSOR_NOISE, STATE_SIZE, VELOCITY
 
 __all__ = ["LISTS", "Options", "run"]
-LISTS = ("--to", "--noise", "--process", "--prior", "--disturbance", "--platforms")
+LISTS = ("--to", "--noise", "--process", "--prior", "--disturbance")
 FILTER = ("period", "noise", "process", "prior", "disturbance")
+RESPONSE, FASTER = 0.2, 1.05  # of the figure: seconds, and factor on the speed of the first rotor
+UNITS = "velocity [m/s]", "body rates [rad/s]"
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
 PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.md
 PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
@@ -75,10 +81,6 @@ class Options:
     disturbance: Annotated[tuple[float, ...], RARE] = ()
     """Filter: standard deviation of a constant disturbance of a rigid body: three accelerations [m/s^2] and three
     angular accelerations [rad/s^2], by default 3 3 3 5 5 5, or one number for all; 0 for none."""
-    batched: Annotated[bool, RARE] = False
-    """StableHLO: take x (b, d) and u (b, m), for any b, instead of x (d,) and u (m,)."""
-    platforms: Annotated[tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...], RARE] = ("cpu",)
-    """Platforms to compile StableHLO for."""
     state_size: Annotated[int | None, RARE] = None
     """Size of x, if the model is not of a rigid body."""
     input_size: Annotated[int | None, RARE] = None
@@ -110,34 +112,56 @@ def run(options: Options) -> int:
         if isinstance(adaptation, OnlineAdaptation):
             name = f"{options.name}_adaptation"
             written += export_adaptation_c(options.output, adaptation, name=name, double=options.double, **sizes)
-            said.append(f"{name} adapts {', '.join(adaptation.names)}, with a sample every {adaptation.dt:g} s.")
+            groups = ", ".join(dict.fromkeys(each.partition("[")[0] for each in adaptation.names))
+            said.append(f"{name} adapts {groups}, with a sample every {adaptation.dt:g} s.")
         elif adaptation:
             said.append(f"No filter is written: {adaptation}.")
         for kind, length, letter in (("field", None, "f"), ("step", dt, "F")):
             if "stablehlo" in options.to:
-                more: dict[str, Any] = {"batched": options.batched, "platforms": options.platforms}
                 written.append(options.output / f"{kind}.npz")
-                export_program(written[-1], field, length, about=model.about, **own, **more)
+                export_program(written[-1], field, length, about=model.about, **own)
             if "casadi" in options.to:
                 written.append(options.output / f"{kind}.casadi")
                 casadi_function(field, length, name=letter, **own).save(str(written[-1]))
     if options.smooth is not None:
         said.append(_change(field, options.smooth))
-    page.write(options.out, "export", _page(options, dt, written, said), {"files": list(map(str, written)), "dt": dt})
+    told = {"files": list(map(str, written)), "dt": dt}
+    page.write(options.out, "export", _page(options, field, dt, written, said), told)
     return 0
 
 
-def _page(options: Options, dt: float, written: Sequence[Path], said: Sequence[str]) -> page.Page:
+def _page(
+    options: Options, field: AbstractVectorField, dt: float, written: Sequence[Path], said: Sequence[str]
+) -> page.Page:
     rows = [(str(path), f"{path.stat().st_size / 1024:.0f} KB") for path in written]
     compiled = f"gcc -std=c99 -O2 -I{options.output} main.c {options.output / options.name}.c -lm"
     todo = [f"Compile it with yours: {compiled}. docs/howto/c.md has a program."] if "c" in options.to else []
     return page.Page(
-        f"What runs {options.model.name} elsewhere?",
+        f"Which files run {options.model.name} elsewhere?",
         f"{len(written)} files in {options.output}: ẋ = f(x, u), and a step of {dt:g} s.",
         page.Table("Files", ("file", "size"), rows),
-        meaning=said,
-        todo=todo or ["docs/howto/export.md says what reads them."],
+        _response(field, dt),
+        said,
+        todo or ["docs/howto/export.md says what reads them."],
     )
+
+
+@mpl.rc_context(page.STYLE)
+def _response(field: AbstractVectorField, dt: float) -> list[tuple[str, Figure]]:
+    """Plot what a multirotor does after a rotor speeds up, to compare with what the files give."""
+    if (vehicle := vehicle_in(field)) is None or isinstance(field, Actuated):
+        return []
+    steps = max(2, round(RESPONSE / dt))
+    x = jnp.zeros((1, STATE_SIZE)).at[0, jnp.array([2, 3])].set(1.0)
+    u = jnp.full((1, steps, vehicle.rotors), vehicle.hover_speed).at[..., 0].multiply(FASTER)
+    states = np.concatenate([x, rollout_batch(field, x, u, dt)[0]])
+    figure = Figure(figsize=(6.0, 2.6), layout="constrained")
+    for panel, part, name in zip(figure.subplots(1, 2), (VELOCITY, BODY_RATES), UNITS, strict=True):
+        panel.plot(dt * np.arange(steps + 1), states[:, part], label=("x", "y", "z"))
+        panel.set(xlabel="time [s]", ylabel=name)
+        panel.legend()
+    told = f"From rest at 1 m with {vehicle.hover_speed:.4g} rad/s, and the first rotor {FASTER - 1:.0%} faster"
+    return [(f"{told}: what step gives", figure)]
 
 
 def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> OnlineAdaptation | str:

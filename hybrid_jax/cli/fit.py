@@ -22,6 +22,7 @@ from hybrid_jax.io.models import save
 
 __all__ = ["LISTS", "Options", "run"]
 IDENTIFIED = ("output", "learn", "anyway", "out", "columns", "topics", "motor_order")  # options of both
+OF_MODEL = ("windows", "motion")  # of the model, and not of the report
 QUANTILES = np.linspace(0.01, 0.99, 99)
 
 
@@ -74,8 +75,9 @@ def run(options: Options) -> int:
         told(f"{found.chosen} predicts them best")
     about = _about(options, model, flights, found)
     save(options.output, found.field, json_value(about))
-    more = {"model": options.output, "adaptation": found.physics.to_dict()}
-    page.write(options.out, "fit", _page(options, flights, found), about | more)
+    told = {name: each for name, each in about.items() if name not in OF_MODEL}
+    told |= {"model": options.output, "adaptation": found.physics.to_dict()}
+    page.write(options.out, "fit", _page(options, flights, found), told)
     return 0
 
 
@@ -139,6 +141,7 @@ def _page(options: Options, flights: Flights, found: Learned) -> page.Page:
         [("RMSE on held-out flights", errors.figure(found.left_out, options.dt))],
         [
             f"The model is {found.chosen}: {adds}.",
+            errors.BASELINE,
             *([f"Rotors follow the motors of the logs with {1000 * found.lag:.3g} ms."] if found.lag else []),
             *errors.unknown(found.physics),
         ],

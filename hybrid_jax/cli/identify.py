@@ -16,12 +16,13 @@ from matplotlib.figure import Figure
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
-from hybrid_jax.cli.compared import check_consistent, check_whole, unlearned_drag
+from hybrid_jax.cli.compared import compared, require_passed, unlearned_drag
 from hybrid_jax.cli.flags import in_flags
 from hybrid_jax.cli.help import RARE
 from hybrid_jax.cli.logs import LogOptions, content_of, raw_logs, require_distinct
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
+from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
 from hybrid_jax.identification import slow_commands
@@ -131,9 +132,9 @@ def read_checked(
     logs = {path.name: log for path, log in raws}
     require_distinct([(log.name, content_of(log)) for log in logs.values()])
     said += [f"{name}: {note}" for name, log in logs.items() for note in log.notes]
-    failed = check_whole([*logs.values()], vehicle, options.anyway)
+    failed = require_passed([(log, check_recording(log, vehicle)) for log in logs.values()], options.anyway)
     field = start([*logs.values()])
-    failed += check_consistent([*logs.values()], field, learn, options.anyway)
+    failed += require_passed([(log, compared(log, field, learn)) for log in logs.values()], options.anyway)
     failed = [in_flags("identify", line) for line in failed]
     for line in (*said, *failed):
         print(f"  {line}", file=sys.stderr)
@@ -273,8 +274,10 @@ def _nearest(part: Float[np.ndarray, "n t k"], asked: int, dt: float) -> str:
 def figure(field: Any, logs: Sequence[Recording], layout: Layout) -> Figure:
     """Plot prediction errors against time."""
     errors = prediction_errors(field, logs, layout)
-    picture = Figure(figsize=(3.2 * len(errors), 2.8), layout="constrained")
-    for panel, (name, part) in zip(np.atleast_1d(picture.subplots(1, len(errors))), errors.items(), strict=True):
+    rows = -(-len(errors) // 2)
+    picture = Figure(figsize=(6.0, 2.6 * rows), layout="constrained")
+    for i, (name, part) in enumerate(errors.items(), 1):
+        panel = picture.add_subplot(rows, min(2, len(errors)), i)
         steps, rms = _by_step(part)
         axes = logs[0].signals[name].axes if name != "attitude" else ("x", "y", "z")
         panel.plot(layout.dt * steps, rms, marker="." if len(steps) < part.shape[1] else None, label=axes)

@@ -231,7 +231,7 @@ def _verdict(check: Check) -> str:
 @mpl.rc_context(page.STYLE)
 def _drawn(recording: Recording) -> Figure:
     """Plot each signal against time in its own panel, with gaps in grey."""
-    figure = Figure((8, 1.2 + 1.3 * len(recording.signals)), layout="constrained")
+    figure = Figure((6.0, 0.8 + 1.1 * len(recording.signals)), layout="constrained")
     panels = figure.subplots(len(recording.signals), 1, sharex=True, squeeze=False)[:, 0]
     for panel, (name, signal) in zip(panels, recording.signals.items(), strict=True):
         panel.plot(*_broken(signal), linewidth=0.8, label=signal.axes)

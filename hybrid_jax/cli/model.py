@@ -66,12 +66,11 @@ def flights_for(known: Known, folder: Path, options: FlightOptions, changed: boo
 
 
 def unlike(known: Known, flights: Flights) -> list[str]:
-    """Warn about each quantity that is often outside the training range."""
+    """Warn about quantities that are often outside the training range."""
     learned = {name: np.asarray(values) for name, values in known.about["motion"].items()}
     x, u = (np.concatenate([getattr(log, part) for log in flights.logs]) for part in ("x", "u"))
     asked = RIGID_BODY_SPACE.features(x, u)
     shares = shares_outside(learned, asked)
-    unit = "of the time, so errors there may be larger than expected"
-    return [
-        f"{name} is outside the training range {share:.0%} {unit}." for name, share in shares.items() if share > WARN
-    ]
+    told = ", ".join(f"{name.partition(' [')[0]} {share:.0%}" for name, share in shares.items() if share > WARN)
+    more = "of the time; errors there may be larger than expected."
+    return [f"These flights are outside of those that the model was trained on: {told} {more}"] if told else []

@@ -91,7 +91,7 @@ def _figure(caption: str, figure: Figure | bytes) -> str:
     data = io.BytesIO(figure if isinstance(figure, bytes) else b"")
     if isinstance(figure, Figure):
         with mpl.rc_context(STYLE):
-            figure.savefig(data, format="png", dpi=130)
+            figure.savefig(data, format="png", dpi=160)
     kind = "gif" if data.getvalue().startswith(b"GIF") else "png"
     text = base64.b64encode(data.getvalue()).decode()
     picture = f'<img alt="{_text(caption)}" src="data:image/{kind};base64,{text}">'

@@ -24,7 +24,7 @@ from hybrid_jax.state import POSITION, VELOCITY
 
 __all__ = ["LISTS", "Options", "run"]
 LISTS = ("--learn", "--low", "--high", "--rotor-speed", "--noise")
-WINDOW, HALF = 10, 1.96  # intervals; standard errors on either side of a 95 % interval
+WINDOW, HALF, WELL = 10, 1.96, 0.1  # intervals; standard errors of half an interval; share of a value
 HEADER = "t,px,py,pz,yaw,vx,vy,vz"
 BOX = FlightBounds()
 
@@ -97,10 +97,11 @@ def _page(options: Options, found: Excitation, points: np.ndarray, values: dict[
     shares = {name: half / abs(values[name]) if values[name] else np.inf for name, half in halves.items()}
     rows = [(name, f"{values[name]:.4g}", f"± {half:.2g}", f"{shares[name]:.1%}") for name, half in halves.items()]
     header = ("parameter", "value", "half-width", "of the value")
-    worst = max(found.parameters, key=lambda name: shares[name])
+    worst, within = max(found.parameters, key=lambda name: shares[name]), sum(each < WELL for each in shares.values())
+    least = f"{worst} is the least certain, to ± {shares[worst]:.0%}"
     return page.Page(
         f"Which {options.seconds:g} s of flight identify the parameters of {options.model.name} best?",
-        f"{options.output}: every parameter to ± {shares[worst]:.1%} or better; {worst} is the least certain.",
+        f"{options.output} determines {within} of {len(rows)} parameters to ± {WELL:.0%} or better; {least}.",
         page.Table("Expected 95 % intervals", header, rows[:5]),
         [("The flight: from above, and over time", _figure(found, points))],
         said,

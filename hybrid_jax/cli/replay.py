@@ -80,6 +80,8 @@ def run(options: Options) -> int:
         f"{seconds:g} s ahead it is {rms[str(options.model)]:.3g} m from where {options.model.name} expects it.",
         page.Table(f"Distance after {seconds:g} s", ("model", "RMS", "largest"), rows),
         [("The flight, and what models expect next, in real time", picture)],
+        ["Each line begins where the vehicle is, and ends where a model expects it with the recorded inputs."],
+        [f"Over whole flights and against baselines: hybrid-jax check {options.model} FLIGHTS."],
     )
     page.write(options.out, "replay", shown, {"distance": rms, "files": [options.out / "replay.gif"]})
     return 0

@@ -1,14 +1,41 @@
-"""The script is called in this process, whose devices are fixed by now, and whose signals are not the script's."""
+"""The script in this process, and as installed from the wheel; logs of every format; a browser that looks at pages."""
 
+import html
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
 from unittest import mock
 
 import pytest
+from cli_logs import READING, of_every_format, simulated, written
+from smoke import ROOT
+from writers import MAP
 
+from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.cli import main
+from hybrid_jax.sim import PARAMETER_SHIFT, SOURCE
+from hybrid_jax.vehicle import IRIS
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+# Errors are collected; then all is unfolded, and what is there is written down.
+BEGIN = "<script>const wrong = []; onerror = (...error) => wrong.push(String(error)); console.error = onerror</script>"
+END = """<script>addEventListener("load", () => {
+  for (const each of document.querySelectorAll("details")) each.open = true
+  const hidden = [...document.images].filter(one => one.naturalWidth * one.getBoundingClientRect().height == 0).length
+  const wide = document.documentElement.scrollWidth > innerWidth
+  parent.seen[name] = {wrong, images: document.images.length, hidden, wide}
+})</script>"""
+WIDTHS = (400, 1400)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def devices():
+    """Devices of this process are fixed by now, and its signals are not the script's."""
     with mock.patch("hybrid_jax.cli.command.configure"), mock.patch("hybrid_jax.cli.command._answer_at_once"):
         yield
 
@@ -23,3 +50,70 @@ def called(capsys):
         return (stop.value.code or 0, *capsys.readouterr())
 
     return call
+
+
+@pytest.fixture
+def seen(tmp_path):
+    """What a browser shows of pages, at the width of a telephone and of a screen."""
+    if BROWSER is None:
+        pytest.skip("no Chromium")
+
+    def look(pages):
+        frames = ""
+        for name, width in ((name, width) for name in pages for width in WIDTHS):
+            page = pages[name].replace("<head>", f"<head>{BEGIN}").replace("</body>", f"{END}</body>")
+            frames += f'<iframe name="{name} {width}" width={width} height=800 srcdoc="{html.escape(page)}"></iframe>'
+        done = """addEventListener("load", () => document.body.innerHTML = `<pre>${JSON.stringify(seen)}</pre>`)"""
+        (tmp_path / "all.html").write_text(f"<body><script>var seen = {{}}; {done}</script>{frames}</body>")
+        options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'browser'}"]
+        run = [BROWSER, *options, "--dump-dom", (tmp_path / "all.html").as_uri()]
+        found = subprocess.run(run, capture_output=True, text=True, timeout=300, check=True).stdout
+        return json.loads(html.unescape(re.findall(r"<pre>(.*?)</pre>", found, flags=re.DOTALL)[-1]))
+
+    return look
+
+
+@pytest.fixture(scope="session")
+def script(tmp_path_factory):
+    """The script of the wheel, in an environment that sees the packages of this one, and nothing of the checkout."""
+    folder = tmp_path_factory.mktemp("wheel")
+    (folder / "build.cfg").write_text(f"[build]\nbuild_base = {folder / 'build'}\n")  # not in the checkout
+    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT]
+    subprocess.run(build, check=True, env=os.environ | {"DIST_EXTRA_CONFIG": str(folder / "build.cfg")})
+    venv.create(folder / "env", system_site_packages=True, symlinks=True)
+    site = next((folder / "env").glob("lib/python*/site-packages"))
+    (site / "parent.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")))
+    (wheel,) = folder.glob("*.whl")
+    python = folder / "env" / "bin" / "python"
+    install = [python, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--force-reinstall", wheel]
+    subprocess.run(install, check=True, env={}, cwd=folder)
+    where = [python, "-c", "import hybrid_jax; print(hybrid_jax.__file__)"]
+    found = subprocess.run(where, capture_output=True, text=True, env={}, cwd=folder).stdout
+    assert Path(found.strip()).is_relative_to(folder)
+    return python.with_name("hybrid-jax")
+
+
+@pytest.fixture(scope="session")
+def ran(script):
+    """What a command line of the script of the wheel prints, run in a folder."""
+
+    def run(folder, line):
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        given = [script, *line.split()]
+        done = subprocess.run(given, capture_output=True, text=True, env=environment, cwd=folder)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def fitted(tmp_path_factory, ran):
+    """Flights of every format, a model of them by the script of the wheel, and flights after a change of inertia."""
+    root = tmp_path_factory.mktemp("cli")
+    (root / "v.toml").write_text(vehicle_toml(IRIS))
+    (root / "map.toml").write_text(MAP)
+    of_every_format(root / "before", simulated(SOURCE, 5, 0))
+    written(root / "after", PARAMETER_SHIFT, 2, 1)
+    ran(root, f"fit before -o source.npz --vehicle v.toml {READING}")
+    return root

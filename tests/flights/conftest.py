@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from writers import PX4_STATES, stamped, ulog
+from writers import px4_topics, ulog
 
-from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import IRIS
 
 DT = 0.01
@@ -70,18 +68,4 @@ def _squares(thrust, torque):
 
 @pytest.fixture(scope="session")
 def topics(flight):
-    """The constructed flight as PX4 logs it: NED and FRD, position at 50 Hz, attitude at 125, gyro at 200."""
-    t = flight.t - flight.t[0]
-    body, world = BODIES["FRD"], WORLDS["NED"]
-
-    def at(rate, columns):
-        times = np.arange(0.003, t[-1], 1 / rate)
-        return times, CubicSpline(t, flight.x[:, columns])(times)
-
-    times, moving = at(50, [0, 1, 2, 7, 8, 9])
-    local = stamped(times, np.concatenate([moving[:, :3] @ world, moving[:, 3:] @ world], axis=1), delay=4000)
-    times, q = at(125, QUATERNION)
-    turned = Rotation.from_matrix(world.T @ Rotation.from_quat(np.roll(q, -1, axis=1)).as_matrix() @ body)
-    attitude = stamped(times, np.roll(turned.as_quat(), 1, axis=1), delay=2000)
-    times, omega = at(200, slice(10, 13))
-    return dict(zip(PX4_STATES, (local, attitude, stamped(times, omega @ body)), strict=True))
+    return px4_topics(flight)

@@ -4,59 +4,26 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from surface import outcome, refusal
+from writers import MAP, foreign, table_of
 
-from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.flights.load import load_log
 
-GOOD = """
-frames = {world = "NED", body = "FRD", velocity = "body"}
-time = {columns = ["stamp"], unit = "us"}
-position = {columns = ["x", "y", "z"], unit = "mm"}
-attitude = {columns = ["q1", "q2", "q3", "q4"], unit = "xyzw"}
-velocity = {columns = ["u", "v", "w"], unit = "cm/s"}
-body_rates = {columns = ["p", "q", "r"], unit = "deg/s"}
-motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}
-[format]
-delimiter = ";"
-"""
 EULER = [('["q1", "q2", "q3", "q4"]', '["roll", "pitch", "yaw"]'), ('"xyzw"', '"deg"')]
 AFFINE = [('"rpm"', '"command", polynomial = [100.0, 1000.0]')]
 QUADRATIC = [('"rpm"', '"command", polynomial = [50, 200.0, 800.0]')]
 
 
-def foreign(flight):
-    """The flight as a logger in NED, FRD and the units of GOOD writes it, by name of column."""
-    world, body = WORLDS["NED"], BODIES["FRD"]
-    to_world = Rotation.from_quat(np.roll(flight.x[:, 3:7], -1, axis=1))
-    attitude = Rotation.from_matrix(world.T @ to_world.as_matrix() @ body)
-    u = flight.u
-    command = (u - 100) / 1000
-    squared = (-200 + np.sqrt(200**2 + 4 * 800 * (u - 50))) / 1600
-    yaw, pitch, roll = attitude.as_euler("ZYX", degrees=True).T
-    columns = {"stamp": flight.t * 1e6 + 7e9, "roll": roll, "pitch": pitch, "yaw": yaw}
-    columns |= dict(zip("xyz", 1000 * world.T @ flight.x[:, :3].T, strict=True))
-    columns |= dict(zip(("q1", "q2", "q3", "q4"), attitude.as_quat().T, strict=True))
-    columns |= dict(zip("uvw", 100 * body @ to_world.inv().apply(flight.x[:, 7:10]).T, strict=True))
-    columns |= dict(zip("pqr", np.rad2deg(body @ flight.x[:, 10:].T), strict=True))
-    for name, motors in (("rpm", u * 30 / np.pi), ("affine", command), ("quadratic", squared)):
-        columns |= dict(zip((f"{name}_{m}" for m in ("m3", "m1", "m4", "m2")), motors.T, strict=True))
-    return columns
-
-
 @pytest.fixture
 def mapped(tmp_path):
     def read(columns, changes=(), motors="rpm"):
-        text = GOOD
+        text = MAP
         for old, new in changes:
             assert old in text
             text = text.replace(old, new)
         (tmp_path / "map.toml").write_text(text)
-        names = [name.removeprefix(f"{motors}_") for name in columns]
-        rows = [";".join(map(repr, row)) for row in np.column_stack(list(columns.values())).tolist()]
-        (tmp_path / "log.csv").write_text("\n".join([";".join(names), *rows]))
+        (tmp_path / "log.csv").write_text(table_of(columns, motors))
         return load_log(tmp_path / "log.csv", columns=tmp_path / "map.toml")
 
     return read
@@ -106,8 +73,8 @@ def test_wrong_data_are_refused_with_names_of_the_file(flight, mapped):
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.text(max_size=80), st.integers(0, len(GOOD)))
+@given(st.text(max_size=80), st.integers(0, len(MAP)))
 def test_any_map_is_read_or_refused(tmp_path_factory, text, at):
     path = tmp_path_factory.getbasetemp() / "fuzzed.toml"
-    path.write_bytes((GOOD[:at] + text + GOOD[at:]).encode("utf-8", "replace"))
+    path.write_bytes((MAP[:at] + text + MAP[at:]).encode("utf-8", "replace"))
     outcome(load_column_map, path, naming=str(path))
