@@ -101,7 +101,7 @@ def _page(
     if not different:
         answer = "These flights show no change."
         todo = "Keep the model. If something did change, you should fly manoeuvres that excite it more."
-    rows = [(name, f"{value:.4g}", str(one)) for name, value, one in (changed or changes)[:SHOWN]]
+    rows = [(name, f"{value:.4g}", str(one)) for name, value, one in ([*own, *lacked] or changes)[:SHOWN]]
     title = "What changed" if changed else "Parameters, none of which clearly changed"
     expected = [
         (horizon, name, *(f"{number:.3g}" for number in one))
@@ -110,7 +110,7 @@ def _page(
     ]
     header = ("after", "of", "RMSE", "from", "to")
     return page.Page(
-        f"What changed, by {len(flights.logs)} flights of {options.after}, {flights.seconds:.0f} s?",
+        f"What changed, by {page.counted(flights.logs, 'flight')} of {options.after}, {flights.seconds:.0f} s?",
         answer,
         page.Table(f"{title} (95 % intervals)", ("parameter", "before", "after"), rows) if rows else None,
         [("RMSE on these flights, to which the model was adapted", errors.figure(curves, known.dt))],

@@ -71,7 +71,7 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
     worse = [name for i, name in enumerate(names) if (curves["model"][i, at] > frozen[i, at]).all()]
     meaning = [f"The model is worse than frozen rates in every quantity on {', '.join(worse)}."] if worse else []
     return page.Page(
-        f"How well does {options.model.name} predict {len(names)} flights of {options.flights}?",
+        f"How well does {options.model.name} predict {page.counted(names, 'flight')} of {options.flights}?",
         f"Its predictions of {known.steps * known.dt:g} s are {beaten}.",
         page.Table(f"RMSE after {known.steps * known.dt:g} s", header, rows),
         [("RMSE over the time since a prediction began, all flights", errors.figure(curves, known.dt))],

@@ -59,7 +59,7 @@ def adapt(options: Any, model: Model) -> int:
     ]
     todo = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     shown = page.Page(
-        f"What changed, by {len(logs)} logs of {options.after}, {found.seconds:.0f} s?",
+        f"What changed, by {page.counted(logs, 'log')} of {options.after}, {found.seconds:.0f} s?",
         f"Changed: {alone[0]}" if changed else "These logs show no change.",
         page.Table("Before, and after with 95 % intervals", HEADER, lines[:LINES]),
         [("Errors of predictions of the adapted model", figure(found.field, logs, layout))],
@@ -88,7 +88,7 @@ def check(options: Any, model: Model) -> int:
     whole = predicted(model.field, logs, layout, "all logs")
     ends = "; ".join(f"{name} {error} {unit}" for name, unit, _, error in whole.lines)
     shown = page.Page(
-        f"How well does {options.model.name} predict {len(logs)} logs of {options.flights}?",
+        f"How well does {options.model.name} predict {page.counted(logs, 'log')} of {options.flights}?",
         f"After {layout.dt * layout.steps:.3g} s its RMS errors are: {ends}.",
         whole,
         [("Errors of predictions, all logs", figure(model.field, logs, layout))],

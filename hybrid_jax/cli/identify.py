@@ -143,7 +143,7 @@ def read_checked(
 
 def identified(read: Read, layout: Layout) -> Identified:
     """Identify the parameters, beginning with the field's; with commands, thrust comes before rotation."""
-    with step(f"identifying by {len(read.logs)} logs") as told:
+    with step(f"identifying by {page.counted(read.logs, 'log')}") as told:
         fit = identify_in_turn if isinstance(read.field, Actuated) else identify
         found = fit(read.field, [*read.logs.values()], layout)
         told(f"{found.windows} windows, {found.seconds:.4g} s of flight")
@@ -207,7 +207,7 @@ def _page(options: Options, found: Identified, read: Read) -> page.Page:
     fitted = [(name, _unit(name), "  ".join(f"{e:.3g}" for e in each)) for name, each in found.errors.items()]
     again = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     return page.Page(
-        f"What do {len(logs)} logs of {options.folder} show about the vehicle?",
+        f"What do {page.counted(logs, 'log')} of {options.folder} show about the vehicle?",
         f"{len(values) - len(unseen)} of {len(lines)} parameters are identified by {found.seconds:.4g} s of flight.",
         page.Table("Parameters, with 95 % intervals", header, lines[:LINES]),
         [("Errors of predictions from the state estimated from earlier samples", errors)],

@@ -33,7 +33,7 @@ BORNE = ("quantities", "slowest signal", "gaps", "repeated samples")
 SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
 NOT_RUN = f"not checked for want of --vehicle: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
 EMPTY = "–"
-LESS = "{} of them lack quantities, but have motors: hybrid-jax fit identifies what these and the other sensors tell."
+LESS = "Some logs have motors and lack states ({}): hybrid-jax identify learns what these determine."
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,8 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
     ]
     learn = f"Learn from them: hybrid-jax fit {options.folder} -o source.npz --vehicle {options.vehicle or 'v.toml'}"
     read = [log for log in logs if log.recording is not None]
-    less = sum("quantities" in {c.name for c in log.failed} for log in read if log.recording and log.recording.rotors)
+    motors = [log for log in read if log.recording and log.recording.rotors]
+    less = ", ".join(log.name for log in motors if "quantities" in {check.name for check in log.failed})
     worst = sorted(logs, key=lambda log: log.result == "ready")
     return page.Page(
         f"Do the logs of {printable(str(options.folder))} suffice for a model?",

@@ -3,7 +3,7 @@
 import base64
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ body { font: 16px/1.5 system-ui, sans-serif; max-width: 56rem; margin: 0 auto; p
 h1 { font-size: 1.3rem } h2 { font-size: 1.1rem } .answer { font-size: 1.2rem; font-weight: 600 }
 .scroll { overflow-x: auto } table { border-collapse: collapse; font-size: .9rem }
 td, th { padding: .25rem .6rem; text-align: left; border-bottom: 1px solid #ddd; vertical-align: top }
+@media (max-width: 30rem) { body { padding: .5rem } table { font-size: .8rem } td, th { padding: .25rem .3rem } }
 figure { margin: 1rem 0 } img { max-width: 100% } figcaption { font-size: .9rem; color: #555 }
 details { margin: .5rem 0 } summary { cursor: pointer } li { overflow-wrap: anywhere }
 @media (prefers-color-scheme: dark) { body { background: #161616; color: #e6e6e6 } td, th { border-color: #444 }
@@ -58,6 +59,11 @@ class Page:
     todo: Sequence[str] = ()
     details: Sequence[Table] = ()
     notes: Sequence[str] = field(default_factory=tuple)
+
+
+def counted(several: Sized, what: str) -> str:
+    """Return, for example, "1 log" or "2 logs"."""
+    return f"{len(several)} {what}{'s' * (len(several) != 1)}"
 
 
 def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
