@@ -69,8 +69,8 @@ def _fly(
         course = pilot.Course(reference.position, reference.velocity, reference.heading, no_dither)
         x = starting_state(reference)
         if random:
-            course = pilot.draw_course(own, steps, scale)
-            x = pilot.starting_state(start, course, scale)
+            course = pilot.draw_course(steps, scale, own)
+            x = pilot.starting_state(course, scale, start)
 
         def interval(carry, now):
             integral, x, u, t = carry

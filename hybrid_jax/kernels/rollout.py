@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from hybrid_jax.integrate import RK4, Solver, integrate
 from hybrid_jax.kernels import library
 from hybrid_jax.kernels.fields import Kernel, kernel_of
-from hybrid_jax.networks.normalised_layer import row_means
+from hybrid_jax.networks.normalisation import row_means
 
 Shaped = Array | np.ndarray | jax.ShapeDtypeStruct
 VECTOR = 16  # numbers in a vector, at most: of windows the kernels take at least so many

@@ -96,8 +96,8 @@ def _fly_chunk(
 
     def one_flight(number: UInt[Array, ""]) -> Flights:
         key_course, key_start, key_clock = jax.random.split(jax.random.fold_in(key, number), 3)
-        course = pilot.draw_course(key_course, steps, scale)
-        x0 = pilot.starting_state(key_start, course, scale)
+        course = pilot.draw_course(steps, scale, key_course)
+        x0 = pilot.starting_state(course, scale, key_start)
         start = jax.random.uniform(key_clock, maxval=CLOCK)
 
         def decide(carry, now):

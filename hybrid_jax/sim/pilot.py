@@ -74,9 +74,9 @@ class Course(NamedTuple):
     dither: Float[Array, "*t 4"]  # angular acceleration [rad/s², body], acceleration along the thrust [m/s²]
 
 
-def draw_course(key: PRNGKeyArray, steps: int, scale: Scale) -> Course:
+def draw_course(steps: int, scale: Scale, key: PRNGKeyArray) -> Course:
     key_targets, key_dither = jax.random.split(key)
-    target, limit = _draw_waypoints(key_targets, steps, scale)
+    target, limit = _draw_waypoints(steps, scale, key_targets)
     hardest = jnp.array(ACCELERATION) * np.array([*[scale.acceleration] * 3, 1 / scale.time**2])
 
     def follow(carry, waypoint):
@@ -88,7 +88,7 @@ def draw_course(key: PRNGKeyArray, steps: int, scale: Scale) -> Course:
         return (place, rate), (place, rate)
 
     _, (place, rate) = jax.lax.scan(follow, (target[0], jnp.zeros(4)), (target, limit))
-    return Course(place[:, :3], rate[:, :3], place[:, 3], _draw_dither(key_dither, steps, scale))
+    return Course(place[:, :3], rate[:, :3], place[:, 3], _draw_dither(steps, scale, key_dither))
 
 
 def _shorten(velocity: Float[Array, "4"], fastest: Vector) -> Float[Array, "4"]:
@@ -98,7 +98,7 @@ def _shorten(velocity: Float[Array, "4"], fastest: Vector) -> Float[Array, "4"]:
     return jnp.concatenate([plane, jnp.clip(velocity[2:], -fastest[1:], fastest[1:])])
 
 
-def _draw_waypoints(key: PRNGKeyArray, steps: int, scale: Scale) -> tuple[Float[Array, "t 4"], Float[Array, "t 3"]]:
+def _draw_waypoints(steps: int, scale: Scale, key: PRNGKeyArray) -> tuple[Float[Array, "t 4"], Float[Array, "t 3"]]:
     """Waypoint (x, y, z, heading) and limits (cruise, climb, turn) at each decision."""
     count = int(steps * PERIOD / (HOLD[0] * scale.time)) + 2
     # One draw for all, because each call of a random function takes a third of a second to compile.
@@ -118,7 +118,7 @@ def _between(bounds: tuple[float, float], share: Float[Array, "*n"], scale: floa
     return bounds[0] * scale + (bounds[1] - bounds[0]) * scale * share
 
 
-def _draw_dither(key: PRNGKeyArray, steps: int, scale: Scale) -> Float[Array, "t 4"]:
+def _draw_dither(steps: int, scale: Scale, key: PRNGKeyArray) -> Float[Array, "t 4"]:
     share_of_band, share_of_turn = jax.random.uniform(key, (2, TONES, 4))
     frequency, phase = _between(BAND, share_of_band, 1 / scale.time), 2 * jnp.pi * share_of_turn
     time = PERIOD * jnp.arange(steps)[:, None, None]
@@ -187,7 +187,7 @@ def _allocate(thrust: Scalar, torque: Vector, vehicle: Vehicle) -> Input:
     return jnp.sqrt(jnp.clip(squared, 0.0, vehicle.max_rotor_speed**2))
 
 
-def starting_state(key: PRNGKeyArray, course: Course, scale: Scale) -> State:
+def starting_state(course: Course, scale: Scale, key: PRNGKeyArray) -> State:
     """A random state near the start of a course, slightly tilted, drifting and turning."""
     draw = jax.random.normal(key, (3, 3))
     level = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), course.heading[0])
