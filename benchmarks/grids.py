@@ -141,8 +141,6 @@ COLUMNS = {
     "plain [MB]": lambda row: f"{row['plain_bytes'] / 1e6:.1f}",
     "differ by": lambda row: f"{row['difference']:.0e}",
 }
-
-
 JACOBIAN_COLUMNS = {
     "kernel": lambda row: str(row["kernel"]),
     "parameters": lambda row: str(row["parameters"]),

@@ -137,8 +137,8 @@ def agree(what: str, ours: PyTree, theirs: PyTree, tolerance: float) -> float:
         Disagreement: it exceeds the tolerance, or is not a number.
     """
     pairs = zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True)
-    differences = [float(np.max(np.abs(np.asarray(a) - b)) / max(np.max(np.abs(b)), 1e-30)) for a, b in pairs]
-    worst = float(np.max(differences))
+    sizes = [[np.max(np.abs(part), initial=0) for part in (np.asarray(a) - b, b)] for a, b in pairs]
+    worst = float(np.max([off / max(size, 1e-30) for off, size in sizes]))
     if not worst <= tolerance:
         raise Disagreement(f"{what} differ by {worst:.1e}, allowed {tolerance:.0e}")
     return worst

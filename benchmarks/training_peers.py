@@ -140,7 +140,13 @@ def result_of(first: tuple) -> dict[str, Any]:
         moment["physics.deviations"] = jnp.stack([physics.deviations[name] for name in LEARNED])
         if "drag" in physics.deviations:
             moment["physics.drag"] = physics.deviations["drag"]
-    return {"loss": value, "first_moment": moment, "statistics": jax.tree.leaves(eqx.filter(statistics, eqx.is_array))}
+    return joined(value, moment, jax.tree.leaves(eqx.filter(statistics, eqx.is_array)))
+
+
+def joined(*parts: Any) -> dict[str, Any]:
+    """Loss, Adam's first moment and statistics, each as one vector: in a single number a gradient may cancel."""
+    vectors = (np.concatenate([np.zeros(0), *map(np.ravel, jax.tree.leaves(part))]) for part in parts)
+    return dict(zip(("loss", "first_moment", "statistics"), vectors, strict=True))
 
 
 def our_steps(step: Callable, arguments: tuple, in_a_row: int) -> Steps:
@@ -188,7 +194,7 @@ def rival_steps(arguments: tuple, preset: Preset, name: str) -> Steps:
         for _ in range(preset.in_a_row):
             training()
 
-    return Steps(in_a_row, training.result(value), seconds)
+    return Steps(in_a_row, joined(*training.result(value).values()), seconds)
 
 
 class TooLate(BaseException):
@@ -225,18 +231,17 @@ def prepare(preset: Preset, model: str, names: Sequence[str], most_seconds: int)
     if TORCHDIFFEQ in steps:
         step = partial(gradient_step, settings=replace(SETTINGS, solver=ThreeEighths()))
         alike[TORCHDIFFEQ] = result_of(compiled(step, *arguments)[0]())
-    ours = steps[OURS].result
-    differences = {
-        name: agree(f"steps of {name} and ours", alike.get(name, ours), program.result, AGREEMENT)
-        for name, program in steps.items()
-        if name != OURS
-    }
+    differences = {}
+    for name in steps.keys() - {OURS}:
+        what, own, other = f"steps of {name} and ours", alike.get(name, steps[OURS].result), steps[name].result
+        whole, loss = (agree(what, *both, AGREEMENT) for both in ((own, other), (own["loss"], other["loss"])))
+        differences[name] = {"difference": whole, "loss_difference": loss}
     for program in steps.values():
         program.call()
     return steps, differences, late
 
 
-def row_of(name: str, steps: Steps, differences: dict[str, float], times: Times, preset: Preset) -> dict[str, Any]:
+def row_of(name: str, steps: Steps, differences: dict[str, Any], times: Times, preset: Preset) -> dict[str, Any]:
     seconds = times.median(name) / preset.in_a_row
     return {
         "program": name,
@@ -247,19 +252,19 @@ def row_of(name: str, steps: Steps, differences: dict[str, float], times: Times,
         "windows_per_second": preset.windows / seconds,
         "times_ours": times.ratio(name, OURS),
         "compile_seconds": steps.seconds,
-        "difference": differences.get(name),
+        **differences.get(name, {"difference": None, "loss_difference": None}),
     }
 
 
 def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]], model: str) -> Table:
-    heads = "", "ms", "windows/s", "× ours", r"compile \[s]", "differs by"
+    heads = "", "ms", "windows/s", "× ours", r"compile \[s]", "differs by", "its loss by"
     table = Table(*heads, title=f"a gradient step of {model}, one core")
     for row in rows:
         speed = f"{1e3 * row['seconds']:.2f}", f"{row['windows_per_second']:,.0f}", f"{row['times_ours']:.2f}"
-        difference = "" if row["difference"] is None else f"{row['difference']:.0e}"
-        table.add_row(row["program"], *speed, f"{row['compile_seconds']:.1f}", difference)
+        off = ("" if row[key] is None else f"{row[key]:.0e}" for key in ("difference", "loss_difference"))
+        table.add_row(row["program"], *speed, f"{row['compile_seconds']:.1f}", *off)
     for row in absent:
-        table.add_row(row["rival"], *[""] * 4, escape(row["skipped"]))
+        table.add_row(row["rival"], *[""] * 5, escape(row["skipped"]))
     return table
 
 

@@ -12,12 +12,7 @@ LOOPED = 8  # so many entries are copied by a loop
 
 @dataclass
 class Tables:
-    """Tables of numbers, and unused names, that the functions of one file share.
-
-    Attributes:
-        double: whether numbers are in double instead of single precision.
-        numbers: tables by name.
-    """
+    """Tables of numbers by name, in double or single precision, and unused names, shared by all functions of a file."""
 
     double: bool
     numbers: dict[str, np.ndarray] = field(default_factory=dict)

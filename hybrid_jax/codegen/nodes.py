@@ -19,13 +19,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Entry(Reference):
-    """A variable, or an entry of an array at a known index.
-
-    Attributes:
-        name: name of the variable or array.
-        index: index in the array; None for a variable.
-        logical: whether it is an int (0 or 1) instead of a real.
-    """
+    """A variable, or with an index an entry of an array; a logical one is an int (0 or 1) instead of a real."""
 
     index: int | None = None
     logical: bool = False

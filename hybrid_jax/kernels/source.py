@@ -100,11 +100,7 @@ Outputs = list[tuple[str, int]]  # arrays, and where in them the results begin
 
 
 class Source:
-    """Functions of a field's weights and of one sample: x, u, and n; see cpp/rollout.h.
-
-    Attributes:
-        back: the weights of the backward pass, as a function of the weights; None for inference alone.
-    """
+    """Functions of a field's weights and of one sample: x, u, n; see cpp/rollout.h. `back` makes weights of its own."""
 
     def __init__(self, forward: Split, of_sample: Sequence[Shape], training: bool):
         self.tables, self.printer, self.factors = Tables(double=False), SamplePrinter(double=False), 1
