@@ -35,14 +35,10 @@ class FlightErrors(NamedTuple):
 
 
 def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"]) -> FlightErrors:
-    position, velocity, rates = (
-        jnp.linalg.norm(predicted[..., part] - truth[..., part], axis=-1) for part in (POSITION, VELOCITY, BODY_RATES)
-    )
-    # |a − b| and |a + b| are 2 sin and 2 cos of a quarter of the angle, which is accurate for small angles.
-    a, b = (rotation.normalise(states[..., QUATERNION]) for states in (predicted, truth))
-    chords = jnp.linalg.norm(a - b, axis=-1), jnp.linalg.norm(a + b, axis=-1)
-    angle = 4 * jnp.arctan2(jnp.minimum(*chords), jnp.maximum(*chords))  # q and −q are one rotation
-    return FlightErrors(position, velocity, angle, rates)
+    turns = jnp.vectorize(rotation.attitude_error, signature="(q),(q)->(v)")
+    parts = [predicted[..., part] - truth[..., part] for part in (POSITION, VELOCITY, BODY_RATES)]
+    parts.insert(2, turns(truth[..., QUATERNION], predicted[..., QUATERNION]))
+    return FlightErrors(*(jnp.linalg.norm(part, axis=-1) for part in parts))
 
 
 def flight_errors(
