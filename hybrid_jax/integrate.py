@@ -16,14 +16,14 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, state_space
 from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.runtime import entry
+from hybrid_jax.runtime import entry, jit_by_size
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
 LONG = 1000  # intervals in which solvers change the norm of a quaternion by more than rounding
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
-_infer = eqx.filter_jit(lambda field, x, u: as_field(field).infer_batch(x, u))
+_infer = jit_by_size()(lambda field, x, u: as_field(field).infer_batch(x, u))
 
 
 class RK4(diffrax.AbstractSolver):
@@ -131,7 +131,7 @@ def traced_once(derivative: Derivative, x: Float[Array, " d *b"]) -> Derivative:
     return jax.jit(lambda x, held: derivative(x, held)) if checks.is_traced(x) else derivative
 
 
-@eqx.filter_jit
+@jit_by_size()
 def _evaluate(field: AbstractVectorField, x, u):
     return field(x, u)
 
@@ -176,7 +176,7 @@ def rollout(
     return _integrate(field, *checked(field, x0, u, dt, solver), dt)
 
 
-@eqx.filter_jit
+@jit_by_size()
 def _integrate(field, x0, u, solver, dt):
     return integrate(field, x0, u, dt, solver, 1, projection(field, len(x0), len(u)))
 
@@ -205,7 +205,7 @@ def rollout_batch(
     return _integrate_batch(field, *checked(field, x0, u, dt, solver, windows=True), dt)
 
 
-@eqx.filter_jit
+@jit_by_size()
 def _integrate_batch(field, x0, u, solver, dt):
     if isinstance(solver, diffrax.AbstractImplicitSolver) or not as_field(field).features_first:
         return jax.vmap(lambda start, held: _integrate(field, start, held, solver, dt))(x0, u)

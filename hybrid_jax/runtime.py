@@ -8,7 +8,7 @@ import time
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import cache, partial, wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -38,10 +38,13 @@ FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
 UNUSED = 30 * 24 * 3600  # s after which a program that nobody used is deleted: its source has changed
 MOST = 2**30  # bytes of programs; beyond, those used longest ago are deleted
 THREADS = "OPENBLAS_NUM_THREADS"
+SIZES = 2  # of data, of which a function keeps its programs
 
 P = ParamSpec("P")
 R = TypeVar("R")
 _owner: dict[str, int] = {}  # the process that first computed
+_sized: list[Any] = []  # programs of `jit_by_size`
+_sizes: dict[str, set[Hashable]] = {}  # of the data of each function, since these were last cleared
 
 
 def configure(folder: Path | None = None) -> None:
@@ -115,6 +118,26 @@ def entry(function: Callable[P, R]) -> Callable[P, R]:
 def jit_with(options: dict[str, bool | int] | None) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """`equinox.filter_jit` with compiler options, which its type annotation lacks."""
     return partial(eqx.filter_jit, compiler_options=options)  # pyright: ignore[reportCallIssue, reportReturnType]
+
+
+def jit_by_size(options: dict[str, bool | int] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """`jit_with`, whose programs `keep_programs` deletes: each size of data has its own, of some 20 MiB."""
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        _sized.append(jit_with(options)(function))
+        return _sized[-1]
+
+    return decorate
+
+
+def keep_programs(function: str, size: Hashable) -> None:
+    """Delete the programs of `jit_by_size` if a function begins with data of its third size since they were deleted."""
+    sizes = _sizes.setdefault(function, set())
+    if size not in sizes and len(sizes) == SIZES:
+        for program in _sized:
+            program._cached.clear_cache()
+        _sizes.clear()
+    _sizes.setdefault(function, set()).add(size)
 
 
 def machine() -> tuple[str, ...]:

@@ -36,7 +36,7 @@ from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.standardise import motion_of
-from hybrid_jax.runtime import FAST_COMPILE, entry, jit_with, load_lapack
+from hybrid_jax.runtime import FAST_COMPILE, entry, jit_by_size, keep_programs, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
@@ -236,7 +236,7 @@ def adapt(
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
     checks.instance("settings", settings, Settings)
     for data in (windows,) if validation is None else (windows, validation):
-        checked(field, data.x0, data.u, data.dt, settings.solver, windows=True)
+        checked(field, data.x0[0], data.u[0], data.dt, settings.solver)
     exact, size = getattr(method, "has_intervals", False), _size(field)
     if exact and size > NAMED:
         physics = type(physics_of(field)).__name__
@@ -251,6 +251,7 @@ def adapt(
     if motion and len(windows) <= size:
         warnings.warn(FEW.format(len(windows), size), stacklevel=3)
     load_lapack()
+    keep_programs("adapt", windows.x.shape)
     diverged = Solution(field, status=Status.DIVERGED) if overflows(windows) or overflows(held_out) else None
     solution = diverged or method.solve(field, train, held_out, settings, **motion)
     if not isinstance(solution, Solution):
@@ -286,7 +287,7 @@ def adapt(
     )
 
 
-_mse = jit_with(FAST_COMPILE)(rollout_mse)
+_mse = jit_by_size(FAST_COMPILE)(rollout_mse)
 
 
 def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[str, Any]:

@@ -36,7 +36,7 @@ from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
 from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.networks.standardise import motion_of
-from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
+from hybrid_jax.runtime import FASTEST_COMPILE, jit_by_size
 from hybrid_jax.status import ended
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
@@ -200,10 +200,11 @@ def _conclude(
     return Solution(candidate(extended(field, train.x0.shape[1]), choice, taken), found.steps, status, choice)
 
 
-_compiled = jit_with(FASTEST_COMPILE)
+_compiled = jit_by_size(FASTEST_COMPILE)
 _fit_each, _judged, _concluded = _compiled(fit_each), _compiled(_judge), _compiled(_conclude)
 
 
+@jit_by_size()
 def at(fits: Fit, index: Int[Array, ""] | int) -> Fit:
     return jax.tree.map(lambda leaf: leaf[index], fits)
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from hybrid_jax.dynamics.composition import Frozen, Hybrid
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.estimation.least_squares import Scale, check_determined, fit_least_squares, ravel_parameters
 from hybrid_jax.estimation.uncertainty import select_disturbance
+from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import ADAM, make_run_config, run, start
@@ -162,7 +162,7 @@ class FineTune(Method):
         return Solution(replace(state.best, **kept), state.epoch, state.status)
 
 
-_run, _fit_ridge = eqx.filter_jit(run), eqx.filter_jit(ridge.fit_ridge)
+_run, _fit_ridge = jit_by_size()(run), jit_by_size()(ridge.fit_ridge)
 
 
 @cache  # the same object for the same weight, so that its program is compiled once

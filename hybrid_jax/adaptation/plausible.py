@@ -10,6 +10,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 # Parameters of a corrected rigid body; the others are its own, θ_p.
@@ -56,9 +57,7 @@ class Plausible:
         groups, theta = groups_of([*named_parameters(field)]), ravel_parameters(field)[0]
         k = groups.count("disturbance")
         parts = k if k and windows.x0.shape[1] % k == 0 else 1  # of a grid a component is one part
-        rates = (windows.x[:, -1] - windows.x0) / (windows.horizon * windows.dt)
-        rates = jnp.sqrt(jnp.mean(jnp.square(rates).reshape(len(rates), parts, -1), axis=(0, 2)))
-        steady, found = iter(jnp.broadcast_to(rates, (max(parts, k),))), []
+        steady, found = iter(jnp.broadcast_to(_rates(windows, parts), (max(parts, k),))), []
         for group, value in zip(groups, theta, strict=True):
             if group == "disturbance":
                 found.append(self.disturbance * next(steady))
@@ -66,6 +65,13 @@ class Plausible:
                 found.append(getattr(self, group) if "drag" in groups else self.relative * jnp.abs(value))
         sizes = jnp.asarray(found, theta.dtype)
         return jnp.where(sizes > 0, sizes, jnp.inf)
+
+
+@jit_by_size()
+def _rates(windows: Trajectories, parts: int) -> Float[Array, " parts"]:
+    """Return the RMS of each part's mean rate over a window."""
+    rates = (windows.x[:, -1] - windows.x0) / (windows.horizon * windows.dt)
+    return jnp.sqrt(jnp.mean(jnp.square(rates).reshape(len(rates), parts, -1), axis=(0, 2)))
 
 
 def groups_of(names: Sequence[str]) -> list[str]:

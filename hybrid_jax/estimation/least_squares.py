@@ -19,7 +19,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_l
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, minimise, move_of_rows
 from hybrid_jax.integrate import compact, rollout
-from hybrid_jax.runtime import entry
+from hybrid_jax.runtime import entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories
 
@@ -87,6 +87,7 @@ def fit_least_squares(
     """
     windows = check_windows(field, windows)
     checks.count("max_steps", max_steps)
+    keep_programs("fit_least_squares", windows.x.shape)
     with solver_errors(solver):
         found = _fit_and_compare(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
     if not checks.is_traced(found.discretisation):
@@ -112,7 +113,7 @@ def warn_of_steps(discretisation: float, remedy: str) -> None:
         warnings.warn(f"half the solver's step would move a parameter by {errors}: give {remedy}", stacklevel=3)
 
 
-@eqx.filter_jit
+@jit_by_size()
 def _fit_and_compare(field: AbstractVectorField, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale):
     """Run `fit_free` and compute `discretisation` by a Gauss–Newton step to the predictions with half the step."""
     fit, jacobian, errors = fit_and_linearise(field, windows, solver, max_steps, scale)
@@ -171,7 +172,7 @@ def rounding(windows: Trajectories, scale: Scale) -> Float[Array, ""]:
     return jnp.finfo(x.dtype).eps * jnp.linalg.norm(x.ravel())
 
 
-@eqx.filter_jit
+@jit_by_size()
 def fit_free(
     field: AbstractVectorField,
     windows: Trajectories,
@@ -272,7 +273,7 @@ def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta
     return theta, lambda theta: with_physics(field, at(theta))
 
 
-@eqx.filter_jit
+@jit_by_size()
 def prediction_errors(
     field: AbstractVectorField, window: Trajectories, solver: Solver = None, scale: Scale = None
 ) -> Float[Array, "t d"]:

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation import least_squares
 from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
+from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
@@ -47,7 +47,7 @@ class NormalEquations(NamedTuple):
 
 
 # A program of its own: selecting a disturbance and the covariance share it.
-@eqx.filter_jit
+@jit_by_size()
 def normal_equations(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, error: ErrorLoss | None, scale: Scale
 ) -> NormalEquations:
@@ -77,12 +77,14 @@ def equations_of(
     return NormalEquations(effect.T @ bent.reshape(-1, p), effect.T @ slope.ravel(), r @ r)
 
 
+@jit_by_size()
 def masked(equations: NormalEquations, free: Bool[Array | np.ndarray, " p"]) -> NormalEquations:
     """Replace the equations of parameters that are not free so that they do not change."""
     gram = jnp.where(free & free[:, None], equations.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
     return NormalEquations(gram, jnp.where(free, equations.score, 0.0), equations.square)
 
 
+@jit_by_size()
 def has_effect(equations: NormalEquations, windows: Trajectories, scale: Scale) -> Bool[Array, " p"]:
     """Which parameters change the predictions by more than rounding."""
     return jnp.diagonal(jnp.sum(equations.gram, axis=0)) > jnp.square(least_squares.rounding(windows, scale))

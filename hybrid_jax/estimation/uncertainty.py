@@ -33,7 +33,7 @@ from hybrid_jax.estimation.normal_equations import (
     masked,
     normal_equations,
 )
-from hybrid_jax.runtime import entry
+from hybrid_jax.runtime import entry, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 Kind = Literal["sandwich", "homoscedastic"]
@@ -113,7 +113,7 @@ def covariance_of(
     return found + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
 
 
-@eqx.filter_jit
+@jit_by_size()
 def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Array, ""] | int, cluster: int):
     gram, score, square = equations
     n = len(score)
@@ -262,7 +262,7 @@ def select_disturbance(
     return _selection(fits, equations, windows.horizon)
 
 
-@eqx.filter_jit
+@jit_by_size()
 def _selection(fits: list[LeastSquaresFit], equations: list[NormalEquations], horizon: int) -> DisturbanceSelection:
     disturbed, plain = fits
     gains = left_out(equations[1], horizon) - left_out(equations[0], horizon)

@@ -20,7 +20,7 @@ from hybrid_jax.dynamics.composition import check_batch_norm
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_motion, with_scaling
-from hybrid_jax.runtime import FAST_COMPILE, entry, jit_with
+from hybrid_jax.runtime import FAST_COMPILE, entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, FitState, Optimiser, RunConfig, make_run_config
@@ -124,6 +124,7 @@ def fit(
         FitInterrupted: Ctrl-C; a KeyboardInterrupt with the result so far.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
+    keep_programs("fit", train.x.shape)
     if rates is None:
         rates = RATE if optimiser is None else 1.0
     try:
@@ -221,7 +222,7 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     return result
 
 
-_train, _train_by_kernels = eqx.filter_jit(fitting.run), jit_with(FAST_COMPILE)(fitting.run)
+_train, _train_by_kernels = jit_by_size()(fitting.run), jit_by_size(FAST_COMPILE)(fitting.run)
 
 
 @cache  # the same object for the same optimiser, so that its program is compiled once
