@@ -84,6 +84,7 @@ def fit_records(
     robust: float = np.inf,
     rounds: int = 2,
     max_steps: int = 50,
+    starts: int = 1,
     solver: Solver = None,
     substeps: int = 1,
     level: float = 0.95,
@@ -107,6 +108,8 @@ def fit_records(
             all count as squares; 3 is usual for data with outliers.
         rounds: fits, each with outputs weighted by the previous round's errors.
         max_steps: of Levenberg–Marquardt in each round.
+        starts: searches in the first round, of which the one with the least cost goes on: the first from the model, the
+            others from learned numbers drawn from `prior`, always the same ones; free numbers are not drawn.
         solver: of diffrax, by default `RK4`.
         substeps: steps of the solver in each interval.
         level: confidence level of the intervals, between 0 and 1.
@@ -120,7 +123,7 @@ def fit_records(
     checks.positive("dt", dt, "a positive number of seconds")
     if not robust > 0:
         raise ValueError(f"robust must be a positive number, got {checks.short_repr(robust)}")
-    for name, number in (("rounds", rounds), ("max_steps", max_steps), ("substeps", substeps)):
+    for name, number in (("rounds", rounds), ("max_steps", max_steps), ("starts", starts), ("substeps", substeps)):
         checks.count(name, number)
     if any(model.process) and segment is None:
         raise ValueError("segment must be given with process noise: it acts between segments")
@@ -146,8 +149,12 @@ def fit_records(
         else:
             own = own[:, : model.space.tangent_size]
             search = search._replace(centres=search.centres[:, :1], off=None)
+        drawn = np.random.default_rng(0).normal(size=(starts, len(theta))) * np.where(np.isfinite(near), near, 0.0)
+        drawn[0] = 0.0
         for i in range(rounds):
-            end = descend(search.equations, theta, own, max_steps=max_steps)
+            moves = drawn if i == 0 else drawn[:1]
+            ends = [descend(search.equations, theta + move, own, max_steps=max_steps) for move in moves]
+            end = min(ends, key=lambda each: np.nan_to_num(float(jnp.sum(each.equations.square)), nan=np.inf))
             theta, own, total = end.theta, end.own, total + end.steps
             errors = search.errors(theta, own)
             if i < rounds - 1:

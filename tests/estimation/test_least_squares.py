@@ -14,7 +14,7 @@ from pushes import Push, pushes
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
-from hybrid_jax.estimation import least_squares
+from hybrid_jax.estimation import least_squares, levenberg_marquardt
 from hybrid_jax.estimation.least_squares import fit_least_squares, ravel_parameters
 from hybrid_jax.estimation.uncertainty import covariance_of
 from hybrid_jax.integrate import RK4, rollout_batch
@@ -183,3 +183,23 @@ def test_parameters_as_a_vector_and_back():
     theta, rebuild = ravel_parameters(field)
     np.testing.assert_allclose(theta, logs, rtol=1e-6)
     assert eqx.tree_equal(rebuild(theta), field)
+
+
+def test_a_narrow_curved_valley_takes_few_steps():
+    def evaluate(z, _):
+        def errors(z):
+            return jnp.stack([1e3 * (z[1] - z[0] ** 2), 1 - z[0]])
+
+        return jnp.sum(errors(z) ** 2), (z, errors(z), jax.jacfwd(errors)(z))
+
+    def aim(best, damping):
+        z, r, jacobian = best
+        move, expected = levenberg_marquardt.move_of_equations(jacobian.T @ jacobian, jacobian.T @ r, damping)
+        return z + move, expected, 0.0
+
+    with jax.enable_x64(True):
+        start = jnp.array([-1.2, 1.0])
+        begun = levenberg_marquardt.begin(start, (start, jnp.zeros(2), jnp.zeros((2, 2))))
+        end = levenberg_marquardt.minimise(evaluate, aim, begun, 1000)
+    np.testing.assert_allclose(end.best[0], 1.0, atol=1e-6)
+    assert end.steps < 400  # 509 if the damping falls only after steps that are as good as expected

@@ -88,6 +88,15 @@ def test_multiple_shooting_ends_where_the_simulation_does_from_a_worse_start(rec
         assert float(interval.value) == pytest.approx(float(fitted.intervals[name].value), abs=1e-4)
 
 
+def test_several_starts_find_the_minimum_that_one_misses(records):
+    options = {"dt": 0.02, "prior": {"field.log_length": 1.0}, "noise": {"angle": NOISE}}
+    one, several = (
+        fit_records(model_of(pendulum(0.1, 0.1)), records[:1], starts=starts, **options) for starts in (1, 5)
+    )
+    assert one.errors["angle"] > 10 * NOISE
+    assert several.errors["angle"] == pytest.approx(NOISE, rel=0.2)
+
+
 def test_what_follows_is_predicted_from_what_was_seen(fitted):
     whole = record(pendulum(), (0.3, -0.5), 6.0, 60, seed=3)
     past, future = whole.part(0, 4.0), whole.part(3.9, 9.0)
