@@ -6,6 +6,8 @@ import numpy as np
 import scipy  # not scipy.spatial, which takes a quarter of a second: it is imported where it is first used
 from jaxtyping import Float
 
+from hybrid_jax.records import Signal, integral
+
 Vectors = Float[np.ndarray, "n 3"]
 Quaternions = Float[np.ndarray, "n 4"]
 
@@ -63,11 +65,7 @@ def interpolate(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values:
 
 
 def mean_of_held(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values: Float[np.ndarray, "n d"]):
-    """Average zero-order-held values over each interval of t; slower values are returned unchanged."""
-    if len(t) == 1:
-        return values[np.searchsorted(at, t, side="right") - 1]
-    area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(at)[:, None], axis=0)])
-    end = max(t[-1], at[-1]) + 1.0
-    area = np.concatenate([area, area[-1:] + values[-1:] * (end - at[-1])])
-    mean = np.diff(interpolate(t, np.append(at, end), area), axis=0) / np.diff(t)[:, None]
-    return np.concatenate([mean, values[np.searchsorted(at, t[-1:], side="right") - 1]])
+    """Average zero-order-held values over each interval of t, and return the last value; slower ones are unchanged."""
+    area = integral(Signal(at, values), t, "held")
+    held = values[np.searchsorted(at, t[-1:], side="right") - 1]
+    return np.concatenate([np.diff(area, axis=0) / np.diff(t)[:, None], held])

@@ -119,16 +119,6 @@ def test_a_moving_motor_is_never_dropped_and_another_airframe_is_refused(flight,
     assert any("VTOL (SYS_AUTOSTART 13014)" in line for line in failures(check_recording(read_recording(path)), "log"))
 
 
-def test_slow_signals_fail_at_their_own_rates(flight, topics, written):
-    """ESC telemetry at 4 Hz may not become rotor speeds at 100 Hz."""
-    t = flight.t - flight.t[0]
-    recording = read_recording(written(topics | {"esc_status": escs(t[::25], flight.u[::25])}))
-    (line,) = failures(check_recording(recording, IRIS, 0.03), "log")
-    assert "motors 4 Hz" in line
-    assert "dt=0.25" in line
-    assert not failures(check_recording(recording, IRIS, 0.25), "log")
-
-
 @pytest.mark.parametrize("version", [(1, 9), (1, 12), (1, 14)], ids=str)
 def test_advice_for_the_next_flight_is_complete_for_its_version(version):
     """A list of topics takes the place of PX4's profile, so what it lacks is lost."""
