@@ -29,10 +29,8 @@ from hybrid_jax.identification.fitting import Identified
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import Model, save
 
-ALIKE, LEAST = (
-    0.03,
-    0.2,
-)  # share of a value by which flights of one vehicle differ, and that a parameter explains at least
+# Share of a value by which flights of one vehicle differ, and share that a parameter explains at least.
+ALIKE, LEAST = 0.03, 0.2
 REACH, SURE = 1.96, 1.5  # standard errors of an interval; half-widths that a change is at least
 HEADER = ("parameter", "before", "after", "from", "to", "unit")
 

@@ -70,8 +70,7 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
     order = np.argsort(np.concatenate(groups))
     found = {name: np.concatenate(each)[order] for name, each in parts.items()}
     ends = {name: each[:, -1] for name, each in found.items()}
-    scores = {name: np.log(ends[name] / ends[FROZEN]).mean(axis=1)[:, None] for name in CANDIDATES}
-    chosen = choose(scores, CANDIDATES[:1])
+    chosen = choose({name: np.log(ends[name] / ends[FROZEN]).mean(axis=1) for name in CANDIDATES})
     windows = windows_of(logs, STEPS, STEPS, TRAINED).windows
     physics = adapt(model.physics(), windows, method=PHYSICS, settings=settings)
     field = physics.field if chosen == "physics" else _hybrid(physics.field, logs, seed, settings)

@@ -15,12 +15,17 @@ TOP = 1000.0  # rad/s at full command if speeds are unknown: only thrust matters
 def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | None) -> str:
     """Return the text of a TOML file; unidentified numbers are placeholders with a comment."""
     own_mass, own_arm = mass or MASS, arm or ARM
-    places = found.positions(own_arm) if found.placed else _even(len(found.hover), own_arm)
+    angles = -np.pi / 4 - 2 * np.pi * np.arange(len(found.hover)) / len(found.hover)
+    places = found.positions(own_arm) if found.placed else own_arm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    pairs = ", ".join(f"[{x:.4g}, {y:.4g}]" for x, y in places + 0.0)
     thrust = level = own_mass * GRAVITY / float((found.hover**2).sum())  # N per squared motor
     if found.curve is not None:  # its slope at hover
         thrust = own_mass * float(found.curve[1] / (2 * found.hover.mean()) + found.curve[2])
     top = TOP if found.commands else 1.2 * found.largest
     k = level / top**2 if found.commands else thrust
+    unit, motors = "of full command" if found.commands else "rad/s", ", ".join(f"{each:.3g}" for each in found.hover)
+    volts = f" at {found.voltage:.3g} V" if np.isfinite(found.voltage) else ", voltage unknown"
+    hover = f"hover with motors at {motors} {unit}{volts}, {found.seconds:.0f} s of flight"
     lines = [
         "# Written from logs by hybrid-jax inspect. Numbers with a # are explained; those marked",
         "# PLACEHOLDER are not identifiable from logs: measure them.",
@@ -30,8 +35,8 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
         f'name = "{name}"',
         f"mass = {own_mass:g}  # kg; {'as given' if mass else WEIGH}",
         *_turning(found, thrust, places, k, top),
-        f"thrust_coefficient = {k:.4g}  # N/(rad/s)²; {_hover(found)}",
-        f"rotor_positions = {_pairs(places)}  # m; {_where(found, arm)}",
+        f"thrust_coefficient = {k:.4g}  # N/(rad/s)²; {hover}",
+        f"rotor_positions = [{pairs}]  # m; {_where(found, arm)}",
         f"max_rotor_speed = {top:.4g}  # rad/s; "
         + (
             "PLACEHOLDER at full command: only thrust matters"
@@ -78,26 +83,10 @@ def _turning(found: Estimate, thrust: float, places: np.ndarray, k: float, top: 
     ]
 
 
-def _even(count: int, arm: float) -> np.ndarray:
-    angles = -np.pi / 4 - 2 * np.pi * np.arange(count) / count
-    return arm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
-def _pairs(places: np.ndarray) -> str:
-    return f"[{', '.join(f'[{x:.4g}, {y:.4g}]' for x, y in places + 0.0)}]"
-
-
 def _where(found: Estimate, arm: float | None) -> str:
     order = "in the order of the log's motors"
     length = "arm as given" if arm else f"arm {ARM:g} m is a PLACEHOLDER: measure it; inertia grows with it"
     return f"{order}, from roll and pitch; {length}" if found.placed else f"PLACEHOLDER, {order}; {length}"
-
-
-def _hover(found: Estimate) -> str:
-    unit = "of full command" if found.commands else "rad/s"
-    motors = ", ".join(f"{each:.3g}" for each in found.hover)
-    volts = f" at {found.voltage:.3g} V" if np.isfinite(found.voltage) else ", voltage unknown"
-    return f"hover with motors at {motors} {unit}{volts}, {found.seconds:.0f} s of flight"
 
 
 def _actuator(found: Estimate, mass: float, thrust: float) -> list[str]:
