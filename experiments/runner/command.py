@@ -17,7 +17,7 @@ from experiments.runner.cache import source_digest
 from experiments.runner.options import COMMON, Run
 from experiments.runner.run_record import recorded
 from hybrid_jax import checks
-from hybrid_jax.cli.command import exit_codes, parsed
+from hybrid_jax.cli.command import answering, exit_codes, parsed
 from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
@@ -60,6 +60,7 @@ def run(
         main = hosts.is_main_process()  # it alone prints and writes
         console, folder = Console(stderr=True, quiet=not main), config.out / name
         with contextlib.ExitStack() as stack:
+            stack.enter_context(answering(name, "interrupted at the end of this block; Ctrl-C again stops it"))
             if main:
                 folder.mkdir(parents=True, exist_ok=True)
                 try:

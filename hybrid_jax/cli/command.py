@@ -65,27 +65,39 @@ def run(arguments: Sequence[str]) -> None:
         module = import_module(f"hybrid_jax.cli.{verb}")
         options = parsed(module.Options, f"hybrid-jax {verb}", split_lists(given, module.LISTS))
         configure()
-        _answer_at_once(f"hybrid-jax {verb}")
-        code = module.run(options)
+        with answering(f"hybrid-jax {verb}", INTERRUPTED, end=True):
+            code = module.run(options)
     sys.exit(code)
 
 
-def _answer_at_once(program: str) -> None:
-    """End the process on Ctrl-C even while XLA is busy; files are renamed when complete, so none is left partial."""
+@contextlib.contextmanager
+def answering(program: str, answer: str, end: bool = False) -> Iterator[None]:
+    """Answer the first Ctrl-C at once, even while XLA is busy, and perhaps end the process."""
     if threading.current_thread() is not threading.main_thread():
+        yield
         return
     ear, mouth = os.pipe()
     os.set_blocking(mouth, False)
-    signal.set_wakeup_fd(mouth)  # to which a signal is written at once
-    signal.signal(signal.SIGINT, lambda *_: None)
 
     def listen() -> None:
-        while os.read(ear, 1)[0] != signal.SIGINT:
-            pass
-        os.write(2, f"{program}: {INTERRUPTED}\n".encode())
-        os._exit(128 + signal.SIGINT)
+        with open(ear, "rb", buffering=0) as signals:
+            while number := signals.read(1):
+                if number[0] == signal.SIGINT:
+                    os.write(2, f"{program}: {answer}\n".encode())
+                    if end:  # files are renamed when complete, so none is left partial
+                        os._exit(128 + signal.SIGINT)
+                    return
 
     threading.Thread(target=listen, daemon=True).start()
+    before = signal.set_wakeup_fd(mouth, warn_on_full_buffer=False)  # to which a signal is written at once
+    handler = signal.signal(signal.SIGINT, lambda *_: None) if end else None
+    try:
+        yield
+    finally:
+        if handler is not None:
+            signal.signal(signal.SIGINT, handler)
+        signal.set_wakeup_fd(before)
+        os.close(mouth)
 
 
 def parsed(

@@ -35,8 +35,8 @@ WIDTHS = (400, 1400)
 
 @pytest.fixture(scope="session", autouse=True)
 def devices():
-    """Devices of this process are fixed by now, and its signals are not the script's."""
-    with mock.patch("hybrid_jax.cli.command.configure"), mock.patch("hybrid_jax.cli.command._answer_at_once"):
+    """Devices of this process are fixed by now."""
+    with mock.patch("hybrid_jax.cli.command.configure"):
         yield
 
 
@@ -55,10 +55,10 @@ def called(capsys):
 @pytest.fixture
 def seen(tmp_path):
     """What a browser shows of pages, at the width of a telephone and of a screen."""
-    if BROWSER is None:
-        pytest.skip("no Chromium")
 
     def look(pages):
+        if BROWSER is None:
+            pytest.skip("no Chromium")
         frames = ""
         for name, width in ((name, width) for name in pages for width in WIDTHS):
             page = pages[name].replace("<head>", f"<head>{BEGIN}").replace("</body>", f"{END}</body>")

@@ -142,6 +142,7 @@ def test_a_signal_saves_the_state_and_a_second_run_is_refused(sent, code, folder
         finally:
             process.kill()
     assert "the same command goes on from here" in rest
+    assert ("Ctrl-C again" in rest) == (sent == signal.SIGINT)
     (begun,) = (folder / "cache" / "stages").glob("pre-training-physics_only-*.begun")
     shutil.rmtree(begun)
 
