@@ -56,7 +56,7 @@ def test_the_paper(change, n):
 
 def test_the_verdicts():
     shown = {name.split()[0]: verdicts for name, verdicts in lines("docs/results/paper.md").items()}
-    words = {True: "holds", False: "fails", None: "undecided"}
+    words = {True: "yes", False: "no", None: "undecided"}
     for column, name in enumerate(PAPER.values()):
         report = json.loads((ROOT / "docs/reference" / name / "report.json").read_text())
         for claim in report["claims"]:

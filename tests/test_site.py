@@ -64,7 +64,7 @@ MEASURE = """(page, window) => {
     tables: frames.filter(frame => frame.getBoundingClientRect().right > right + 1).length,
     formulas: [...page.querySelectorAll("math")].filter(each => each.getBoundingClientRect().height < 3).length,
     source: page.querySelectorAll(".arithmatex").length,
-    styles: [...page.styleSheets].filter(each => !each.cssRules.length).length,
+    styles: [...page.styleSheets].filter(each => each.href && !each.cssRules.length).length,
     pictures: [...page.images].filter(each => each.complete && !each.naturalWidth).length,
   }
 }"""
