@@ -8,11 +8,13 @@ import shutil
 import subprocess
 import sys
 import venv
+from importlib.metadata import version
 from pathlib import Path
 from unittest import mock
 
 import pytest
 from cli_logs import READING, of_every_format, simulated, written
+from packaging.version import Version
 from smoke import ROOT
 from writers import MAP
 
@@ -79,6 +81,8 @@ def script(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     (folder / "build.cfg").write_text(f"[build]\nbuild_base = {folder / 'build'}\n")  # not in the checkout
     build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT]
+    if Version(version("setuptools")) >= Version("77"):  # else pip loads one
+        build.append("--no-build-isolation")
     subprocess.run(build, check=True, env=os.environ | {"DIST_EXTRA_CONFIG": str(folder / "build.cfg")})
     venv.create(folder / "env", system_site_packages=True, symlinks=True)
     site = next((folder / "env").glob("lib/python*/site-packages"))
