@@ -41,8 +41,9 @@ from hybrid_jax.kernels import library
 from hybrid_jax.training.fitting import gradient_step
 
 PEERS = "pip install -e '.[peers]'"
-# Sums of 100 windows × 40 evaluations in another order, in float32; and 1e-4 of a leaf's largest entry moves no rate.
-AGREEMENT = 1e-4
+# Errors of windows are a thousandth of their states: rounding these by 6e-8 changes a gradient by 1e-4. The car's is
+# 2e-4 from double precision in JAX, and 3e-4 by its kernel. An error of 1e-3 of the largest entry moves no rate.
+AGREEMENT = 1e-3
 OURS, BARE = "ours", "ours without kernels"
 TORCHDIFFEQ, BY_HAND, COMPILED = "PyTorch, torchdiffeq", "PyTorch by hand", "PyTorch, torch.compile"
 RIVALS = TORCHDIFFEQ, BY_HAND, COMPILED

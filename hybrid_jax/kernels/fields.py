@@ -5,6 +5,7 @@ sample of these, x and u: forward, and backward by `jax.vjp`. Batch normalisatio
 takes its result n and returns z and the weights W, γ and β besides ẋ; see cpp/rollout.h.
 """
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -74,7 +75,6 @@ def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
     key = tuple((*one.shape, str(one.dtype)) for one in shapes), structure, tuple(static), frame, d, m
     try:
         if (*key, training) not in _KNOWN:
-            _KNOWN[*key, training] = None  # unless what follows succeeds: GCC is not asked twice
             whole, both = eqx.combine(jax.tree.unflatten(structure, shapes), rest), _KNOWN.get((*key, True))
             _check_methods(whole, "train_batch" if training else "infer_batch")
             if both is None or both.sizes.units:  # or predictions are a part of training
@@ -86,6 +86,8 @@ def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
         known = isinstance(error, ValueError | library.Unusable)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
         REFUSED[_name(field)] = reason.removeprefix("field: ").partition("\n")[0]
+        with contextlib.suppress(TypeError):  # of a field that is not hashable
+            _KNOWN[*key, training] = None  # GCC is not asked twice
         return None
 
 
