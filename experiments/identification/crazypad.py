@@ -12,6 +12,7 @@ import tyro
 from jaxtyping import Float
 from rich.console import Console
 
+from experiments.identification.record import rmse
 from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
 from hybrid_jax import runtime
@@ -20,7 +21,7 @@ from hybrid_jax.dynamics.actuators import Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
 from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.load import read_recording
-from hybrid_jax.flights.recording import Recording, Signal
+from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification.fitting import identify
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.vehicle import Vehicle
@@ -75,14 +76,6 @@ def flights(folder: Path, vehicle: str = "E8") -> tuple[list[Flight], list[Fligh
     return normal, sorted(cut, key=lambda each: -each.length)
 
 
-def cut_out(recording: Recording, begin: float, end: float) -> Recording:
-    def part(signal: Signal) -> Signal:
-        inside = (signal.t >= begin) & (signal.t <= end)
-        return replace(signal, t=signal.t[inside], values=np.asarray(signal.values)[inside])
-
-    return replace(recording, signals={name: part(signal) for name, signal in recording.signals.items()})
-
-
 def force_errors(field: Any, recording: Recording, after: float = 0.0) -> np.ndarray:
     """Measured minus predicted specific force along the thrust [m/s²], in flight, from a time on."""
     command, force = (recording.signals[name] for name in ("command", "specific_force"))
@@ -95,10 +88,6 @@ def force_errors(field: Any, recording: Recording, after: float = 0.0) -> np.nda
     return error[within(t, airborne(recording)) & (t >= after)]
 
 
-def rms(errors: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(errors**2)))
-
-
 def source(normal: list[Flight]) -> Any:
     learn = rigid_body(VEHICLE, ("k_rotors",))
     field = actuated(learn, ACTUATOR, ("time_constant",))
@@ -107,7 +96,7 @@ def source(normal: list[Flight]) -> Any:
 
 def first_seconds(recording: Recording, seconds: float = SECONDS) -> tuple[Recording, float]:
     begin, _ = airborne(recording)[0]
-    return cut_out(recording, begin, begin + seconds), begin + seconds
+    return recording.part(begin, begin + seconds), begin + seconds
 
 
 def take_off(field: Any, normal: list[Flight]) -> Any:
@@ -148,7 +137,7 @@ def run(options: Options) -> None:
         worst = int(lost[:, 0].argmax())
         alone = 1 - float(np.exp(efficiency[worst]))
         shares.setdefault(flight.length, []).append(alone)
-        found.append([rms(force_errors(each, flight.recording, end)) for each in (here, changed(here, efficiency))])
+        found.append([rmse(force_errors(each, flight.recording, end)) for each in (here, changed(here, efficiency))])
         value, low, high = lost[worst]
         cells = f"M{worst + 1}" if low > 0 else "none", f"{value:.3f}", f"{low:.3f} … {high:.3f}", f"{alone:.3f}"
         lines.append((f"{WHOLE - flight.length:g}", *cells, *(f"{each:.2f}" for each in found[-1])))
@@ -157,7 +146,7 @@ def run(options: Options) -> None:
         lengths = sorted({WHOLE, *others})
         lost = np.interp(flight.length, lengths, [others.get(length, 0.0) for length in lengths])
         efficiency = np.log1p(-lost * (np.arange(VEHICLE.rotors) == 2))
-        row.append(rms(force_errors(changed(here, efficiency), flight.recording, first_seconds(flight.recording)[1])))
+        row.append(rmse(force_errors(changed(here, efficiency), flight.recording, first_seconds(flight.recording)[1])))
     lines = [(*line, f"{row[2]:.2f}") for line, row in zip(lines, found, strict=True)]
     pooled = np.sqrt(np.mean(np.square(found), axis=0))
     lines.append(("all", "", "", "", "", *(f"{each:.3f}" for each in pooled)))

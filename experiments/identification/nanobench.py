@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 from rich.console import Console
 
 import hybrid_jax as hj
-from experiments.identification.crazypad import ACTUATOR, VEHICLE, first_seconds, force_errors, rms
+from experiments.identification.crazypad import ACTUATOR, VEHICLE, first_seconds, force_errors
+from experiments.identification.record import rmse
 from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
 from hybrid_jax import runtime
@@ -132,7 +133,7 @@ def run(options: Options) -> None:
         tens = [first_seconds(each, SECONDS)[0] for each in others]
         few = [thrust_of([each], start=aware, free=("curve",)) for each in tens]
         errors_few = np.concatenate([force_errors(each, left) for each in few])
-        forces.append([*(rms(force_errors(each, left)) for each in (aware, fitted)), rms(errors_few)])
+        forces.append([*(rmse(force_errors(each, left)) for each in (aware, fitted)), rmse(errors_few)])
         console.print(Path(left.name).name, [f"{each:.3f}" for each in forces[-1]])
         test, plain, short = tests_of(left, fitted), tests_of(left, gain), tests_of(left, few[0])
         simple = [fitted_to(rigid_body(VEHICLE), others, each) for each in (gain, fitted)]

@@ -1,15 +1,14 @@
 """Shared parts of the programs for public records: reading, model selection on left-out parts, a table, a test."""
 
 import csv
-import dataclasses
 import gzip
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import equinox as eqx
 import numpy as np
 import tyro
 from rich.console import Console
@@ -18,10 +17,12 @@ from rich.table import Table
 import hybrid_jax as hj
 from experiments.runner import command
 
+FIRST = 0.05  # of a record, which is in every fit: it tells the initial state
+
 
 @dataclass(frozen=True)
 class Options:
-    """Fit physics, with and without a residual, to a record, choose by left-out parts, and predict from inputs only."""
+    """Fit several models to a record, choose by left-out parts, and predict another record from its inputs only."""
 
     record: Annotated[Path, tyro.conf.Positional]
     """CSV with the columns t, u and the measured output; you may compress it with gzip."""
@@ -31,15 +32,19 @@ class Options:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A system and its evaluation: errors are printed in `unit`, and `start` gives another record's initial state."""
+    """A system and its evaluation.
+
+    Errors are printed in `unit`, and `start` gives the initial state from the first samples and a model. A candidate is
+    a model with its priors; each of `parts` equal parts is left out in turn.
+    """
 
     title: str
     columns: tuple[str, str]
     unit: tuple[str, float]
     candidates: Mapping[str, Callable[[], tuple[hj.StateSpaceModel, dict[str, float]]]]
     options: Mapping[str, Any]
-    start: Callable[[float, hj.StateSpaceModel], tuple[float, ...]]
-    hidden: tuple[float, ...]
+    start: Callable[[float, float, hj.StateSpaceModel], tuple[float, ...]]
+    parts: int = 5
 
 
 def read(path: Path, columns: tuple[str, str]) -> hj.Record:
@@ -70,22 +75,23 @@ def run(benchmark: Benchmark, options: Options, console: Console) -> None:
     scores, fits = {}, {}
     unit, factor = benchmark.unit
     for label, candidate in benchmark.candidates.items():
+        model, prior = candidate()
+        model = replace(model, start=begun(benchmark, model, record))
         with console.status(f"{label}: {time.perf_counter() - began:.0f} s"):
-            scores[label] = [factor * error for error in left_out(benchmark, candidate, record)]
-            fits[label] = fit(benchmark, *candidate(), record)
+            scores[label] = [factor * error for error in left_out(benchmark, model, prior, record)]
+            fits[label] = fit(benchmark, model, prior, record)
         own = factor * float(fits[label].errors[benchmark.columns[1]][0])
         table.add_row(label, ", ".join(f"{error:.3g}" for error in scores[label]), f"{own:.3g}")
     chosen = min(scores, key=lambda label: np.mean(np.square(scores[label])))
     console.print(table)
-    console.print(f"RMSE of free runs in {unit}. Left out: the last third, and the first, each by a fit to the others.")
+    console.print(f"RMSE of free runs from the start, in {unit}. Left out: each part in turn, by a fit to the others.")
     console.print(f"Chosen: {chosen}, fitted in {time.perf_counter() - began:.0f} s with all candidates.")
     for parameter, interval in fits[chosen].intervals.items():
         low, high = float(interval.low), float(interval.high)
         console.print(f"  {parameter} {float(interval.value):.4g}, 95 % interval {low:.4g} to {high:.4g}")
     if test is not None:
         model = fits[chosen].model
-        signal = test.signals[benchmark.columns[1]]
-        error = free_run(benchmark, model, test, benchmark.start(float(signal.values[0, 0]), model))
+        error = free_run(benchmark, model, test, begun(benchmark, model, test))
         console.print(f"{test.name}: {factor * rmse(error):.4g} {unit}")
 
 
@@ -100,25 +106,22 @@ def free_run(benchmark: Benchmark, model: hj.StateSpaceModel, record: hj.Record,
     return (y - record.signals[benchmark.columns[1]].values[: len(y)])[:, 0]
 
 
+def begun(benchmark: Benchmark, model: hj.StateSpaceModel, record: hj.Record) -> tuple[float, ...]:
+    return benchmark.start(*(float(record.signals[name].values[0, 0]) for name in benchmark.columns), model)
+
+
 def rmse(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def left_out(benchmark: Benchmark, candidate, record: hj.Record) -> tuple[float, float]:
-    """RMSE on the last third, simulated on from a fit to the others, and on the first third.
-
-    The initial state of the first third is estimated from its first tenth.
-    """
-    signal = record.signals[benchmark.columns[1]]
-    begin, span = signal.t[0], signal.t[-1] - signal.t[0]
-    model, prior = candidate()
-    first = fit(benchmark, model, prior, record.part(begin, begin + 2 / 3 * span))
-    late = signal.t > begin + 2 / 3 * span
-    one = rmse(free_run(benchmark, first.model, record, first.starts[0])[late])
-    at = float(np.interp(begin + span / 3, signal.t, signal.values[:, 0]))
-    inside = dataclasses.replace(model, start=benchmark.start(at, model), spread=benchmark.hidden)
-    second = fit(benchmark, inside, prior, record.part(begin + span / 3, np.inf))
-    known = eqx.tree_at(lambda model: model.field, second.model, hj.Frozen(second.model.field))
-    known = dataclasses.replace(known, start=model.start, spread=model.spread)
-    start = fit(benchmark, known, {}, record.part(begin, begin + span / 30)).starts[0]
-    return one, rmse(free_run(benchmark, second.model, record.part(begin, begin + span / 3), start))
+def left_out(benchmark: Benchmark, model: hj.StateSpaceModel, prior: dict[str, float], record: hj.Record):
+    """Return the RMSE of free runs of the whole record on each part, by a fit to the other samples."""
+    name, found = benchmark.columns[1], []
+    n = len(signal := record.signals[name])
+    # The last sample stays, so that all fits have one grid and one program.
+    for begin, end in itertools.pairwise(np.linspace(FIRST * n, n - 1, benchmark.parts + 1).astype(int)):
+        others = np.delete(np.arange(n), np.s_[begin:end])
+        kept = replace(signal, t=signal.t[others], values=signal.values[others])
+        result = fit(benchmark, model, prior, replace(record, signals={**record.signals, name: kept}))
+        found.append(rmse(free_run(benchmark, result.model, record, result.starts[0])[begin:end]))
+    return found

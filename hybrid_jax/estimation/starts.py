@@ -65,14 +65,6 @@ class Sums(NamedTuple):
         return jnp.maximum(self.square - self.score @ solve(self.gram, self.score), 0.0)
 
 
-def unknown_starts(windows: Trajectories) -> Starts:
-    t, d = windows.x.shape[1:]
-    n, x0 = len(windows), jnp.asarray(windows.x0)
-    return Starts(
-        x0, jnp.zeros_like(x0), jnp.zeros((n, t, d, d), x0.dtype), jnp.zeros((n, d, d), x0.dtype), jnp.zeros(n)
-    )
-
-
 def smoothed(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale
 ) -> tuple[Starts | None, Float[Array, ""]]:

@@ -33,7 +33,7 @@ def slide(tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_model_that_made_a_record_predicts_another(slide, capsys):
-    one = dataclasses.replace(emps.BENCHMARK, candidates={"physics": emps.candidate})
+    one = dataclasses.replace(emps.BENCHMARK, candidates={"physics": emps.candidate}, parts=2)
     record.main(one, "identification.emps", [slide[0], "--test", slide[1]])
     said = capsys.readouterr().out
     assert "Chosen: physics" in said
@@ -41,9 +41,18 @@ def test_the_model_that_made_a_record_predicts_another(slide, capsys):
 
 
 def test_what_is_added_to_the_physics_is_zero_at_first():
-    x, u = np.array([4.0, 6.0]), np.array([3.0])
-    plain, *others = (model.field(x, u) for model, _ in (tanks.white(False), tanks.white(True), tanks.hybrid()))
-    np.testing.assert_allclose(others, [plain, plain], rtol=1e-6)
+    x, u = np.array([4.0, 6.0, 0.0]), np.array([3.0])
+    models = [make()[0] for make in tanks.BENCHMARK.candidates.values()]
+    plain, *others = (model.field(x[: model.size], u)[:2] for model in models)
+    np.testing.assert_allclose(others, [plain] * 2, rtol=1e-6)
+
+
+def test_a_sensor_with_play_stays_at_a_reversal_and_then_follows():
+    field, play = tanks.physics("log_play"), 0.15
+    rate = field(np.array([4.0, 6.0, 0.0]), np.array([3.0]))[1]
+    for z, share in ((0.0, 1.0), (-np.sign(rate) * play, 1.0), (np.sign(rate) * play, 0.0)):
+        change = field(np.array([4.0, 6.0, z]), np.array([3.0]))
+        np.testing.assert_allclose(change[2], share * change[1], atol=1e-7)
 
 
 @pytest.mark.parametrize(
