@@ -26,7 +26,7 @@ from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, with_dis
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import Interval, intervals
-from hybrid_jax.integrate import check_callable
+from hybrid_jax.integrate import check_callable, check_field
 from hybrid_jax.online import consistency, excitation, kalman, multiple_model
 from hybrid_jax.online.change_test import ChangeTest
 from hybrid_jax.online.excitation import Excitation
@@ -174,6 +174,7 @@ class OnlineAdaptation(AbstractEstimator):
         x, u = jnp.asarray(x, state.x.dtype), jnp.asarray(u, state.x.dtype)
         if x.shape != state.x.shape:
             raise ValueError(f"x must be one sample {state.x.shape}, as the state is, got shape {x.shape}")
+        check_field(self.field, x, u)
         x = state_space(self.field, len(x)).nearest(x, state.x)
         sample, history = classify(x, u, elapsed, state.history, self.dt, self.tuning.gap)
         model = self._filter_model(sample, each)

@@ -1,18 +1,22 @@
 """The C of a filter passes faults under sanitizers: no report, always finite, and it ends where JAX does."""
 
-import shutil
 import subprocess
+from functools import cache
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import needs_compiler
 from jax.flatten_util import ravel_pytree
-from test_excited_directions import DT, HOVER, NOISE, SECOND, filter_of
+from test_excited_directions import DT, HOVER, NOISE, SECOND, Climb
 
+import hybrid_jax as hj
 from hybrid_jax.export import export_adaptation_c
 
+pytestmark = needs_compiler
+HYPOTHESES = hj.Hypothesis("gain", {"gain": 0.2}), hj.Hypothesis("wind", {"disturbance[0]": 3.0})
 STEPS, FAULT = 24 * SECOND, slice(12 * SECOND, None)
 MAIN = """
 #include "adaptation.h"
@@ -68,23 +72,17 @@ def flight():
     return np.array(rows, np.float32)
 
 
-@pytest.fixture(scope="module")
-def program(tmp_path_factory):
-    """The C with a main function, under sanitizers."""
-    if shutil.which("gcc") is None:
-        pytest.skip("gcc is not installed")
-    folder = tmp_path_factory.mktemp("filter")
-    source = export_adaptation_c(folder, filter_of(NOISE), state_size=1, input_size=1)[1]
-    size = ravel_pytree(filter_of(NOISE).begin(jnp.zeros(1)))[0].size
-    (folder / "main.c").write_text(MAIN % (size, size, size))
-    flags = ("-std=c99", "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    subprocess.run(["gcc", *flags, folder / "main.c", source, "-o", folder / "main", "-lm"], check=True)
-    return folder / "main"
+@cache
+def filter_of(named):
+    hypotheses = HYPOTHESES if named else ()
+    options = {"disturbance": 3.0, "indices": (0,), "process": 0.005, "hypotheses": hypotheses}
+    return hj.OnlineAdaptation(Climb(jnp.array(1.0)), DT, NOISE, 0.2, **options)
 
 
-@pytest.fixture(scope="module")
-def states_of():
-    adaptation = filter_of(NOISE)
+@cache
+def states_of(named):
+    """The filter in JAX, as one program."""
+    adaptation = filter_of(named)
 
     @eqx.filter_jit
     def states(given):
@@ -97,15 +95,28 @@ def states_of():
     return states
 
 
+@pytest.fixture(scope="module", params=[False, pytest.param(True, marks=pytest.mark.slow)], ids=["alone", "hypotheses"])
+def program(request, tmp_path_factory):
+    """Whether the filter has hypotheses, and its C with a main function, under sanitizers."""
+    folder, adaptation = tmp_path_factory.mktemp("filter"), filter_of(request.param)
+    source = export_adaptation_c(folder, adaptation, state_size=1, input_size=1)[1]
+    size = ravel_pytree(adaptation.begin(jnp.zeros(1)))[0].size
+    (folder / "main.c").write_text(MAIN % (size, size, size))
+    flags = ("-std=c99", "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    subprocess.run(["gcc", *flags, folder / "main.c", source, "-o", folder / "main", "-lm"], check=True)
+    return request.param, folder / "main"
+
+
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_ends_as_in_jax(name, program, states_of):
+def test_a_fault_ends_as_in_jax(name, program):
+    named, main = program
     given = flight()
     FAULTS[name](given)
     sent = np.zeros(1, np.float32).tobytes() + given.tobytes()
-    done = subprocess.run([program], input=sent, capture_output=True, check=False, timeout=60)
+    done = subprocess.run([main], input=sent, capture_output=True, check=False, timeout=60)
     assert done.returncode == 0, done.stderr[:2000].decode()
     assert not done.stderr
-    adaptation, expected = filter_of(NOISE), states_of(jnp.asarray(given))
+    adaptation, expected = filter_of(named), states_of(named)(jnp.asarray(given))
     unravel = ravel_pytree(adaptation.begin(jnp.zeros(1)))[1]
     found = jax.vmap(unravel)(jnp.asarray(np.frombuffer(done.stdout, np.float32).reshape(STEPS, -1)))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))

@@ -252,6 +252,19 @@ def test_a_sample_is_a_list_or_an_array_of_the_size_of_the_first():
         adaptation().update(state, [0.0], [0.0], elapsed=-1)
 
 
+def test_an_input_of_another_size_is_refused_with_the_name_of_the_field():
+    class Strict(hj.AbstractVectorField):
+        friction: jax.Array
+
+        def __call__(self, x, u):
+            (force,) = u
+            return force - self.friction * x
+
+    strict = OnlineAdaptation(Strict(jnp.array(0.5)), DT, NOISE)
+    with pytest.raises(ValueError, match=r"^field: Strict does not take a state .*\(2,\): .*too many"):
+        strict.update(strict.begin([0.0]), [0.0], [0.0, 0.0])
+
+
 @pytest.mark.parametrize("hypotheses", [(), (hj.Hypothesis("push", {"push": 1.0}),)], ids=["alone", "hypotheses"])
 def test_a_parameter_with_a_prior_of_zero_is_held(hypotheses):
     field, prior = Towed(jnp.array(1.0), jnp.array(0.0)), {"friction": 0.0, "push": 1.0}
