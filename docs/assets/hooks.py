@@ -12,6 +12,7 @@ FORMULA = re.compile(
     r'<(span|div) class="arithmatex">\s*\\[(\[](.*?)\\[)\]]\s*</\1>',
     re.DOTALL,
 )
+DOTTED = re.compile(r"<mover><mi>(\w)</mi><mo>&#x002D9;</mo></mover>")
 ROOT = Path(__file__).parents[2]
 
 
@@ -49,9 +50,11 @@ def on_page_markdown(markdown, page, config, files):
 def on_page_content(content, page, config, files):
     """Replace each formula of the page by MathML, which needs no script."""
     display = {"span": "inline", "div": "block"}
-    return FORMULA.sub(
-        lambda found: convert(
-            html.unescape(found[2]).strip(), display=display[found[1]]
-        ),
-        content,
-    )
+
+    def formula(found):
+        text = html.unescape(found[2]).strip()
+        # A letter with its dot, since browsers set a dot above too small.
+        dotted = r'<mi style="font-style: italic">\1&#x0307;</mi>'
+        return DOTTED.sub(dotted, convert(text, display=display[found[1]]))
+
+    return FORMULA.sub(formula, content)
