@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, Self, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -101,7 +101,7 @@ class Record:
         """Length [s] of the longest signal, from its first to its last sample."""
         return max((float(signal.t[-1] - signal.t[0]) for signal in self.signals.values() if len(signal)), default=0.0)
 
-    def part(self, begin: float, end: float) -> "Record":
+    def part(self, begin: float, end: float) -> Self:
         """The samples between two times; times are not shifted.
 
         Args:

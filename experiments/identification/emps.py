@@ -51,9 +51,9 @@ def position(x, u):
 
 
 def candidate(direction: bool = False, drift: bool = False, lag: bool = False):
-    offset = jnp.array([-3.0, 0.0][: 1 + drift])
-    more = jnp.zeros(()) if direction else None, jnp.log(20.0) if drift else None
-    field = Slide(*(jnp.array(number) for number in (4.55, 5.3, 3.0)), offset, *more)
+    mass, viscous, coulomb = (jnp.array(number) for number in (4.55, 5.3, 3.0))
+    offset, turned = jnp.array([-3.0, 0.0][: 1 + drift]), jnp.zeros(()) if direction else None
+    field = Slide(mass, viscous, coulomb, offset, turned, jnp.log(20.0) if drift else None)
     prior = {"direction": 0.3} if direction else {}
     prior |= {"log_warming": 1.0} if drift else {}
     if lag:

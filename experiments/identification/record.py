@@ -107,7 +107,8 @@ def free_run(benchmark: Benchmark, model: hj.StateSpaceModel, record: hj.Record,
 
 
 def begun(benchmark: Benchmark, model: hj.StateSpaceModel, record: hj.Record) -> tuple[float, ...]:
-    return benchmark.start(*(float(record.signals[name].values[0, 0]) for name in benchmark.columns), model)
+    u, y = (float(record.signals[name].values[0, 0]) for name in benchmark.columns)
+    return benchmark.start(u, y, model)
 
 
 def rmse(errors: np.ndarray) -> float:

@@ -72,7 +72,7 @@ class Lag(AbstractHidden):
         return (u[jnp.array(self.places)] - z) / jnp.exp(self.log_time_constant)
 
     def inputs(self, z, u):
-        return u.at[jnp.array(self.places)].set(z)
+        return jnp.asarray(u).at[jnp.array(self.places)].set(z)
 
 
 class Delay(AbstractHidden):
@@ -100,7 +100,7 @@ class Delay(AbstractHidden):
         return ((before - chain) * self.order / jnp.exp(self.log_delay)).ravel()
 
     def inputs(self, z, u):
-        return u.at[jnp.array(self.places)].set(z.reshape(self.order, -1)[-1])
+        return jnp.asarray(u).at[jnp.array(self.places)].set(z.reshape(self.order, -1)[-1])
 
 
 class RandomWalk(AbstractHidden):
