@@ -102,7 +102,7 @@ def of_fold(
     physics, rigid = model.physics(), rigid_body(model.vehicle, (), model.terms)
     rows = []
 
-    def score(name: str, field: AbstractVectorField, n: int = 0, found: Adaptation | None = None) -> None:
+    def score(name: str, field: AbstractVectorField, found: Adaptation | None = None, n: int = 0) -> None:
         for log in test:
             curve = errors.rmse(errors.errors_of(field, log, max(config.horizon)))
             row: dict[str, Any] = {"flight": flight_of(log), "model": name, "n_train": n, "seed": seed}
@@ -122,10 +122,8 @@ def of_fold(
     score(names.PHYSICS_ONLY, source.physics.field)
     score(LEARNED, source.field)
     for n in config.n if adapts else ():
-        found = adapted(source.field, train, source.windows, n)
-        score(ADAPTED, found.field, n, found)
-        scratch = adapted(physics, train, None, n)
-        score(names.SCRATCH, scratch.field, n, scratch)
+        score(ADAPTED, *adapted(source.field, train, source.windows, n), n)
+        score(names.SCRATCH, *adapted(physics, train, None, n), n)
     return rows, {}
 
 

@@ -11,9 +11,10 @@ from hybrid_jax import checks
 from hybrid_jax.adaptation import Adaptation, Parameter
 from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
-from hybrid_jax.cli.learning import adapted
+from hybrid_jax.cli.learning import adapted, without_past
 from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights
 from hybrid_jax.cli.model import Known, flights_for, known_of, unlike
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import load, save
@@ -55,22 +56,22 @@ def run(options: Options) -> int:
     known = known_of(options.source, model)
     flights = flights_for(known, options.after, options, changed=True)
     with step("adapting") as told:
-        found = adapted(known.field, flights.logs, known.windows)
+        field, found = adapted(known.field, flights.logs, known.windows)
         told(f"{found.windows} windows, chose {found.chosen}")
     changes = _changes(known, found)
     different = any(map(_significant, changes)) or found.alone or found.candidates["source"] < UNLIKELY
     if different:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
-        save(options.output, found.field, json_value(about))
+        save(options.output, field, json_value(about))
     told = found.to_dict() | {"model": options.output if different else None}
-    page.write(options.out, "adapt", _page(options, known, flights, found, changes, different), told)
+    page.write(options.out, "adapt", _page(options, known, flights, field, found, changes, different), told)
     return 0 if different else NOTHING_CHANGED
 
 
 def _changes(known: Known, found: Adaptation) -> list[Change]:
     """Return the change of each parameter, the most significant first."""
-    before = {name: float(value) for name, value in named_parameters(known.field).items()}
+    before = {name: float(value) for name, value in named_parameters(without_past(known.field)).items()}
     # A term that was not there was 0, an efficiency 1.
     every = [
         (name, before.get(name, float(name.startswith("efficiency"))), one) for name, one in found.parameters.items()
@@ -83,13 +84,19 @@ def _significant(change: Change) -> bool:
 
 
 def _page(
-    options: Options, known: Known, flights: Flights, found: Adaptation, changes: Sequence[Change], different: bool
+    options: Options,
+    known: Known,
+    flights: Flights,
+    field: AbstractVectorField,
+    found: Adaptation,
+    changes: Sequence[Change],
+    different: bool,
 ) -> page.Page:
-    learned, changed = named_parameters(known.field), [*filter(_significant, changes)]
+    learned, changed = named_parameters(without_past(known.field)), [*filter(_significant, changes)]
     own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
     curves = {
         name: errors.rmse_by_flight(field, flights.logs, known.steps)
-        for name, field in (("before", known.field), ("adapted", found.field))
+        for name, field in (("before", known.field), ("adapted", field))
     }
     seconds, (old, new) = known.steps * known.dt, (errors.texts(each.mean(axis=0)[-1]) for each in curves.values())
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])

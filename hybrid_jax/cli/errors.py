@@ -7,12 +7,16 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from hybrid_jax import trajectories
 from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.cli.logs import windows_of
 from hybrid_jax.cli.page import STYLE, Table
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
+from hybrid_jax.estimation import observe
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import flight_errors
+from hybrid_jax.flights.windows import sequences
 
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
 BASELINE = "Frozen rates are a baseline: the thrust of the motors acts, and body rates stay as they are."
@@ -28,7 +32,12 @@ def rmse_by_flight(
 
 def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[np.ndarray, "n t 4"]:
     """Compute the errors in UNITS for windows of a flight at the end of each interval."""
-    windows = windows_of([log], steps, steps).windows
+    if isinstance(field, DisturbanceModel):  # which starts from what was seen before
+        parts = [(each, observe(field, each)[0]) for each in sequences([log], steps)]
+        cut = [trajectories.windows_of(seen, each.u[0], each.dt, steps=steps) for each, seen in parts]
+        windows = trajectories.concatenate(cut)
+    else:
+        windows = windows_of([log], steps, steps).windows
     places = np.arange(-(-len(windows) // MOST) * MOST) % len(windows)  # so that flights share a program
     return np.stack(flight_errors(field, windows[places], chunk=MOST), axis=-1)[: len(windows)]
 

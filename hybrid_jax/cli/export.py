@@ -16,8 +16,10 @@ from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
+from hybrid_jax.cli.learning import without_past
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
@@ -38,6 +40,10 @@ UNITS = "velocity [m/s]", "body rates [rad/s]"
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
 PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.md
 PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
+FILTERED = (
+    "The last {} numbers of x are z, its errors after filters: after each period, add (1 − exp(−dt / τ)) (e − z) to z, "
+    "with the measured error e ({} numbers, per second) and τ of {} s."
+)
 
 
 @dataclass(frozen=True)
@@ -101,11 +107,13 @@ def run(options: Options) -> int:
     d, m = sizes_of(field, options.state_size, options.input_size)
     sizes: dict[str, Any] = {"state_size": d, "input_size": m}
     own: dict[str, Any] = sizes | {"smooth": options.smooth}
-    adaptation = _filter(options, field, dt, d) if "c" in options.to else ""
+    said: list[str] = []
+    adaptation = _filter(options, without_past(field), dt, d) if "c" in options.to else ""
+    if isinstance(field, DisturbanceModel):
+        said.append(FILTERED.format(field.filters, len(field.weights), field.time_constants))
     checks.writable_folder("--output", options.output)
     checks.writable_folder("--out", options.out)
     written: list[Path] = []
-    said: list[str] = []
     with step(f"writing {', '.join(options.to)}"):
         if "c" in options.to:
             written += export_c(options.output, field, dt, name=options.name, double=options.double, **own)

@@ -11,7 +11,7 @@ from hybrid_jax import checks
 from hybrid_jax.cli import errors, identify, page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.inspect import inspected, write_vehicle
-from hybrid_jax.cli.learning import CANDIDATES, FROZEN, Learned, learn
+from hybrid_jax.cli.learning import CANDIDATES, FROZEN, PAST, Learned, learn
 from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, raw_logs, read_flights
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
@@ -23,6 +23,10 @@ from hybrid_jax.io.models import save
 __all__ = ["LISTS", "Options", "run"]
 IDENTIFIED = ("output", "learn", "anyway", "out", "columns", "topics", "motor_order")  # options of both
 OF_MODEL = ("windows", "motion")  # of the model, and not of the report
+REMEMBERS = (
+    "Errors of the model last, for example because a load swings that no sensor shows. So it predicts them from its "
+    "errors in the seconds before; see docs/howto/records.md on how you give them to it."
+)
 QUANTILES = np.linspace(0.01, 0.99, 99)
 
 
@@ -129,7 +133,7 @@ def _page(options: Options, flights: Flights, found: Learned) -> page.Page:
         (name, *(f"{errors.ratio(found.left_out[each][i, -1], frozen[i]):.3g}" for each in CANDIDATES))
         for i, name in enumerate(flights.contents)
     ]
-    adds = "a network improves the predictions" if found.chosen == "hybrid" else "a network does not help"
+    adds = "a network improves the predictions" if found.chosen.startswith("hybrid") else "a network does not help"
     return page.Page(
         f"What do {len(flights.logs)} flights of {options.before} show about the vehicle?",
         f"Predictions of {seconds:g} s on held-out flights are {better:.2g} times as accurate as with frozen rates.",
@@ -142,6 +146,7 @@ def _page(options: Options, flights: Flights, found: Learned) -> page.Page:
         [
             f"The model is {found.chosen}: {adds}.",
             errors.BASELINE,
+            *([REMEMBERS] if found.chosen.endswith(PAST) else []),
             *([f"Rotors follow the motors of the logs with {1000 * found.lag:.3g} ms."] if found.lag else []),
             *errors.unknown(found.physics),
         ],

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -14,20 +15,24 @@ from hybrid_jax.cli.logs import STEPS, windows_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates
 from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
+from hybrid_jax.estimation import fit_disturbance
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
 from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.windows import sequences
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.training import Settings, fit, rates_by_group
 from hybrid_jax.training.channels import scaled_loss
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, split
 
 TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
 FOLDS = 3  # at most so many groups of flights are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
 PHYSICS, OUTPUTS = "theta_least_squares", "accelerations"
-FROZEN, CANDIDATES = "thrust, rates frozen", ("physics", "hybrid")  # the simplest first
+PAST = " with its past"  # of a candidate that also predicts its disturbance from the errors before
+FROZEN, CANDIDATES = "thrust, rates frozen", ("physics", "hybrid", f"physics{PAST}", f"hybrid{PAST}")  # simplest first
 
 
 class Learned(NamedTuple):
@@ -64,7 +69,8 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
         kept = [log for i, log in enumerate(logs) if i not in group]
         train = _windows(kept, TRAINED)
         physics = METHODS[PHYSICS].solve(model.physics(), train, train, settings).field
-        fields = FrozenRates(model.physics()), physics, _hybrid(physics, kept, seed, settings)
+        both = physics, _hybrid(physics, kept, seed, settings)
+        fields = FrozenRates(model.physics()), *both, *(with_past(field, kept) for field in both)
         for name, field in zip(parts, fields, strict=True):
             parts[name].append(errors.rmse_by_flight(field, [logs[i] for i in group], STEPS))
     order = np.argsort(np.concatenate(groups))
@@ -73,17 +79,38 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
     chosen = choose({name: np.log(ends[name] / ends[FROZEN]).mean(axis=1) for name in CANDIDATES})
     windows = windows_of(logs, STEPS, STEPS, TRAINED).windows
     physics = adapt(model.physics(), windows, method=PHYSICS, settings=settings)
-    field = physics.field if chosen == "physics" else _hybrid(physics.field, logs, seed, settings)
+    field = physics.field if chosen.startswith("physics") else _hybrid(physics.field, logs, seed, settings)
+    field = with_past(field, logs) if chosen.endswith(PAST) else field
     kept = windows_of(logs, STEPS, STEPS, KEPT).windows
     return Learned(field, physics, chosen, lag, found, kept, expected(np.log(ends[chosen])))
 
 
 def adapted(
     field: AbstractVectorField, logs: Sequence[FlightLog], learned_from: Trajectories | None, most: int = ADAPTED
-) -> Adaptation:
-    """Adapt the physics of a model, not its network, to at most `most` windows of flights after a change."""
+) -> tuple[AbstractVectorField, Adaptation]:
+    """Adapt the physics of a model to at most `most` windows of flights after a change, and what it has of the past.
+
+    Also return the adaptation of the model without its past.
+    """
     windows = windows_of(logs, STEPS, STEPS, most).windows
-    return adapt(field, windows, method=Auto(networks=False), learned_from=learned_from)
+    found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)
+    if not isinstance(field, DisturbanceModel):
+        return found.field, found
+    return with_past(eqx.tree_at(lambda model: model.field, field, found.field), logs, most * STEPS), found
+
+
+def with_past(field: AbstractVectorField, logs: Sequence[FlightLog], most: int | None = None) -> DisturbanceModel:
+    """Add a model of the disturbance, learned from at most `most` intervals of flights."""
+    kept, left = [], most or sum(map(len, logs))
+    for each in sequences(logs, 2 * STEPS):
+        if left > 2 * STEPS:
+            kept.append(split(each, left)[0] if left < each.horizon else each)
+            left -= each.horizon
+    return fit_disturbance(field, kept, steps=STEPS)
+
+
+def without_past(field: AbstractVectorField) -> AbstractVectorField:
+    return field.field if isinstance(field, DisturbanceModel) else field
 
 
 def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:

@@ -15,6 +15,7 @@ from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
+from hybrid_jax.cli.learning import without_past
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.io.files import write_atomic
@@ -74,7 +75,7 @@ def run(options: Options) -> int:
     checks.writable_folder("--out", options.out)
     checks.writable_folder("--output", options.output.parent)
     model = load(options.model)
-    dt, field = model.about.get("dt", 0.01), with_disturbance(model.field)
+    dt, field = model.about.get("dt", 0.01), with_disturbance(without_past(model.field))
     box = FlightBounds(options.low, options.high, options.speed, options.tilt, options.yaw, options.rotor_speed)
     search = {name: getattr(options, name) for name in ("seconds", "bandwidth", "starts", "steps", "seed")}
     search |= {"noise": options.noise or None, "window": WINDOW * dt, "dt": dt}

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
-from hybrid_jax.cli.learning import lagged
+from hybrid_jax.cli.learning import lagged, without_past
 from hybrid_jax.cli.logs import LISTS, FlightOptions, read_flights, windows_of
 from hybrid_jax.cli.model import known_of, reading_of
 from hybrid_jax.integrate import rollout_batch
@@ -66,8 +66,8 @@ def run(options: Options) -> int:
     windows = windows_of(logs, steps, every).windows[: max(1, round(options.seconds * SHOWN))]
     with step(f"predicting and drawing {len(windows)} pictures"):
         forecasts = {
-            str(path): np.asarray(rollout_batch(known.field, windows.x0, windows.u, windows.dt))[..., POSITION]
-            for path, known in models.items()
+            str(path): np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt))[..., POSITION]
+            for path, field in ((path, without_past(known.field)) for path, known in models.items())
         }
         picture = _animated(windows, forecasts, every * windows.dt)
         write_atomic(options.out / "replay.gif", picture)

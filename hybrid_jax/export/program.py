@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
+from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.integrate import Derivative, check_field, rk4_step
 from hybrid_jax.networks import smoothed
 from hybrid_jax.state import STATE_SIZE
@@ -69,6 +70,9 @@ def vehicle_in(field: Any) -> Vehicle | None:
 
 
 def _known_sizes(tree: Any) -> tuple[int, int] | None:
+    if isinstance(tree, DisturbanceModel):
+        inside = _known_sizes(tree.field)
+        return inside and (inside[0] + tree.filters, inside[1])
     for part in _parts(tree):
         if isinstance(vehicle := getattr(part, "vehicle", None), Vehicle):
             return STATE_SIZE, vehicle.rotors

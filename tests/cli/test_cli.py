@@ -71,7 +71,7 @@ def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_chang
     taken = {"chosen": "source", "candidates": {"source": 1.0}, "alone": True}
     found = Adaptation(body, "auto", {}, status=Status.OK, **none, **numbers, **taken)
     monkeypatch.setattr("hybrid_jax.cli.adapt.flights_for", lambda *_, **__: Flights([flown], {}, []))
-    monkeypatch.setattr("hybrid_jax.cli.adapt.adapted", lambda *_: found)
+    monkeypatch.setattr("hybrid_jax.cli.adapt.adapted", lambda *_: (body, found))
     files = ["-o", tmp_path / "adapted.npz", "--out", tmp_path]
     code, said, _ = called("adapt", tmp_path / "m.npz", tmp_path, *files)
     assert code == 0
