@@ -82,7 +82,6 @@ class Controller:
         iterations: Gauss–Newton steps per call.
         damping: lower bound of the damping.
         min_speed: lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's.
-        unit_quaternion: normalise the quaternion after each step of the prediction.
         rotor_lag: time constant of the rotors [s]; see `lagged_speeds`.
 
     Raises:
@@ -97,7 +96,6 @@ class Controller:
     iterations: int = 1
     damping: float = 1e-3
     min_speed: float = 0.0
-    unit_quaternion: bool = True
     rotor_lag: float = 0.0
 
     def __post_init__(self):
@@ -234,7 +232,7 @@ class Controller:
 
     def _step(self, model: AbstractVectorField, start: _Start, variables: Float[Array, " rotors"]) -> _Start:
         command = self._speeds(jnp.tanh(variables))
-        return advance_lagged(model, *start, command, self.rotor_lag, self.interval, self.unit_quaternion)
+        return advance_lagged(model, *start, command, self.rotor_lag, self.interval)
 
     def _improve(self, model, reference, start: _Start, point: _Point) -> _Point:
         """Take the best damped Gauss–Newton step if it lowers the cost, and keep its damping."""
@@ -274,8 +272,7 @@ class Controller:
         share = jnp.tanh(variables)
         slope = 1 - jnp.square(share)  # of the tanh
         commands, to_speed = self._speeds(share), self._range()[1] * slope
-        options = self.rotor_lag, self.interval, self.unit_quaternion
-        sensitivities = condensed(model, x[:-1], before, commands, *options) * to_speed
+        sensitivities = condensed(model, x[:-1], before, commands, self.rotor_lag, self.interval) * to_speed
         sensitivities = sensitivities.reshape(self.steps, -1, share.size)
         slopes = ((factor[:, None, None] * jacobian) @ sensitivities).reshape(-1, variables.size)
         changes = input_rate_penalty(self.weights, self.steps)

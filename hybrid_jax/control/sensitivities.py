@@ -69,31 +69,28 @@ def step_of(derivative: Derivative, x: State, inputs: Sequence[Any], dt: float) 
     return RK4().step(term, 0.0, dt, x, None, None, made_jump=False)[0]
 
 
-def advance(model: AbstractVectorField, x: State, u: Input, dt: float, unit_quaternion: bool = True) -> State:
-    """Compute the state after dt [s] with constant u by one step of classical RK4.
+def advance(model: AbstractVectorField, x: State, u: Input, dt: float) -> State:
+    """Compute the state after dt [s] with constant u by one step of classical RK4, with a unit quaternion.
 
     Args:
         model: a rigid body's ẋ = f(x, u).
         dt: length of the step [s].
-        unit_quaternion: normalise the quaternion afterwards.
     """
-    x = rk4_step(model, x, u, dt)
-    return _with_unit_quaternion(x) if unit_quaternion else x
+    return _with_unit_quaternion(rk4_step(model, x, u, dt))
 
 
 def advance_lagged(
-    model: AbstractVectorField, x: State, speeds: Input, command: Input, lag: float, dt: float, unit_quaternion=True
+    model: AbstractVectorField, x: State, speeds: Input, command: Input, lag: float, dt: float
 ) -> tuple[State, Input]:
     """Compute state and rotor speeds after dt [s]; rotors follow the command with a lag, or at once if it is 0."""
     if not lag:
-        return advance(model, x, command, dt, unit_quaternion), command
+        return advance(model, x, command, dt), command
     inputs = [command + share * (speeds - command) for share in stage_shares(lag, dt)]
-    x = step_of(model, x, inputs, dt)
-    return _with_unit_quaternion(x) if unit_quaternion else x, lagged_speeds(speeds, command, lag, dt)[1]
+    return _with_unit_quaternion(step_of(model, x, inputs, dt)), lagged_speeds(speeds, command, lag, dt)[1]
 
 
 def advance_with_jacobian(
-    model: AbstractVectorField, x: State, speeds: Input, command: Input, lag: float, dt: float, unit_quaternion=True
+    model: AbstractVectorField, x: State, speeds: Input, command: Input, lag: float, dt: float
 ) -> tuple[State, Float[Array, "13 n"]]:
     """Return the state of `advance_lagged` and its Jacobian in x, the command and (with lag) the rotor speeds."""
     d, m = len(x), len(command)
@@ -112,12 +109,11 @@ def advance_with_jacobian(
 
     directions = jnp.eye(d, inputs[0][1].shape[1], dtype=x.dtype)
     both = step_of(slopes, jnp.concatenate([x[:, None], directions], axis=1), inputs, dt)
-    x, columns = both[:, 0], both[:, 1:]
-    return jvp_columns(_with_unit_quaternion, (x,), (columns,)) if unit_quaternion else (x, columns)
+    return jvp_columns(_with_unit_quaternion, (both[:, 0],), (both[:, 1:],))
 
 
 def condensed(
-    model, x: Float[Array, "t 13"], before: Input, commands: Float[Array, "t 4"], lag: float, dt: float, unit_quaternion
+    model, x: Float[Array, "t 13"], before: Input, commands: Float[Array, "t 4"], lag: float, dt: float
 ) -> Float[Array, "t 13 t 4"]:
     """∂(state at the end of each interval) / ∂(all commands); `before` are the initial rotor speeds."""
     d, (t, m) = STATE_SIZE, commands.shape
@@ -125,7 +121,7 @@ def condensed(
     speeds = kept[:, None] * before + mixed @ commands
 
     def stage(x, speeds, command):
-        return advance_with_jacobian(model, x, speeds, command, lag, dt, unit_quaternion)[1]
+        return advance_with_jacobian(model, x, speeds, command, lag, dt)[1]
 
     def interval(carried, stage):
         jacobian, row, i = stage
