@@ -22,6 +22,7 @@ from experiments.real_flight import report as real_flight
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import JSON_NAME
 from experiments.reporting.results import Results
+from experiments.worlds import verdicts as worlds
 
 REFERENCE = Path(__file__).parents[1] / "docs/reference"
 Drawn = dict[str, tuple[Figure, str]]  # figure and caption by name
@@ -37,6 +38,7 @@ DRAWN: Mapping[str, Callable[[Results, Mapping[str, Any]], Drawn]] = {
     "param_shift": outcome.draw,
     "reaction_diffusion": lambda rows, _: reaction_diffusion.draw(rows),
     "real_flight": lambda rows, _: real_flight.draw(rows),
+    "worlds": lambda rows, _: worlds.draw(rows),
 }
 
 

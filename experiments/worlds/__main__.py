@@ -9,13 +9,22 @@ from rich.console import Console
 from experiments.paper.config import BOTH_ENDS, ONE_FLIGHT, SMOKE, preset_like
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
+from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.run_record import environment
 from experiments.runner.stages import stages_of
 from experiments.worlds.cases import WORLDS, WorldsConfig, adapted
-from experiments.worlds.verdicts import CLAIMS, conclusion, coverage_table, expectation_table, method_table, ratio_table
+from experiments.worlds.verdicts import (
+    CLAIMS,
+    conclusion,
+    coverage_table,
+    draw,
+    expectation_table,
+    method_table,
+    ratio_table,
+)
 from hybrid_jax.sweep import hosts
 
 NAME = "worlds"
@@ -36,7 +45,7 @@ PRESETS = {
     "paper": WorldsConfig(seeds=3, draws=3, noise_on="all"),
     "quick": preset_like(
         WorldsConfig,
-        replace(BOTH_ENDS, **NOISY, seeds=1),
+        replace(BOTH_ENDS, **NOISY, seeds=1, draws=4),
         worlds=("iris", "hummingbird"),
         changes=("nothing", "reaction_torque", "external_force", "parameter_shift"),
         learn_from=("moving", "hover", "near_ground", "outliers"),
@@ -70,6 +79,7 @@ def experiment(config: WorldsConfig, console: Console) -> None:
             notes=stages.notes(),
             head=HEAD.strip(),
             conclusion=conclusion(rows),
+            figures=save_figures(config.out / NAME, draw(rows)),
             tables=[verdict_table(verdicts, "Hypotheses"), *(table(rows) for table in TABLES)],
         )
         write_report(config.out / NAME, report, Console())

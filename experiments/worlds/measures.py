@@ -9,8 +9,8 @@ import numpy as np
 import hybrid_jax as hj
 from experiments.paper.study import EVERY
 from experiments.worlds.world import World
-from hybrid_jax.adaptation.adapting import Parameter
 from hybrid_jax.adaptation.expectation import Expected
+from hybrid_jax.adaptation.results import Parameter
 from hybrid_jax.dynamics.rigid_body import LEARNED, RIGID_BODY_SPACE, nominal
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import rollout_mse
@@ -41,6 +41,7 @@ def parameters_of(world: World, change: str, found: Mapping[str, Parameter]) -> 
         row |= {
             f"{name}_error": one.value / truth[name] - 1 if known else None,
             f"{name}_half_width": (one.high - one.low) / (2 * truth[name]) if bounded else None,
+            f"{name}_effective": known and one.effective is not None,
             f"{name}_inside": bool(one.low <= truth[name] <= one.high) if bounded else None,
         }
     return row

@@ -1,25 +1,26 @@
 """`adapt`: adapt any field to windows of a changed system, with any method and one type of result."""
 
-import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from dataclasses import field as attribute
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
-from hybrid_jax.adaptation.auto import NETWORK, Auto, Choice, has_network
-from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of
+from hybrid_jax.adaptation.auto import NETWORK, Auto, Choice, extended, has_network
+from hybrid_jax.adaptation.expectation import expected_errors
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
+from hybrid_jax.adaptation.outliers import outliers
+from hybrid_jax.adaptation.plausible import groups_of
+from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import correlated, longest_chain, overlap
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
@@ -29,13 +30,14 @@ from hybrid_jax.dynamics.disturbance import (
     without_zeros,
 )
 from hybrid_jax.dynamics.rigid_body import uncorrected
+from hybrid_jax.estimation.least_squares import Solver
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters, sandwich
-from hybrid_jax.extrapolation import WARN, features_of, shares_outside
+from hybrid_jax.extrapolation import features_of, shares_outside
 from hybrid_jax.integrate import checked, compact
-from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import check_savable
-from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.metrics import CHUNK
 from hybrid_jax.networks.standardise import motion_of
+from hybrid_jax.rollouts import predict
 from hybrid_jax.runtime import FAST_COMPILE, entry, jit_by_size, keep_programs, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
@@ -43,14 +45,16 @@ from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories, check_like, overflows
 
+FEWEST = 10  # windows, of which outliers are told apart
 HELD_OUT = 5  # one in so many windows validates
-SHOWN = 0.01  # less probable candidates are not reported
 NAMED = 50  # physics with more parameters is a network, and its weights are not listed
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; check dt and all units"
 NOT_FITTED = "no parameter was fitted"
 NO_MOTION = "field: its training windows are unknown, so all its errors count as changes; pass learned_from="
 FEW = "windows: {} do not determine {} parameters; the others stay at the source's values"
+BY_NETWORK = "the network of the source expresses a part of this; hj.pool of several sources includes that"
+BY_ROTORS = "it is relative to the rotors' efficiencies, which were fitted too"
 OVERLAP = "windows overlap: left-out blocks share samples with the others, so the expected errors are too small"
 
 METHODS: Mapping[str, Method] = {
@@ -64,132 +68,6 @@ METHODS: Mapping[str, Method] = {
     "linear_residual": Ridge(ridge.linear_residual),
     "source": Source(),
 }
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A physical parameter and its confidence interval.
-
-    Attributes:
-        value: the estimate, in `unit`.
-        low: lower end of the interval in `unit`: NaN without a valid one, −∞ or 0 if the parameter is not identifiable.
-        high: upper end in `unit`: NaN without a valid interval, ∞ if the parameter is not identifiable.
-        unit: for example "kg m²"; None if unknown.
-    """
-
-    value: float
-    low: float = math.nan
-    high: float = math.nan
-    unit: str | None = None
-
-    @property
-    def has_interval(self) -> bool:
-        """Whether there is a valid interval, which may be infinite."""
-        return not math.isnan(self.low)
-
-    def __str__(self) -> str:
-        around = f"  ({self.low:.4g} to {self.high:.4g})" if self.has_interval else ""
-        return f"{self.value:.4g}{f' {self.unit}' if self.unit else ''}{around}"
-
-
-@dataclass(frozen=True, eq=False)
-class Adaptation:
-    """An adapted field with its parameters, their intervals and its expected errors.
-
-    Attributes:
-        field: the adapted field.
-        method: name of the method, or its class if you passed a value.
-        parameters: of physics and disturbance, by the names of `uncertainty.named_parameters`.
-        disturbance: the constant part of ẋ in the units of ẋ; None if there is none.
-        mse_before: L_MSE of the source field on all windows, in squared units of the states.
-        mse_after: L_MSE of the adapted field on all windows, in the same units.
-        windows: the number of windows.
-        steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
-        status: how the method ended.
-        level: confidence level of the intervals, between 0 and 1.
-        without_intervals: why there are no intervals; None if there are.
-        covariance: covariance in the physics' own parametrisation; None without intervals.
-        degrees: degrees of freedom of the covariance, one less than the clusters of adjacent windows, or None.
-        candidates: "auto" only: probability of each change by name, 0 to 1; the network's is relative to the one taken.
-        chosen: "auto" only: name of the chosen candidate.
-        refused: "auto" only: candidates that would be more probable than the chosen one if the source had no errors.
-        alone: "auto" only: whether physics, fitted to the source's own motion, replaced physics and network.
-        expected: "auto" only: errors on an unseen flight, by horizon and quantity: value, low, high.
-        units: units of the quantities in `expected`.
-        outside: share of samples, 0 to 1, outside the range of the source's training data, by quantity.
-    """
-
-    field: AbstractVectorField
-    method: str
-    parameters: dict[str, Parameter]
-    disturbance: Float[np.ndarray, " d"] | None
-    mse_before: float
-    mse_after: float
-    windows: int
-    steps: int
-    status: Status
-    level: float
-    without_intervals: str | None
-    covariance: Float[np.ndarray, "p p"] | None = None
-    degrees: int | None = None
-    candidates: dict[str, float] = attribute(default_factory=dict)
-    chosen: str | None = None
-    refused: tuple[str, ...] = ()
-    alone: bool = False
-    expected: Expected = attribute(default_factory=dict)
-    units: dict[str, str] = attribute(default_factory=dict)
-    outside: dict[str, float] = attribute(default_factory=dict)
-
-    @property
-    def converged(self) -> bool:
-        """Whether the method stopped by itself, at a finite error."""
-        return self.status == Status.OK
-
-    def report(self) -> str:
-        """A summary in plain text, a few lines."""
-        after = f" after {self.steps} steps" if self.steps else ""
-        lines = [
-            f"Adapted to {self.windows} windows by {self.method}: {self.status.message}{after}.",
-            f"Mean squared prediction error: {self.mse_before:.3g} before, {self.mse_after:.3g} after.",
-        ]
-        if self.chosen is not None:
-            known = sorted(self.candidates.items(), key=lambda one: -one[1])
-            found = ", ".join(f"{name} {share:.2g}" for name, share in known if share >= SHOWN)
-            lines.append(f"Chosen: {self.chosen}. Probability of each change: {found}.")
-        if self.alone:
-            lines.append("Physics without the network predicts the source's own motion better and replaces the source.")
-        if self.refused:
-            names = ", ".join(self.refused)
-            lines.append(f"Refused: {names}: the source's own errors may be as large without any change.")
-        if self.expected:
-            lines.append("Expected RMSE on an unseen flight (80% intervals, from left-out blocks of these windows):")
-            lines += lines_of(self.expected, self.units)
-        for name, share in self.outside.items():
-            if share > WARN:
-                lines.append(f"Warning: {name} is outside the source's training range in {share:.0%} of the samples.")
-        if self.parameters:
-            note = f"{self.level:.0%} confidence intervals" if self.without_intervals is None else "no intervals"
-            width = max(map(len, self.parameters))
-            lines.append(f"Parameters ({note}):")
-            lines += [f"  {name:<{width}}  {parameter}" for name, parameter in self.parameters.items()]
-            told = [name for name, one in self.parameters.items() if one.has_interval and one.high < np.inf]
-            rest = [name for name in self.parameters if name not in told]
-            if rest and self.chosen is not None:
-                names = f"{', '.join(told) or 'no parameter'}, and not {', '.join(rest)}"
-                lines.append(f"These windows identify {names}; hj.excitation plans a flight for all of them.")
-            if unseen := [name for name, one in self.parameters.items() if one.high == np.inf]:
-                names = ", ".join(unseen)
-                lines.append(f"Warning: these windows do not determine {names}: other values fit them as well.")
-        lines.append(f"Constant disturbance: {'none' if self.disturbance is None else 'see parameters'}.")
-        if self.parameters and self.without_intervals is not None:
-            lines.append(f"No intervals: {self.without_intervals}.")
-        return "\n".join(lines)
-
-    def to_dict(self) -> dict[str, Any]:
-        """All but the field as JSON values; numbers that are not finite become None."""
-        parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
-        found = vars(self) | {"status": str(self.status), "converged": self.converged, "parameters": parameters}
-        return json_value({name: value for name, value in found.items() if name != "field"})
 
 
 @entry
@@ -230,13 +108,11 @@ def adapt(
         learned_from = check_windows(field, learned_from, "learned_from")
         check_like(learned_from, windows, "learned_from", dt=False)
     check_level(level)
-    train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
-    held_out = check_windows(field, held_out, "validation")
-    check_like(held_out, train, "validation")
-    settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
-    checks.instance("settings", settings, Settings)
+    if settings is not None:
+        checks.instance("settings", settings, Settings)
+    solver = None if settings is None else settings.solver
     for data in (windows,) if validation is None else (windows, validation):
-        checked(field, data.x0[0], data.u[0], data.dt, settings.solver)
+        checked(field, data.x0[0], data.u[0], data.dt, solver)
     exact, size = getattr(method, "has_intervals", False), _size(field)
     if exact and size > NAMED:
         physics = type(physics_of(field)).__name__
@@ -245,6 +121,15 @@ def adapt(
         warnings.warn(reason, stacklevel=3)
     if overlap(windows):
         warnings.warn(OVERLAP, stacklevel=3)
+    keep_programs("adapt", windows.x.shape)
+    given, errors = len(windows), np.asarray(_errors(field, windows, compact(solver)))
+    good = ~outliers(errors, windows)
+    if good.sum() >= max(FEWEST, given / 2):
+        windows, errors = (windows, errors) if good.all() else (windows[good], errors[good])
+    train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
+    held_out = check_windows(field, held_out, "validation")
+    check_like(held_out, train, "validation")
+    settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
     motion = {"learned_from": learned_from} if getattr(method, "uses_motion", False) else {}
     if motion and learned_from is None and has_network(field):
         warnings.warn(NO_MOTION, stacklevel=3)
@@ -256,38 +141,43 @@ def adapt(
     solution = diverged or method.solve(field, train, held_out, settings, **motion)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
-    mse = partial(_mse, solver=compact(settings.solver))
-    before = mse(field, windows)  # its program is read, and SciPy's functions imported, while the device solves
-    import scipy.special  # noqa: F401
-
     adapted = solution.field
     if disturbance_of(field) is None:
         adapted = uncorrected(without_zeros(adapted))  # what windows need
-    space = state_space(field, windows.x0.shape[-1])
+    space, found = state_space(field, windows.x0.shape[-1]), disturbance_of(adapted)
     choice = {} if solution.choice is None else _chosen(solution.choice, train, space)
     status = Status(int(solution.status))
     without = None if exact and choice.get("chosen") != NETWORK else NOT_LEAST_SQUARES
     without = NOT_FINITE if status == Status.DIVERGED else without
-    found = disturbance_of(adapted)
+    ranges = [] if learned_from is None else [features_of(w, space) for w in (learned_from, windows)]
     return Adaptation(
         field=adapted,
         method=name,
         disturbance=None if found is None else np.asarray(found.vector(windows.x0.shape[-1])),
-        mse_before=float(before),
-        mse_after=float(mse(adapted, windows)),
+        mse_before=_mse(errors),
+        mse_after=_mse(_errors(adapted, windows, compact(settings.solver))),
         windows=len(windows),
         steps=int(solution.steps),
         status=status,
         level=level,
-        outside={}
-        if learned_from is None
-        else shares_outside(*(features_of(w, space) for w in (learned_from, windows))),
+        set_aside=(given - len(windows)) * windows.horizon,
+        outside=shares_outside(*ranges) if ranges else {},
         **choice,
-        **_parameters(adapted, train, settings, level, without, solution.choice),
+        **_parameters(field, adapted, train, settings, level, without, solution.choice),
     )
 
 
-_mse = jit_by_size(FAST_COMPILE)(rollout_mse)
+@jit_by_size(FAST_COMPILE)
+def _errors(field: AbstractVectorField, windows: Trajectories, solver: Solver) -> Float[Array, "n t d"]:
+    def errors(part: Trajectories):
+        return jnp.asarray(part.x) - predict(field, part.x0, part.u, part.dt, solver)
+
+    return in_chunks(errors, windows, CHUNK)
+
+
+def _mse(errors) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.mean(np.sum(np.square(errors), axis=-1)))
 
 
 def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[str, Any]:
@@ -329,6 +219,7 @@ def _size(field: AbstractVectorField) -> int:
 
 
 def _parameters(
+    source: AbstractVectorField,
     field: AbstractVectorField,
     windows: Trajectories,
     settings: Settings,
@@ -338,36 +229,49 @@ def _parameters(
 ) -> dict[str, Any]:
     if not 0 < _size(field) <= NAMED:
         return {"parameters": {}, "without_intervals": NOT_LEAST_SQUARES}
-    own = physics_of(without_disturbance(field))
+    own, d = physics_of(without_disturbance(field)), windows.x0.shape[-1]
     known = (own.parameter_units if isinstance(own, AbstractVectorField) else {}) | disturbance_units(field)
-    values = named_parameters(field)
+    values, groups = named_parameters(field), groups_of([*named_parameters(field)])
     units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
-    alone = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
-    free = np.ones(len(values), bool)
+    found = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
+    free, absorbed = np.ones(len(values), bool), np.zeros(len(values))
     if choice is not None:
         places = [choice.parameters.index(name) for name in values]
         free = np.asarray(choice.free)[choice.taken][places]
+        absorbed = np.where(free, np.asarray(choice.absorbed)[places], 0.0)
     if without is None and not free.any():
         without = NOT_FITTED
     if without is None and len(windows) <= free.sum():
         without = FEW.format(len(windows), free.sum())
     if without is not None:
-        return {"parameters": alone, "without_intervals": without}
+        return {"parameters": found, "without_intervals": without}
     cluster = correlated(windows)
     degrees = None if cluster == 1 else -(-len(windows) // cluster) - 1
     if choice is None:
-        scale = scale_of(settings.objective, windows.x0.shape[-1])
+        scale = scale_of(settings.objective, d)
         covariance = np.asarray(covariance_of(field, windows, solver=settings.solver, scale=scale, cluster=cluster))
     else:
         unseen = free & (np.asarray(choice.equations.score) == 0).all(axis=0)[places]
-        covariance = np.asarray(sandwich(choice.equations, int(free.sum()), cluster))[np.ix_(places, places)]
-        covariance = covariance + np.diag(np.where(unseen, np.inf, 0.0))
+        covariance = np.asarray(sandwich(choice.equations, int(free.sum()), cluster) + choice.inherited)
+        covariance = covariance[np.ix_(places, places)] + np.diag(np.where(unseen, np.inf, 0.0))
     if np.isnan(covariance).any():
-        return {"parameters": alone, "without_intervals": NOT_FINITE}
-    found = intervals(field, jnp.asarray(covariance), level, degrees)
-    bounded = {
-        name: Parameter(*map(float, found[name]), unit=units[name])
-        for name, one in zip(values, free, strict=True)
-        if one
+        return {"parameters": found, "without_intervals": NOT_FINITE}
+    whole = covariance + np.diag(absorbed)
+    bounds = intervals(field, jnp.asarray(whole), level, degrees)
+    before = jax.device_get(named_parameters(extended(source, d)))
+    scaled, moved = "efficiency" in np.array(groups)[free], dict[str, float]()
+    for i, (name, (value, low, high)) in enumerate(jax.device_get(bounds).items()):
+        if free[i]:
+            if not low <= before[name] <= high:
+                moved[name] = float(abs(value - before[name]) / (high - low))
+            network, rotors = absorbed[i] > covariance[i, i], scaled and groups[i] == "theta"
+            reason = BY_NETWORK if network else BY_ROTORS if rotors else None
+            bound = {"effective": reason} if reason else {"low": float(low), "high": float(high)}
+            found[name] = replace(found[name], **bound)
+    return {
+        "parameters": found,
+        "without_intervals": None,
+        "covariance": whole,
+        "degrees": degrees,
+        "changed": tuple(sorted(moved, key=lambda name: -moved[name])),
     }
-    return {"parameters": alone | bounded, "without_intervals": None, "covariance": covariance, "degrees": degrees}

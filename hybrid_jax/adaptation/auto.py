@@ -14,27 +14,30 @@ from jaxtyping import Array, Bool, Float, Int
 from hybrid_jax import checks
 from hybrid_jax.adaptation.anchored import fit_anchored, weights_of, with_change
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
-from hybrid_jax.adaptation.plausible import Plausible, groups_of
+from hybrid_jax.adaptation.plausible import Plausible, groups_of, names_of
 from hybrid_jax.adaptation.selection import (
     BLOCKS,
     STRONG,
     Fit,
     Posterior,
+    Unchanged,
     alike,
     blocks_of,
     errors_at_ends,
     fit_each,
     left_out_steps,
     posterior,
+    spread,
     unchanged,
 )
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors, ravel_parameters
-from hybrid_jax.estimation.normal_equations import NormalEquations, masked
-from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, masked
+from hybrid_jax.estimation.uncertainty import sandwich
 from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_by_size
 from hybrid_jax.status import ended
@@ -76,6 +79,8 @@ class Choice(NamedTuple):
         equations: normal equations of each window at the chosen parameters.
         change: change of the network's weights in each candidate (c, w); None without a trainable network.
         ends: errors of left-out blocks, see `errors_at_ends` (b, 2, d).
+        inherited: covariance at the chosen parameters from errors of those that the source keeps (p, p).
+        absorbed: square of how far the source's parameters move on its own motion without its network (p,).
     """
 
     names: tuple[str, ...]
@@ -89,6 +94,8 @@ class Choice(NamedTuple):
     equations: NormalEquations
     change: Float[Array, "c w"] | None
     ends: Float[Array, "b 2 d"]
+    inherited: Float[Array, "p p"]
+    absorbed: Float[Array, " p"]
 
 
 @dataclass(frozen=True)
@@ -124,60 +131,88 @@ class Auto(Method):
         """
         jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))  # then the outer program has the options
-        fits, judge, conclude = (fit_each, _judge, _conclude) if traced else (_fit_each, _judged, _concluded)
+        begin, fits, replace, judge, conclude = STEPS if traced else COMPILED
         # Only these settings matter; as an array, another scale needs no other program.
         scale, solver = scale_of(settings.objective, train.x0.shape[-1]), settings.solver
-        larger = extended(field, train.x0.shape[1])
-        options = self.plausible.sizes(larger, train), solver, scale, self.max_steps
-        free = np.stack([*free_parameters(larger).values()])
-        none, all_of_them = np.zeros_like(free[0]), np.ones_like(free[0])
-        own, alone = None, jnp.array(False)
+        larger, physics, sizes = begin(self, field, train)
+        options = sizes, solver, scale, self.max_steps
+        both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
         learned_from = motion_of(field) if learned_from is None else learned_from
         if learned_from is not None:
             learned_from = alike(learned_from, train)
-            own = at(fits(larger, learned_from, np.stack([none, none]), *options)[0], 0)
-            if self.networks and has_network(larger):
-                physics = without_network(larger)
-                rival = at(fits(physics, learned_from, np.stack([none, all_of_them]), *options)[0], 1)
-                alone = rival.surely_better(own)
-                physics = ravel_parameters(physics)[1](rival.theta)
-                larger, own = (_where(alone, *pair) for pair in ((physics, larger), (rival, own)))
-        found, starts = fits(larger, train, np.stack([none, all_of_them]), *options)
-        found, every = (at(found, i) for i in (0, 1))
+            own, refit, _ = fits(larger, learned_from, both, *options)
+            rival = None if physics is None else fits(physics, learned_from, both, *options)[1]
+            larger, source = replace(self, larger, own, refit, rival)
+        found, every, starts = fits(larger, train, both, *options)
         for _ in range(ROUNDS):
-            chosen, error = judge(field, larger, train, found, every, own, learned_from, *options[:3])
-            found = at(fits(larger, train, jnp.stack([jnp.asarray(free)[chosen.taken], none]), *options)[0], 0)
-        return conclude(self, field, larger, train, starts, found, chosen, error, alone, options[:3])
+            chosen, nothing, rows = judge(field, larger, train, found, every, source, learned_from, *options[:3])
+            found = fits(larger, train, rows, *options)[0]
+        return conclude(self, field, larger, train, starts, (found, chosen, source, nothing), options[:3])
+
+
+class OfSource(NamedTuple):
+    """Fits to the source's own motion: of the source that is adapted, whether it is physics `alone`, and `absorbed`."""
+
+    own: Fit
+    alone: Bool[Array, ""]
+    absorbed: Float[Array, " p"]
+
+
+def _begin(method: Auto, field, train: Trajectories):
+    larger = extended(field, train.x0.shape[1])
+    physics = without_network(larger) if has_network(larger) else None
+    return larger, physics, method.plausible.sizes(larger, train)
+
+
+def _fits(field, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
+    found, starts = fit_each(field, windows, free, *options)
+    return at(found, 0), at(found, 1), starts
+
+
+def _replace(method: Auto, larger, own: Fit, refit: Fit, rival: Fit | None) -> tuple[AbstractVectorField, OfSource]:
+    """Replace the source by physics if these predict its own motion better."""
+    if rival is None:
+        return larger, OfSource(own, jnp.array(False), jnp.zeros_like(own.theta))
+    alone = rival.surely_better(own) & method.networks
+    absorbed = jnp.where(alone, 0.0, jnp.square(rival.theta - refit.theta))
+    physics = ravel_parameters(without_network(larger))[1](rival.theta)
+    larger, own = (_where(alone, *pair) for pair in ((physics, larger), (rival, own)))
+    return larger, OfSource(own, alone, absorbed)
 
 
 def _judge(
-    field, larger, train: Trajectories, around: Fit, every: Fit, own: Fit | None, learned_from, sizes, solver, scale
-) -> tuple[Posterior, Float[Array, ""]]:
-    start, free = ravel_parameters(larger)[0], np.stack([*free_parameters(larger).values()])
-    if own is None:
-        return posterior(around, every, start, free, sizes, jnp.zeros_like(start)), jnp.zeros(())
-    # Also if physics replaced the source: the effect is the difference of two models of it.
-    added = network_effect(field, train, solver, scale) if has_network(field) else 0.0
-    apparent, error = unchanged(own, around, added, larger, learned_from, train)
-    return posterior(around, every, start, free, sizes, apparent), error
+    field, larger, train: Trajectories, around: Fit, every: Fit, source: OfSource | None, learned_from, *options
+) -> tuple[Posterior, Unchanged, Bool[Array, "2 p"]]:
+    (sizes, solver, scale), start = options, ravel_parameters(larger)[0]
+    free, nothing = np.stack([*free_parameters(larger).values()]), Unchanged(jnp.zeros_like(start), jnp.zeros(()))
+    if source is not None:
+        # Also if physics replaced the source: the effect is the difference of two models of it.
+        added = network_effect(field, train, solver, scale) if has_network(field) else 0.0
+        nothing = unchanged(source.own, around, added, larger, learned_from, train)
+    found = posterior(around, every, start, free, sizes, nothing.apparent)
+    return found, nothing, jnp.stack([jnp.asarray(free)[found.taken], jnp.zeros(len(start), bool)])
 
 
-def _conclude(
-    method: Auto, field, larger, train: Trajectories, starts, found: Fit, chosen: Posterior, error, alone, options
-) -> Solution:
+def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome, options) -> Solution:
     """Fit the network's change on top of the chosen candidate, and compute the errors of left-out blocks."""
-    (sizes, solver, scale), (start, unravel) = options, ravel_parameters(larger)
+    (found, chosen, source, nothing), (sizes, solver, scale) = outcome, options
+    start, unravel = ravel_parameters(larger)
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
     theta, blocks = chosen.theta.at[taken].set(found.theta), blocks_of(len(train), method.blocks)
     probability, refused = chosen.probability, chosen.naive > chosen.naive[taken]
     equations = masked(found.equations, free[taken] & found.seen)
+    alone, absorbed, of_source = jnp.array(False), jnp.zeros_like(start), jnp.diag(nothing.apparent)
+    if source is not None:
+        own, alone, absorbed = source
+        of_source = jnp.where(alone, sandwich(own.equations, len(start), 1), of_source)
+    inherited = spread(found.equations, free[taken] & found.seen, of_source)
     held = jnp.diag(jnp.where(free[taken] & found.seen, found.noise / jnp.square(sizes), 0.0))
     left_out = found.theta + left_out_steps(equations, held, held @ (found.theta - start), blocks)
     changes = jnp.zeros((len(left_out), 0))
     if method.networks and has_network(larger):
         removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, if physics replaced it
-        step = fit_anchored(unravel(found.theta), train, starts, found.noise, solver, scale, error, blocks)
+        step = fit_anchored(unravel(found.theta), train, starts, found.noise, solver, scale, nothing.error, blocks)
         odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
         better = odds > STRONG
         changes, change = jnp.where(better, step.left_out, 0.0), jnp.tile(removed, (len(names) + 1, 1))
@@ -194,17 +229,17 @@ def _conclude(
 
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[blocks[0]], train)
     ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(blocks[1])))
-    parameters = (*named_parameters(larger),)
-    choice = Choice(names, probability, refused, taken, alone, parameters, free, theta, equations, change, ends)
+    first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
+    choice = Choice(*first, inherited, absorbed)
     status = ended(found.converged, found.converged | jnp.isfinite(ends).all())
     return Solution(candidate(extended(field, train.x0.shape[1]), choice, taken), found.steps, status, choice)
 
 
 _compiled = jit_by_size(FASTEST_COMPILE)
-_fit_each, _judged, _concluded = _compiled(fit_each), _compiled(_judge), _compiled(_conclude)
+STEPS = _begin, _fits, _replace, _judge, _conclude
+COMPILED = tuple(map(_compiled, STEPS))
 
 
-@jit_by_size()
 def at(fits: Fit, index: Int[Array, ""] | int) -> Fit:
     return jax.tree.map(lambda leaf: leaf[index], fits)
 
@@ -216,10 +251,12 @@ def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
 
 def network_effect(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> Float[Array, ""]:
     fields = field, without_network(field)
-    errors = [
-        jax.lax.map(lambda w, f=f: prediction_errors(f, w, solver, scale), windows, batch_size=64) for f in fields
-    ]
-    return jnp.sum(jnp.square(errors[0] - errors[1]))
+
+    def effect(part: Trajectories):
+        errors = [jax.vmap(lambda w, f=f: prediction_errors(f, w, solver, scale))(part) for f in fields]
+        return errors[0] - errors[1]
+
+    return jnp.sum(jnp.square(in_chunks(effect, windows, CHUNK)))
 
 
 def without_network(field: AbstractVectorField) -> AbstractVectorField:
@@ -239,7 +276,7 @@ def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:
 
 def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
     """Return which parameters of an extended field each candidate fits (c, p)."""
-    names = [*named_parameters(field)]
+    names = names_of(field)
     group = groups_of(names)
     lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
     found = {}

@@ -3,14 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
-from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 # Parameters of a corrected rigid body; the others are its own, θ_p.
@@ -54,24 +55,24 @@ class Plausible:
             field: the extended source.
             windows: of the changed system.
         """
-        groups, theta = groups_of([*named_parameters(field)]), ravel_parameters(field)[0]
+        groups, theta = groups_of(names_of(field)), ravel_parameters(field)[0]
         k = groups.count("disturbance")
         parts = k if k and windows.x0.shape[1] % k == 0 else 1  # of a grid a component is one part
-        steady, found = iter(jnp.broadcast_to(_rates(windows, parts), (max(parts, k),))), []
-        for group, value in zip(groups, theta, strict=True):
-            if group == "disturbance":
-                found.append(self.disturbance * next(steady))
-            else:
-                found.append(getattr(self, group) if "drag" in groups else self.relative * jnp.abs(value))
-        sizes = jnp.asarray(found, theta.dtype)
+        rates = (windows.x[:, -1] - windows.x0) / (windows.horizon * windows.dt)
+        rates = jnp.sqrt(jnp.mean(jnp.square(rates).reshape(len(rates), parts, -1), axis=(0, 2)))
+        if "drag" in groups:
+            sizes = jnp.asarray([getattr(self, group) for group in groups], theta.dtype)
+        else:
+            steady = np.array(groups) == "disturbance"
+            rates = jnp.broadcast_to(rates, (max(parts, k),))[np.maximum(np.cumsum(steady) - 1, 0)]
+            sizes = jnp.where(steady, self.disturbance * rates, self.relative * jnp.abs(theta))
         return jnp.where(sizes > 0, sizes, jnp.inf)
 
 
-@jit_by_size()
-def _rates(windows: Trajectories, parts: int) -> Float[Array, " parts"]:
-    """Return the RMS of each part's mean rate over a window."""
-    rates = (windows.x[:, -1] - windows.x0) / (windows.horizon * windows.dt)
-    return jnp.sqrt(jnp.mean(jnp.square(rates).reshape(len(rates), parts, -1), axis=(0, 2)))
+def names_of(field: AbstractVectorField) -> list[str]:
+    names: list[str] = []
+    jax.eval_shape(lambda: names.extend(named_parameters(field)))  # computes nothing
+    return names
 
 
 def groups_of(names: Sequence[str]) -> list[str]:

@@ -7,7 +7,7 @@ import scipy
 from jaxtyping import Float
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation.adapting import Adaptation, Parameter
+from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import check_level, named_parameters
 from hybrid_jax.runtime import entry
@@ -37,7 +37,9 @@ def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parame
     for i, result in enumerate(results):
         if result.covariance is None:
             raise ValueError(f"results[{i}] has no intervals: {result.without_intervals}")
-    fitted = [{name for name, one in result.parameters.items() if one.has_interval} for result in results]
+    fitted = [
+        {name for name, one in result.parameters.items() if one.has_interval or one.effective} for result in results
+    ]
     estimates = [_estimates(result) for result in results]
     found = {}
     for name in (name for name in results[0].parameters if all(name in own for own in fitted)):

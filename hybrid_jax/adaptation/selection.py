@@ -159,6 +159,16 @@ def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array
     return Posterior(start + jnp.nan_to_num(move), jax.nn.softmax(evidence), jax.nn.softmax(naive), taken)
 
 
+def spread(equations: NormalEquations, free: Bool[Array, " p"], of_source: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """Propagate the covariance of the parameters that are not free to those that are fitted beside them."""
+    gram = jnp.sum(equations.gram, axis=0)
+    fitted = inverse(jnp.sum(masked(equations, free).gram, axis=0)).matrix * free * free[:, None]
+    told = jnp.isfinite(jnp.diagonal(of_source))
+    effect = jnp.where(free | ~told, 0.0, fitted @ gram)
+    found = effect @ jnp.where(told & told[:, None], of_source, 0.0) @ effect.T
+    return found + jnp.diag(jnp.maximum(-jnp.diagonal(found), 0.0))  # rounding
+
+
 def dispersion(found: Fit, sizes) -> Float[Array, ""]:
     """Estimate the variance of an error from the variation between blocks (Wedderburn 1974), at least the noise's."""
     places, counted = blocks_of(len(found.equations.score), BLOCKS)

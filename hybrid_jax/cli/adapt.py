@@ -59,7 +59,7 @@ def run(options: Options) -> int:
         field, found = adapted(known.field, flights.logs, known.windows)
         told(f"{found.windows} windows, chose {found.chosen}")
     changes = _changes(known, found)
-    different = any(map(_significant, changes)) or found.alone or found.candidates["source"] < UNLIKELY
+    different = bool(found.changed) or found.alone or found.candidates["source"] < UNLIKELY
     if different:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
@@ -71,16 +71,10 @@ def run(options: Options) -> int:
 
 def _changes(known: Known, found: Adaptation) -> list[Change]:
     """Return the change of each parameter, the most significant first."""
-    before = {name: float(value) for name, value in named_parameters(without_past(known.field)).items()}
+    before = named_parameters(without_past(known.field))
+    names = [*found.changed, *(name for name in found.parameters if name not in found.changed)]
     # A term that was not there was 0, an efficiency 1.
-    every = [
-        (name, before.get(name, float(name.startswith("efficiency"))), one) for name, one in found.parameters.items()
-    ]
-    return sorted(every, key=lambda each: -abs(each[2].value - each[1]) / max(each[2].high - each[2].low, 1e-30))
-
-
-def _significant(change: Change) -> bool:
-    return change[2].has_interval and not change[2].low <= change[1] <= change[2].high
+    return [(name, float(before.get(name, name.startswith("efficiency"))), found.parameters[name]) for name in names]
 
 
 def _page(
@@ -92,7 +86,7 @@ def _page(
     changes: Sequence[Change],
     different: bool,
 ) -> page.Page:
-    learned, changed = named_parameters(without_past(known.field)), [*filter(_significant, changes)]
+    learned, changed = named_parameters(without_past(known.field)), changes[: len(found.changed)]
     own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
     curves = {
         name: errors.rmse_by_flight(field, flights.logs, known.steps)

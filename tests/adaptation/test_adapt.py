@@ -44,20 +44,6 @@ def flown(truth, count=40, seed=0):
     return replace(start, x=eqx.filter_jit(hj.rollout_batch)(truth, start.x0, start.u, start.dt))
 
 
-def test_the_pendulum_s_length_is_found_and_no_disturbance():
-    truth = hj.Hybrid(pendulum(LENGTH), network())
-    result = adapt(hj.Hybrid(pendulum(0.7), network()), noisy(flown(truth)))
-    assert result.converged
-    assert result.disturbance is None
-    assert list(result.parameters) == ["log_length"]
-    # Four standard errors: the interval is 1.96 of them to either side.
-    found = result.parameters["log_length"]
-    assert abs(found.value - np.log(LENGTH)) < 4 / 1.96 * (found.high - found.value)
-    assert 0 < found.high - found.low < 0.1
-    assert eqx.tree_equal(result.field.residual, network())
-    assert result.mse_after < 0.1 * result.mse_before
-
-
 def test_a_disturbance_of_the_pendulum_is_found_with_the_length():
     truth = hj.Hybrid(disturbed(pendulum(LENGTH), PUSH), network())
     result = adapt(hj.Hybrid(pendulum(0.7), network()), noisy(flown(truth)))

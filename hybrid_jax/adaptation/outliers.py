@@ -1,0 +1,32 @@
+"""Find windows with outliers, such as bursts of bad samples, before a model is adapted to them."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hybrid_jax.trajectories import Trajectories
+
+ORDER = 3  # of the differences, which a smooth error of the model hardly has
+FAR = 8.0  # robust standard deviations: of a million normal errors none is so large
+DEVIATION = 1.4826  # of normal errors over their median size
+ROUGH = 0.3  # of the largest error in the window: less is a smooth error
+
+
+def outliers(errors: Float[np.ndarray, "n t d"], windows: Trajectories) -> Bool[np.ndarray, " n"]:
+    """Return which windows contain an outlier, also as their first state.
+
+    There, differences of successive errors are much larger than usual (Hampel 1974), and nearly as large as the errors
+    themselves, so that no motion explains them.
+
+    Args:
+        errors: measured minus predicted states of each window.
+        windows: these windows.
+    """
+    if len(errors) < 1 or errors.shape[1] < ORDER:
+        return np.zeros(len(errors), bool)
+    with np.errstate(invalid="ignore", over="ignore"):
+        size = np.abs(errors).max(axis=1)
+        rough = np.abs(np.diff(np.pad(errors, ((0, 0), (1, 0), (0, 0))), ORDER, axis=1))
+        rounding = np.finfo(errors.dtype).eps * np.abs(np.asarray(windows.x)).max((0, 1))
+        usual = DEVIATION * np.median(rough, axis=(0, 1)) + rounding
+        rough = rough.max(axis=1)
+        return ((rough > FAR * usual) & (rough > ROUGH * size)).any(axis=1)

@@ -1,0 +1,158 @@
+"""The result of an adaptation, and its report."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from dataclasses import field as attribute
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from hybrid_jax.adaptation.expectation import Expected, lines_of
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.extrapolation import WARN
+from hybrid_jax.io.files import json_value
+from hybrid_jax.status import Status
+
+SHOWN = 0.01  # less probable candidates are not reported
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A physical parameter and its confidence interval.
+
+    Attributes:
+        value: the estimate, in `unit`.
+        low: lower end of the interval in `unit`: NaN without a valid one, −∞ or 0 if the parameter is not identifiable.
+        high: upper end in `unit`: NaN without a valid interval, ∞ if the parameter is not identifiable.
+        unit: for example "kg m²"; None if unknown.
+        effective: why the value predicts well but need not be the system's own, so that it has no interval; None if it
+            is physical.
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+    unit: str | None = None
+    effective: str | None = None
+
+    @property
+    def has_interval(self) -> bool:
+        """Whether there is a valid interval, which may be infinite."""
+        return not math.isnan(self.low)
+
+    def __str__(self) -> str:
+        around = "  (effective)" if self.effective else ""
+        around = f"  ({self.low:.4g} to {self.high:.4g})" if self.has_interval else around
+        return f"{self.value:.4g}{f' {self.unit}' if self.unit else ''}{around}"
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """An adapted field with its parameters, their intervals and its expected errors.
+
+    Attributes:
+        field: the adapted field.
+        method: name of the method, or its class if you passed a value.
+        parameters: of physics and disturbance, by the names of `uncertainty.named_parameters`.
+        disturbance: the constant part of ẋ in the units of ẋ; None if there is none.
+        mse_before: L_MSE of the source field on the windows, in squared units of the states.
+        mse_after: L_MSE of the adapted field on the windows, in the same units.
+        windows: the number of windows that were used.
+        steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
+        status: how the method ended.
+        level: confidence level of the intervals, between 0 and 1.
+        without_intervals: why there are no intervals; None if there are.
+        covariance: covariance in the physics' own parametrisation, of effective parameters too; None without intervals.
+        degrees: degrees of freedom of the covariance, one less than the clusters of adjacent windows, or None.
+        changed: parameters that differ significantly from the source's, the most significant first.
+        set_aside: number of samples in windows with outliers, which were not used.
+        candidates: "auto" only: probability of each change by name, 0 to 1; the network's is relative to the one taken.
+        chosen: "auto" only: name of the chosen candidate.
+        refused: "auto" only: candidates that would be more probable than the chosen one if the source had no errors.
+        alone: "auto" only: whether physics, fitted to the source's own motion, replaced physics and network.
+        expected: "auto" only: errors on an unseen flight, by horizon and quantity: value, low, high.
+        units: units of the quantities in `expected`.
+        outside: share of samples, 0 to 1, outside the range of the source's training data, by quantity.
+    """
+
+    field: AbstractVectorField
+    method: str
+    parameters: dict[str, Parameter]
+    disturbance: Float[np.ndarray, " d"] | None
+    mse_before: float
+    mse_after: float
+    windows: int
+    steps: int
+    status: Status
+    level: float
+    without_intervals: str | None
+    covariance: Float[np.ndarray, "p p"] | None = None
+    degrees: int | None = None
+    changed: tuple[str, ...] = ()
+    set_aside: int = 0
+    candidates: dict[str, float] = attribute(default_factory=dict)
+    chosen: str | None = None
+    refused: tuple[str, ...] = ()
+    alone: bool = False
+    expected: Expected = attribute(default_factory=dict)
+    units: dict[str, str] = attribute(default_factory=dict)
+    outside: dict[str, float] = attribute(default_factory=dict)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the method stopped by itself, at a finite error."""
+        return self.status == Status.OK
+
+    def report(self) -> str:
+        """A summary in plain text, a few lines."""
+        return "\n".join([*self._about_the_fit(), *self._about_parameters()])
+
+    def _about_the_fit(self) -> Iterator[str]:
+        after = f" after {self.steps} steps" if self.steps else ""
+        yield f"Adapted to {self.windows} windows by {self.method}: {self.status.message}{after}."
+        if self.set_aside:
+            yield f"Set aside: {self.set_aside} samples, in windows with outliers."
+        yield f"Mean squared prediction error: {self.mse_before:.3g} before, {self.mse_after:.3g} after."
+        if self.chosen is not None:
+            known = sorted(self.candidates.items(), key=lambda one: -one[1])
+            found = ", ".join(f"{name} {share:.2g}" for name, share in known if share >= SHOWN)
+            yield f"Chosen: {self.chosen}. Probability of each change: {found}."
+        if self.alone:
+            yield "Physics without the network predicts the source's own motion better and replaces the source."
+        if self.refused:
+            yield f"Refused: {', '.join(self.refused)}: the source's own errors may be as large without any change."
+        if self.expected:
+            yield "Expected RMSE on an unseen flight (80% intervals, from left-out blocks of these windows):"
+            yield from lines_of(self.expected, self.units)
+        for name, share in self.outside.items():
+            if share > WARN:
+                yield f"Warning: {name} is outside the source's training range in {share:.0%} of the samples."
+
+    def _about_parameters(self) -> Iterator[str]:
+        if self.parameters:
+            note = f"{self.level:.0%} confidence intervals" if self.without_intervals is None else "no intervals"
+            width = max(map(len, self.parameters))
+            yield f"Parameters ({note}):"
+            yield from (f"  {name:<{width}}  {parameter}" for name, parameter in self.parameters.items())
+            told = [name for name, one in self.parameters.items() if one.has_interval and one.high < np.inf]
+            effective = [name for name, one in self.parameters.items() if one.effective]
+            rest = [name for name in self.parameters if name not in told and name not in effective]
+            if rest and self.chosen is not None:
+                names = f"{', '.join(told + effective) or 'no parameter'}, and not {', '.join(rest)}"
+                yield f"These windows identify {names}; hj.excitation plans a flight for all of them."
+            for reason in dict.fromkeys(self.parameters[name].effective for name in effective):
+                names = ", ".join(name for name in effective if self.parameters[name].effective == reason)
+                yield f"Effective, and therefore without an interval: {names}: {reason}."
+            if unseen := [name for name, one in self.parameters.items() if one.high == np.inf]:
+                yield f"Warning: these windows do not determine {', '.join(unseen)}: other values fit them as well."
+        yield f"Constant disturbance: {'none' if self.disturbance is None else 'see parameters'}."
+        if self.parameters and self.without_intervals is not None:
+            yield f"No intervals: {self.without_intervals}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the field as JSON values; numbers that are not finite become None."""
+        parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
+        found = vars(self) | {"status": str(self.status), "converged": self.converged, "parameters": parameters}
+        return json_value({name: value for name, value in found.items() if name != "field"})
