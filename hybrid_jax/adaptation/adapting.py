@@ -260,7 +260,8 @@ def _parameters(
     bounds = intervals(field, jnp.asarray(whole), level, degrees)
     before = jax.device_get(named_parameters(extended(source, d)))
     scaled, moved = "efficiency" in np.array(groups)[free], dict[str, float]()
-    for i, (name, (value, low, high)) in enumerate(jax.device_get(bounds).items()):
+    for i, name in enumerate(values):
+        value, low, high = jax.device_get(tuple(bounds[name]))
         if free[i]:
             if not low <= before[name] <= high:
                 moved[name] = float(abs(value - before[name]) / (high - low))
