@@ -67,3 +67,9 @@ def test_no_line_of_code_scrolls(page):
     """Programs and notebooks have the same limit in docs/ruff.toml."""
     code = re.findall(r"^```\w+\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     assert [line for block in code for line in block.splitlines() if len(line) > CODE] == []
+
+
+@pytest.mark.parametrize("notebook", sorted(DOCS.glob("tutorials/*.ipynb")), ids=lambda path: path.stem)
+def test_every_exercise_has_an_answer(notebook):
+    text = notebook.read_text()
+    assert text.count("## Exercise") == text.count("<summary>Answer") == 1
