@@ -19,7 +19,7 @@ from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge,
 from hybrid_jax.adaptation.outliers import outliers
 from hybrid_jax.adaptation.plausible import groups_of
 from hybrid_jax.adaptation.results import Adaptation, Parameter
-from hybrid_jax.adaptation.selection import correlated, longest_chain, overlap
+from hybrid_jax.adaptation.selection import TINY, correlated, longest_chain, overlap
 from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space, trainable
 from hybrid_jax.dynamics.disturbance import (
@@ -264,7 +264,7 @@ def _parameters(
         value, low, high = jax.device_get(tuple(bounds[name]))
         if free[i]:
             if not low <= before[name] <= high:
-                moved[name] = float(abs(value - before[name]) / (high - low))
+                moved[name] = float(abs(value - before[name]) / max(high - low, TINY))
             network, rotors = absorbed[i] > covariance[i, i], scaled and groups[i] == "theta"
             reason = BY_NETWORK if network else BY_ROTORS if rotors else None
             bound = {"effective": reason} if reason else {"low": float(low), "high": float(high)}
