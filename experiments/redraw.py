@@ -38,7 +38,7 @@ DRAWN: Mapping[str, Callable[[Results, Mapping[str, Any]], Drawn]] = {
     "param_shift": outcome.draw,
     "reaction_diffusion": lambda rows, _: reaction_diffusion.draw(rows),
     "real_flight": lambda rows, _: real_flight.draw(rows),
-    "worlds": lambda rows, record: worlds.draw(rows) if record["figures"] else {},
+    "worlds": lambda rows, _: worlds.draw(rows),
 }
 
 
