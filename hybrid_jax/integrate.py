@@ -246,7 +246,7 @@ def check_callable(field) -> None:
         raise ValueError(f"field: must be a function (x, u) → ẋ, got {type(field).__name__}{inside}")
 
 
-def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+def check_field(field, x: Array | jax.ShapeDtypeStruct, u: Array | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
     """Shape and type of ẋ = field(x, u); ValueError if it does not have the shape of x."""
     check_callable(field)
     name = getattr(field, "__name__", type(field).__name__)

@@ -91,7 +91,7 @@ def error_figure(rows: Results) -> Figure:
     chosen = rows.where(lambda row: row.get("mode") in SHOWN, n_train=(0, most))
     groups = chosen.group("model", *(["mode"] if "mode" in rows[0] else []))
     named = {
-        ", ".join([LABELS.get(model, model), *(names.label(mode) for mode in modes if mode != names.NOMINAL)]): own
+        ", ".join([LABELS.get(model) or model, *(names.label(mode) for mode in modes if mode != names.NOMINAL)]): own
         for (model, *modes), own in groups.items()
     }
     figure, (panels,) = subplots((PAGE, 0.9 + 0.24 * len(named)), 1, len(errors.UNITS), sharey=True)

@@ -235,9 +235,8 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
     return Solution(candidate(extended(field, train.x0.shape[1]), choice, taken), found.steps, status, choice)
 
 
-_compiled = jit_by_size(FASTEST_COMPILE)
-STEPS = _begin, _fits, _replace, _judge, _conclude
-COMPILED = tuple(map(_compiled, STEPS))
+STEPS: tuple[Any, ...] = (_begin, _fits, _replace, _judge, _conclude)
+COMPILED = tuple(jit_by_size(FASTEST_COMPILE)(step) for step in STEPS)
 
 
 def at(fits: Fit, index: Int[Array, ""] | int) -> Fit:

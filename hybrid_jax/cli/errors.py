@@ -34,7 +34,7 @@ def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[n
     """Compute the errors in UNITS for windows of a flight at the end of each interval."""
     if isinstance(field, DisturbanceModel):  # which starts from what was seen before
         parts = [(each, observe(field, each)[0]) for each in sequences([log], steps)]
-        cut = [trajectories.windows_of(seen, each.u[0], each.dt, steps=steps) for each, seen in parts]
+        cut = [trajectories.windows_of(seen, np.asarray(each.u[0]), each.dt, steps=steps) for each, seen in parts]
         windows = trajectories.concatenate(cut)
     else:
         windows = windows_of([log], steps, steps).windows

@@ -1,6 +1,7 @@
 """Learn to predict a disturbance from its own past, and estimate its hidden state from measured states."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -94,12 +95,13 @@ def errors_after_one(
         np.resize(each, (count, each.shape[-1]))
         for each in (before.reshape(-1, d), past.u.reshape(-1, m), past.x.reshape(-1, d))
     ]
-    parts = [_one_step(field, *(row[i : i + CHUNK] for row in rows), past.dt, solver) for i in range(0, count, CHUNK)]
+    parts = [_one_step(field, [row[i : i + CHUNK] for row in rows], past.dt, solver) for i in range(0, count, CHUNK)]
     return np.concatenate(parts)[: n * t].reshape(n, t, -1)
 
 
 @eqx.filter_jit
-def _one_step(field, x, u, after, dt: float, solver: Solver) -> Float[Array, "n e"]:
+def _one_step(field, rows: Any, dt: float, solver: Solver) -> Float[Array, "n e"]:
+    x, u, after = rows
     space = state_space(field, x.shape[-1])
     return jax.vmap(space.difference)(after, rollout_batch(field, x, u[:, None], dt, solver)[:, 0]) / dt
 
@@ -116,15 +118,17 @@ def _parts(field: AbstractVectorField, sequences: Sequence[Trajectories], steps:
         raise ValueError("sequences: at least one is needed")
     if len(found) < PARTS:
         pieces = -(-PARTS // len(found))
-        found = [
-            windows_of(np.concatenate([one.x0, one.x[0]]), one.u[0], one.dt, steps=one.horizon // pieces)[i : i + 1]
-            for one in found
-            for i in range(pieces if one.horizon >= pieces else 0)
-        ]
+        found = [piece[i : i + 1] for one in found for piece in [_cut(one, pieces)] for i in range(len(piece))]
     shortest = min((one.horizon for one in found), default=0)
     if shortest < 2 * steps:
         raise ValueError(f"sequences: each needs {2 * steps} intervals at least, one has {shortest}")
     return found
+
+
+def _cut(one: Trajectories, pieces: int) -> Trajectories:
+    """One long window in pieces, or as it is where it is too short."""
+    states, u = np.concatenate([one.x0, one.x[0]]), np.asarray(one.u[0])
+    return windows_of(states, u, one.dt, steps=one.horizon // pieces) if one.horizon >= pieces else one
 
 
 def _states(field: AbstractVectorField, windows: Trajectories) -> tuple[int, ...]:
@@ -151,19 +155,21 @@ def _ridge(start: DisturbanceModel, states: np.ndarray, errors: np.ndarray, pena
 
 def _scores(start: DisturbanceModel, weights, flights: Sequence, steps: int, solver: Solver) -> np.ndarray:
     """Mean logarithm of the squared error after `steps` intervals, over the quantities of the state, of all weights."""
-    cut = [windows_of(seen, one.u[0], one.dt, steps=steps, stride=1) for seen, one in flights]
+    cut = [windows_of(seen, np.asarray(one.u[0]), one.dt, steps=steps, stride=1) for seen, one in flights]
     x0, u, end = (np.concatenate(parts) for parts in zip(*((w.x0, w.u, w.x[:, -1]) for w in cut), strict=True))
     chosen = np.round(np.linspace(0, len(x0) - 1, WINDOWS)).astype(int)
     dt, space = cut[0].dt, state_space(start.field, x0.shape[1] - start.filters)
-    found = [_squares(start, each, *(part[chosen] for part in (x0, u, end)), dt, solver) for each in weights]
+    windows = [part[chosen] for part in (x0, u, end)]
+    found = [_squares(start, each, windows, dt, solver) for each in weights]
     sizes = np.cumsum([one.tangent_size for one in space.quantities])[:-1]
     of_quantity = np.stack([each.sum(axis=1) for each in np.split(np.asarray(found, float), sizes, axis=1)])
     return np.nan_to_num(np.log(of_quantity).mean(axis=0), nan=np.inf)
 
 
 @eqx.filter_jit
-def _squares(model, weights, x0, u, end, dt: float, solver: Solver) -> Float[Array, " e"]:
+def _squares(model, weights, windows: Any, dt: float, solver: Solver) -> Float[Array, " e"]:
     """Mean squared error at the end of windows, number by number."""
+    x0, u, end = windows
     model = eqx.tree_at(lambda each: each.weights, model, weights)
     d = x0.shape[-1] - model.filters
     reached = rollout_batch(model, x0, u, dt, solver)[:, -1, :d]
