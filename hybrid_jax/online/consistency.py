@@ -17,7 +17,7 @@ from hybrid_jax.online.samples import HUGE, Sample
 from hybrid_jax.online.state import OnlineState
 from hybrid_jax.online.tuning import TRIAL, WINDOW, Tuning
 
-AT_BOUND = 2.5  # alarms as which a parameter at its bound counts in a second
+AT_BOUND = 5.0  # alarms as which a parameter at its bound counts in a second
 SETTLED = 0.5  # count of alarms below which an estimate is kept
 
 

@@ -46,7 +46,7 @@ class Tuning:
     gusts: float = 500.0
     alarm: float = 5.0
     reject: float = 6.0
-    alarms: float = 5.0
+    alarms: float = 10.0
     clip: float = 5.0
     gap: float = 0.0
     frozen: int = 3
