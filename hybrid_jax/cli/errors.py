@@ -67,7 +67,7 @@ def figure(errors: Mapping[str, Float[np.ndarray, "flights t 4"]], dt: float) ->
         panel.set(title=name.replace("_", " "), ylabel=f"RMSE [{unit}]", ylim=(0, None))
     for panel in panels[-1]:
         panel.set_xlabel("time since the prediction began [s]")
-    panels[0, 0].legend()
+    drawn.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawn
 
 
