@@ -40,10 +40,11 @@ HEAD = f"""# {NAME}
 Flights held out are predicted open loop with the recorded motors, by models that the calls of `hybrid-jax fit` and
 `hybrid-jax adapt` made of the other flights.
 
-- **hybrid-jax fit**: physics, or physics with a network, whichever predicts flights left out better
+- **hybrid-jax fit**: physics, or physics with a network, each with its past errors or without, whichever predicts
+  flights left out best
 - **its physics alone**: the multirotor in it, without a network
 - **hybrid-jax adapt**: the same adapted to N windows of ten intervals after the change
-- **physics adapted from nominal**: the vehicle file's multirotor adapted to the same windows, without a past
+- **physics adapted from nominal**: the vehicle file's multirotor adapted to the same windows, without flights before
 - **rigid body + linear residual**: a linear map of state and input that is fitted to the residuals of a rigid body
 
 Errors are lengths of vectors, of rotation the angle; an RMSE over flights counts each flight once."""
