@@ -99,8 +99,9 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
             y = np.full(len(ratio), names.index(tuple(case)))
             axes.plot(ratio, y, "o", ms=4, alpha=0.7, color=METHODS["adapted"], label="adapted, each flight")
         axes.set(xscale="log", title=str(world), xlabel="test error over the source's")
-    name_lines(panels[0], [" to ".join(name.replace("_", " ") for name in case) for case in names])
-    caption = "Error of the adapted model over that of its source after a change, and the flight it adapted to"
+    words = {"nothing": "no change", "moving": "usual flight", "outliers": "usual flight with outliers"}
+    name_lines(panels[0], [": ".join(words.get(name, name.replace("_", " ")) for name in case) for case in names])
+    caption = "Error of the adapted model over the source's, by the change and the flight that it adapted to"
     return {"ratios": (legend_below(figure, "Is an adapted model ever worse than its source?"), caption)}
 
 
