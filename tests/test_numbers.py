@@ -116,7 +116,7 @@ def test_adapting_in_flight():
     page, rows = (ROOT / "docs/howto/online.md").read_text(), committed("online").where(agent="online")
     low = rows.where(reference="low_pass").group("change")
     shares = [100 * np.mean([[*row["inside"].values()] for row in own]) for own in low.values()]
-    assert f"only {min(shares):.0f} to {max(shares):.0f} %" in page
+    assert f"{min(shares):.0f} to {max(shares):.0f} % of the intervals" in page
     alarms = sum(row["alarms"] > 0 for row in low["nothing"])
     assert f"false alarm in {alarms} of {len(low['nothing'])} flights" in page
     fast = rows.where(change="inertia", reference="fast_figure_eight")
