@@ -112,6 +112,8 @@ def covariance(
     through = np.concatenate([np.broadcast_to(np.eye(p), (len(gram), p, p)), -slope], axis=1)
     half = theta @ through.swapaxes(1, 2) @ meat  # (n, p, q)
     cov = (half @ through).sum(axis=0) @ theta
+    told = told & (np.diagonal(cov) >= 0)  # few pieces that hardly determine a number may give it a negative variance
+    cov = np.where(told[:, None] & told, cov, 0.0)
     variance = np.einsum("nsp,pq,nsq->ns", slope, cov, slope) - 2 * np.einsum(
         "nsp,npt,nts->ns", slope, half[..., p:], back
     )
