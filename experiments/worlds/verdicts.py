@@ -100,7 +100,7 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
             axes.plot(ratio, y, "o", ms=4, alpha=0.7, color=METHODS["adapted"], label="adapted, each flight")
         axes.set(xscale="log", title=str(world), xlabel="test error over the source's")
     words = {"nothing": "no change", "moving": "usual flight", "outliers": "usual flight with outliers"}
-    name_lines(panels[0], [": ".join(words.get(name, name.replace("_", " ")) for name in case) for case in names])
+    name_lines(panels[0], [": ".join(words.get(name) or name.replace("_", " ") for name in case) for case in names])
     caption = "Error of the adapted model over the source's, by the change and the flight that it adapted to"
     return {"ratios": (legend_below(figure, "Is an adapted model ever worse than its source?"), caption)}
 
