@@ -19,7 +19,6 @@ from hybrid_jax.cli.help import RARE
 from hybrid_jax.cli.learning import without_past
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
-from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
@@ -40,10 +39,7 @@ UNITS = "velocity [m/s]", "body rates [rad/s]"
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
 PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.md
 PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
-FILTERED = (
-    "The last {} numbers of x are z, its errors after filters: after each period, add (1 − exp(−dt / τ)) (e − z) to z, "
-    "with the measured error e ({} numbers, per second) and τ of {} s."
-)
+WITHOUT = "The model is written without its past: in a program you would have to filter its errors yourself."
 
 
 @dataclass(frozen=True)
@@ -95,7 +91,7 @@ class Options:
 
 def run(options: Options) -> int:
     model = load(options.model)
-    field, dt = model.field, model.about.get("dt") if options.dt is None else options.dt
+    field, dt = without_past(model.field), model.about.get("dt") if options.dt is None else options.dt
     if dt is None:
         raise ValueError(f"--dt is needed: {options.model} does not say how long the steps of its flights were")
     checks.positive(f"{options.model}: dt" if options.dt is None else "--dt", dt, "a positive number of seconds")
@@ -108,9 +104,9 @@ def run(options: Options) -> int:
     sizes: dict[str, Any] = {"state_size": d, "input_size": m}
     own: dict[str, Any] = sizes | {"smooth": options.smooth}
     said: list[str] = []
-    adaptation = _filter(options, without_past(field), dt, d) if "c" in options.to else ""
-    if isinstance(field, DisturbanceModel):
-        said.append(FILTERED.format(field.filters, len(field.weights), field.time_constants))
+    adaptation = _filter(options, field, dt, d) if "c" in options.to else ""
+    if field is not model.field:
+        said.append(WITHOUT)
     checks.writable_folder("--output", options.output)
     checks.writable_folder("--out", options.out)
     written: list[Path] = []
