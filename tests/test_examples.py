@@ -16,7 +16,7 @@ def test_the_gallery_shows_all_programs():
     page = (FOLDER / "index.md").read_text()
     names = {path.stem for path in PROGRAMS}
     assert len(names) == 12
-    assert {*re.findall(r"\]\((\w+)\.png\)", page)} == {*re.findall(r'"docs/examples/(\w+)\.py"', page)} == names
+    assert {*re.findall(r"\]\((\w+)\.png\)", page)} == {*re.findall(r'--8<-- "docs/examples/(\w+)\.py"', page)} == names
     assert all((FOLDER / f"{name}.png").stat().st_size < 60_000 for name in names)
 
 
