@@ -2,7 +2,6 @@
 
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,9 +15,8 @@ from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.grids import grid_network
 from hybrid_jax.networks.mlp import InputScaling, residual_network
-from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.training import fitting
-from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config
+from hybrid_jax.training.fitting import RunConfig, make_run_config
 from hybrid_jax.training.loss import REGULARISERS
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
@@ -38,20 +36,6 @@ def untrained(model: Model, seed: int | jax.Array = 0, hidden: int = 64) -> Abst
     physics = perturbed(IRIS, physics_key, low=0.8, high=1.25)
     network = residual_network(13, 4, network_key, hidden=hidden, scaling=SCALING)
     return {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
-
-
-def training_runs(
-    model: Model, runs: int, windows: int, max_epochs: int = 2000, hidden: int = 64
-) -> tuple[FitState, RunConfig]:
-    """Stacked initial states and configurations of runs on so many windows, with the paper's rates (paper, App. A)."""
-
-    def begin(seed):
-        return fitting.start(untrained(model, seed, hidden), jax.random.key(seed))
-
-    physics, network = 1e-2, 1e-4
-    rates: Any = {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]  # pyright: ignore[reportArgumentType]
-    plan = make_run_config(rates, np.arange(windows), windows, 100, 20, max_epochs, 1e-3)
-    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(begin))(jnp.arange(runs))), stack([plan] * runs)
 
 
 class Pendulum(AbstractVectorField):
@@ -118,10 +102,3 @@ def make_flights(count: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
     x0[:, 2:4] = 2.0, 1.0
     x0[:, 3:7] /= np.linalg.norm(x0[:, 3:7], axis=1, keepdims=True)
     return x0, IRIS.hover_speed * rng.uniform(0.95, 1.05, size=(count, steps, 4))
-
-
-def make_windows(count: int, steps: int) -> Trajectories:
-    """The same in float32, simulated by the rigid body with nominal parameters."""
-    x0, u = (part.astype(np.float32) for part in make_flights(count, steps))
-    x = jax.jit(lambda x0, u: rollout_batch(rigid_body(IRIS), x0, u, DT))(x0, u)
-    return Trajectories(x0, u, np.asarray(x), DT)

@@ -85,10 +85,6 @@ class Times:
         """The median of one call [s]."""
         return statistics.median(self.seconds[name])
 
-    def medians(self) -> dict[Any, float]:
-        """The medians of all calls [s]."""
-        return {name: self.median(name) for name in self.seconds}
-
     def ratio(self, name: Any, other: Any) -> float:
         """The time of a call over that of another: the median over the turns."""
         return statistics.median(a / b for a, b in zip(self.seconds[name], self.seconds[other], strict=True))

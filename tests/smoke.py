@@ -56,16 +56,15 @@ def experiments(group: str, *names: str, folder: Path, options: Sequence[str] = 
     return [_finished(folder, f"experiments.{name}") for name in names]
 
 
-def benchmarks(folder: Path, *options: str) -> tuple[Run, dict[str, dict[str, Any]]]:
-    """All benchmarks: their output, and their reports by name; run now in the folder, or copied there from .ci/run."""
+def benchmark(name: str, folder: Path) -> tuple[Run, dict[str, Any]]:
+    """A benchmark's output and its report: run now in the folder, or copied there from .ci/run."""
     if LEFT is None:
-        run = python("benchmarks", "--preset", "smoke", "--out", str(folder / "all.json"), *options)
+        run = python(f"benchmarks.{name}", "--preset", "smoke", "--out", str(folder / f"{name}.json"))
         assert run.returncode == 0, run.stderr
     else:
         shutil.copytree(Path(LEFT) / "benchmarks", folder, dirs_exist_ok=True)
-        run = _finished(folder, "benchmarks")
-    reports = json.loads((folder / "all.json").read_text())["benchmarks"]
-    return run, {report["benchmark"]: report for report in reports}
+        run = _finished(folder, f"benchmarks.{name}")
+    return run, json.loads((folder / f"{name}.json").read_text())
 
 
 def _finished(folder: Path, module: str) -> Run:

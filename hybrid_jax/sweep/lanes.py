@@ -20,7 +20,7 @@ from hybrid_jax.sweep import hosts
 
 Numbers = Sequence[Any] | np.ndarray
 AXIS = "lanes"
-WIDTH = {"cpu": 1}  # one lane fills the cache (benchmarks/sweep.py); on a GPU a chunk holds all lanes of a device
+WIDTH = {"cpu": 1}  # one lane fills the cache; on a GPU a chunk holds all lanes of a device
 
 
 def stack(lanes: Sequence[PyTree]) -> PyTree:
