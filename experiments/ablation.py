@@ -34,8 +34,7 @@ TRUTH = {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
 HEAD = """# ablation
 
 One choice of the hybrid method is changed at a time; everything else keeps its default. Each value is pre-trained on
-source flight and fine-tuned on N trajectories of each target: other moments of inertia (parameter shift), and a side
-wind (external force).
+source flight and fine-tuned on N trajectories of each target: other moments of inertia, and a side wind.
 
 L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖²: on the source's validation windows of 0.1 s after pre-training, and on test flights of
 1 s in the target, before (source-only) and after fine-tuning. Test flights have no sensor noise."""

@@ -15,8 +15,8 @@ from experiments.flying.changes import CHANGES
 from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
 from experiments.paper.known_body import coverage, known_body_table
-from experiments.paper.regret import CHANGES as CHANGES_SHOWN
 from experiments.paper.study import flown, pretrained, source_splits, target_splits, windows_of
+from experiments.reporting import names
 from experiments.reporting.claims import Claim, Part, all_of, verdict_table
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.names import HYBRID
@@ -226,7 +226,7 @@ def coverage_figure(rows: Results) -> Figure:
             note(axes, parameter, (min(shares.values()), y), (-6, 0), va="center", ha="right", color="0.4")
         axes.set(title="without noise" if noise == "none" else "with sensor noise", xlim=(60, 100.5))
         axes.set_xlabel("intervals that contain the true value [%]")
-        name_lines(axes, [CHANGES_SHOWN.get(name) or str(name).replace("_", " ") for name in changes])
+        name_lines(axes, [*map(names.label, changes)])
     return legend_below(figure, "Do 95 % intervals contain the true value?")
 
 

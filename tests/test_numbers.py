@@ -10,7 +10,8 @@ from committed import committed, lines
 from smoke import ROOT
 
 from experiments.online.results import error
-from experiments.paper.regret import AUTO, CHANGES, of_each_case, over, regret
+from experiments.paper.regret import AUTO, of_each_case, over, regret
+from experiments.reporting.names import label
 from experiments.reporting.tables import measured
 
 DOCS, README = ROOT / "docs", ROOT / "README.md"
@@ -40,7 +41,7 @@ def test_seven_changes():
         rho = 1 - over(own, "source")
         errors = [f"{of_each_case(own, name).mean():.3g}" for name in ("source", "fine_tune", AUTO)]
         names = {"off_centre_load": "a load off centre", "gusty_wind": "slanted, gusty wind"}
-        name = names.get(domain, CHANGES[domain])
+        name = names.get(domain, label(domain))
         assert shown[name] == [*errors, f"{rho.mean():.3g}, {rho.min():.3g}"], domain
     ratios = regret(committed("changes"))
     assert (f"{np.mean(ratios <= 1.1):.0%}", f"{ratios.max():.2f}") == ("93%", "1.34")
@@ -81,7 +82,7 @@ def test_intervals():
         for column, statistic, factor, form in kinds:
             values = [factor * statistic(own[column]) for own in groups]
             cells.append(f"{min(values):{form}} to {max(values):{form}}")
-        assert lines("docs/results/intervals.md")[CHANGES[domain]] == cells
+        assert lines("docs/results/intervals.md")[label(domain)] == cells
     shares = len(fitted), f"{np.mean(fitted['inside']):.0%}", f"{np.mean(fitted['alone']):.0%}"
     assert shares == (2756, "98%", "92%")
 

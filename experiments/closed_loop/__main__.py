@@ -39,8 +39,8 @@ DISTURBANCES = {"needed": LeastSquares(), "always": LeastSquares(disturbance=Tru
 
 HEAD = """# closed_loop
 
-A model predictive controller flies the simulated quadrotor after a change: other moments of inertia (parameter shift),
-or a side wind of 4 N with a sine of 1 N (external force). Every 0.01 s the controller plans 1 s ahead with its
+A model predictive controller flies the simulated quadrotor after a change: other moments of inertia,
+or a side wind of 4 N with a sine of 1 N. Every 0.01 s the controller plans 1 s ahead with its
 prediction model; nothing else differs between the flights of a column. {knows}
 
 - **nominal physics**: the rigid body of the data sheet, not trained

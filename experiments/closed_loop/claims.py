@@ -168,9 +168,9 @@ CLAIMS: list[tuple[int, str, Callable[[Agent, Agent, Evidence], Iterator[Part]]]
     (2, f"in the wind adaptation with the smallest N closes at least {GAP_SHARE:.0%} of the gap between the source "
         f"model's RMSE and that of the true vehicle in the mean wind, on each of {_THREE}, and no seed crashes (ratio "
         "of means over seeds; Fieller's 95 % interval).", _closes_the_gap),
-    (3, "under the parameter shift the mean RMSE after adaptation with the smallest N is not above that of the source "
+    (3, "with the other inertia the mean RMSE after adaptation with the smallest N is not above that of the source "
         f"model on any reference ({_PAIRED}; {_EQUAL}).", _none_worse),
-    (4, "under the parameter shift, adapted with the smallest N, the actual open-loop cost of plans is within "
+    (4, "with the other inertia, adapted with the smallest N, the actual open-loop cost of plans is within "
         f"{COST_TOLERANCE:.0%} of the predicted one on every reference (95 % interval of the mean over seeds; sum over "
         "calls every 0.5 s; the denominator is at least the cost of an offset of 5 mm; for comparison the source "
         "model, after the change and on the unchanged vehicle).", _cost_predicted),
@@ -178,7 +178,7 @@ CLAIMS: list[tuple[int, str, Callable[[Agent, Agent, Evidence], Iterator[Part]]]
         f"on the source model), under both changes and on each of {_THREE} ({_PAIRED}; {_EQUAL}).", _observer_adds),
     (6, f"adapted with the smallest N, the mean RMSE away from home is at most {AWAY_FACTOR:g} times that at home, in "
         f"each domain and on each reference flown there ({_PAIRED} [cm]).", _same_away),
-    (9, "with the observer before and after, under the parameter shift, the mean RMSE after adaptation with the "
+    (9, "with the observer before and after, with the other inertia, the mean RMSE after adaptation with the "
         f"smallest N is not above that of the source model on any reference ({_PAIRED}; {_EQUAL}).",
      lambda source, adapted, e: _none_worse(replace(source, observer=True), replace(adapted, observer=True), e)),
 ]  # fmt: skip

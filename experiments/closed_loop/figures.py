@@ -8,10 +8,11 @@ from matplotlib.lines import Line2D
 
 from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, SOURCES, Agent, by_agent, gaps
 from experiments.flying.scenario import REFERENCES
-from experiments.reporting.plots import COLOURS, PAGE, STYLE, legend_below, name_lines, subplots
+from experiments.reporting.names import EXTERNAL_FORCE
+from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, subplots
 from experiments.reporting.results import Results
 
-COLOURS_OF = {"hybrid": COLOURS["hybrid"], "invariant": "#CC79A7", "least_squares": "#882255"}
+COLOURS_OF = {"hybrid": METHODS["fine-tuned"], "invariant": "#56B4E9", "least_squares": METHODS["adapted"]}
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
@@ -32,16 +33,17 @@ def shares(rows: Results, domain: str) -> Figure:
     figure, panels = subplots((PAGE, 0.9 + lines * (0.6 + 0.17 * len(agents))), lines, columns, sharey=True)
     for axes in panels.flat[len(names) :]:
         axes.set_visible(False)
+    true = "true vehicle in the mean wind" if domain == EXTERNAL_FORCE else "true vehicle"
     at_home = rows.where(domain=domain, distance=0.0)
     for axes, name in zip(panels.flat, names, strict=False):
         flown = by_agent(at_home.where(reference=name))
         errors = {agent: 100 * group.spread(ERROR).mean for agent, group in flown.items()}
-        axes.axvline(errors[ORACLE], color="0.4", linestyle=":", label="true vehicle in the mean wind")
+        axes.axvline(errors[ORACLE], color="0.4", linestyle=":", label=true)
         for y, agent in enumerate(agents):
             before, after = errors[Agent(SOURCES[agent.model])], errors.get(agent, math.inf)
             axes.plot([before, after], [y, y], color=COLOURS_OF[agent.model], linewidth=1)
-            axes.plot(before, y, "o", color=COLOURS_OF[agent.model], markerfacecolor="white", label="not adapted")
-            axes.plot(after, y, "o", color=COLOURS_OF[agent.model], label="adapted")
+            axes.plot(before, y, "o", color=COLOURS_OF[agent.model], markerfacecolor="white", clip_on=False)
+            axes.plot(after, y, "o", color=COLOURS_OF[agent.model], clip_on=False)
         axes.set(title=REFERENCES[name], xlim=(0, None))
         name_lines(axes, [agent.name for agent in agents])
     for axes in panels[-1]:

@@ -138,7 +138,7 @@ def run(options: Options) -> None:
         test, plain, short = tests_of(left, fitted), tests_of(left, gain), tests_of(left, few[0])
         simple = [fitted_to(rigid_body(VEHICLE), others, each) for each in (gain, fitted)]
         models = {
-            "hold the state": (HoldState(), test),
+            "constant state": (HoldState(), test),
             "frozen rates": (FrozenRates(simple[1]), test),
             "physics, constant gain": (simple[0], plain),
             "physics, voltage": (simple[1], test),
@@ -146,7 +146,7 @@ def run(options: Options) -> None:
             "adapted from A, ten seconds": (fitted_to(of_a, tens[:1], few[0], 5), short),
         }
         for (name, (model, windows)), observed in itertools.product(models.items(), (False, True)):
-            if name == "hold the state" and observed:
+            if name == "constant state" and observed:
                 continue
             line = scores.setdefault(name + OBSERVED * observed, [])
             line.append(errors(model, windows, observed))

@@ -211,7 +211,7 @@ CLAIMS: Mapping[str, tuple[str, Predicate]] = {
            "interval of the paired difference, as for all claims about means).", _lower_error),
     "C2": ("At every N, the mean ρ of the fine-tuned hybrid is above that of fine-tuned no-physics.", _higher_rho),
     "C3": ("At the smallest N, fine-tuned no-physics fails and the hybrid does not: mean ρ of no-physics is below 0 "
-           "(under the external force, diverging in at least half of the runs counts too), that of the hybrid above "
+           "(in the side wind, diverging in at least half of the runs counts too), that of the hybrid above "
            "0.", _only_hybrid_adapts),
     "C4": ("At every N, the standard deviation over seeds of the test error of the fine-tuned hybrid is below that of "
            "fine-tuned no-physics (test of Pitman and Morgan for paired variances).", _less_spread),

@@ -24,7 +24,7 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 DT, STEPS, WINDOWS = 0.01, 10, 100  # s, intervals in a window, windows in a recording
-TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": IRIS.thrust_coefficient}  # SI: the paper's parameter shift
+TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": IRIS.thrust_coefficient}  # SI: the paper's changed inertia
 DRAG = 0.4  # kg/s, that the model does not know: v̇ −= drag v / m
 NOISE_ON = ("targets", "all")  # the start of a window is known exactly, as the fit takes it to be; or measured as well
 SPEED = np.array([2.0, 2.0, 2 / 3])  # m/s: standard deviations about hover, here and below

@@ -6,8 +6,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.reporting import names
 from experiments.reporting.claims import Claim, Part, Undecided
-from experiments.reporting.names import EXTERNAL_FORCE, PARAMETER_SHIFT
 from experiments.reporting.plots import METHODS, STYLE, legend_below, name_lines, note, subplots, tick_errors
 from experiments.reporting.results import Results
 from experiments.reporting.tables import Table
@@ -23,11 +23,6 @@ SHOWN = {  # method → label, colour and marker
     AUTO: ("hj.adapt", METHODS["adapted"], "o"),
     "fine_tune": ("fine-tuned (Adam)", METHODS["fine-tuned"], "^"),
 }
-CHANGES = {
-    PARAMETER_SHIFT: "other inertia", EXTERNAL_FORCE: "side wind", "doubled_drag": "twice the drag",
-    "weak_rotor": "one rotor 15 % weaker", "off_centre_load": "load off centre", "gusty_wind": "gusty wind",
-    "load_and_wind": "load and wind",
-}  # fmt: skip
 
 
 def of_each_case(rows: Results, name: str) -> np.ndarray:
@@ -62,7 +57,7 @@ def _never_worse(rows: Results) -> Part:
 
 def _gains(rows: Results) -> Part:
     sound, words = [], []
-    for domain, own in rows.where(domain=(PARAMETER_SHIFT, EXTERNAL_FORCE)).group("domain").items():
+    for domain, own in rows.where(domain=(names.PARAMETER_SHIFT, names.EXTERNAL_FORCE)).group("domain").items():
         rho = 1 - over(own, "source")
         sound.append(rho.mean() >= MEAN_RHO and rho.min() >= WORST_RHO)
         words.append(f"{domain}: mean {rho.mean():.3f}, worst {rho.min():.3f}")
@@ -122,7 +117,7 @@ def regret_table(rows: Results) -> Table:
         taken = ", ".join(f"{name} {n}" for name, n in sorted(counts.items(), key=lambda item: -item[1]))
         numbers = np.mean(found <= NEAR), np.median(found), found.max(), rho.mean(), rho.min()
         texts = (f"{number:{form}}" for number, form in zip(numbers, (".0%", ".3f", ".3f", ".3f", ".3f"), strict=True))
-        lines.append((domain, *texts, taken))
+        lines.append((names.label(domain), *texts, taken))
     header = ("change", f"regret ≤ {NEAR}", "median", "largest", "mean ρ", "worst ρ", "taken, number of cases")
     return Table("The candidate that is taken", header, lines)
 
@@ -134,7 +129,7 @@ def error_table(rows: Results) -> Table:
         return f"{of_each_case(own, name).mean():.3g}"
 
     lines = [(name, *(text(own, name) for own in groups.values())) for name in (AUTO, *rows.unique("candidate"))]
-    return Table("Mean test error L^T_MSE (less is better)", ("method", *groups), lines)
+    return Table("Mean test error L^T_MSE (less is better)", ("method", *map(names.label, groups)), lines)
 
 
 @mpl.rc_context(STYLE)
@@ -156,5 +151,5 @@ def error_figure(rows: Results) -> Figure:
         xscale="log", xlabel="RMS prediction error over 1 s, % of that without adaptation (log scale; lower is better)"
     )
     tick_errors(axes.xaxis, *axes.get_xlim(), room=3.0)
-    name_lines(axes, [CHANGES.get(name, name.replace("_", " ")) for name in map(str, groups)])
+    name_lines(axes, [*map(names.label, groups)])
     return legend_below(figure, "After a change: ten seconds of one noisy flight (band: all cases)")

@@ -49,7 +49,7 @@ QUESTIONS = {
     "closed_loop": Asked(
         "Does adaptation make a vehicle fly better?",
         ("Yes in a steady wind, with a network that does not read the position; add a disturbance observer.",),
-        "less is better), external force",
+        "less is better), side wind",
         "gap_external_force.png",
     ),
     "online": Asked(

@@ -145,7 +145,7 @@ def markdown_page(page: Page, report: Report) -> str:
         *figures[:1],
         f"## {plain(page.table.title)}\n\n{markdown(page.table)}" if page.table else "",
         f"## What this means for you\n\n{_bullets(page.meaning)}" if page.meaning else "",
-        f"## Details\n\nThis is the report of `experiments.{report.experiment}`.",
+        f"## Details\n\nThis is the report of `experiments.{report.experiment}`{_made(report.environment)}.",
         *(
             f'<details markdown="1"><summary>{plain(title)}</summary>\n\n{content}\n\n</details>'
             for title, content in more.items()
@@ -153,6 +153,12 @@ def markdown_page(page: Page, report: Report) -> str:
         ),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _made(environment: Mapping[str, Any]) -> str:
+    if "date" not in environment:
+        return ""
+    return f", made on {environment['date'][:10]} with hybrid_jax {environment['versions']['hybrid_jax']}"
 
 
 def _bullets(lines: Sequence[str]) -> str:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from experiments.reporting import names
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Spread
 
@@ -37,8 +38,8 @@ def tabulate(
 ) -> Table:
     """Return a line per group of rows, by its label or labels (titled `header`); a column per function of a group."""
     lines = [
-        (*(label if isinstance(label, tuple) else (label,)), *(text(rows) for text in columns.values()))
-        for label, rows in groups.items()
+        (*map(names.label, key if isinstance(key, tuple) else (key,)), *(text(rows) for text in columns.values()))
+        for key, rows in groups.items()
     ]
     return Table(title, (*header, *columns), lines, labels=len(header))
 

@@ -5,6 +5,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.reporting.claims import Claim, Part, Undecided, all_of
+from experiments.reporting.names import label
 from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, subplots
 from experiments.reporting.results import Results
 from experiments.reporting.tables import EMPTY, Table, tabulate
@@ -34,7 +35,7 @@ def ratio_table(rows: Results) -> Table:
         ratio, taken = own.numbers("ratio"), [row["chosen"] for row in own]
         counts = ", ".join(f"{name} {taken.count(name)}" for name in dict.fromkeys(taken))
         made_for = "yes" if own[0]["made_for"] else "no"
-        lines.append((*case, made_for, f"{ratio.mean():.3g}", f"{ratio.max():.3g}", counts))
+        lines.append((*map(label, case), made_for, f"{ratio.mean():.3g}", f"{ratio.max():.3g}", counts))
     header = ("world", "change", "flight", "candidates made for it", "mean ratio", "worst", "taken")
     return Table("Error over the source's on usual flights, the worst first", header, lines)
 
@@ -63,15 +64,23 @@ def coverage_table(rows: Results) -> Table:
             effective = int(np.sum(known(own, f"{name}_effective")))
             numbers = (100 * np.abs(known(own, f"{name}_{column}")) for column in ("error", "half_width"))
             medians = (f"{np.median(v):.2g}" if len(v) else EMPTY for v in numbers)
-            lines.append((world, method, name, share, f"{effective or EMPTY}", *medians))
-    header = "world", "method", "θ_p", "intervals that hold", "effective", "median error [%]", "median half-width [%]"
-    return Table("Do 95 % intervals of θ_p after ten seconds of usual flight hold the truth?", header, lines)
+            lines.append((label(world), method, name, share, f"{effective or EMPTY}", *medians))
+    header = (
+        "world",
+        "method",
+        "θ_p",
+        "that contain the truth",
+        "effective",
+        "median error [%]",
+        "median half-width [%]",
+    )
+    return Table("Do 95 % intervals of θ_p after ten seconds of usual flight contain the truth?", header, lines)
 
 
 def expectation_table(rows: Results) -> Table:
     """Return a line for each world: the share of other flights with an error in the expected interval."""
     columns = {name.split(" ", 1)[1]: lambda own, name=name: f"{known(own, name).mean():.0%}" for name in HORIZONS}
-    title = "Do 80 % intervals of the errors to expect hold those of other flights?"
+    title = "Do 80 % intervals of the error to expect contain the errors of other flights?"
     return tabulate(title, _expecting(rows), columns, ("world",))
 
 
@@ -82,7 +91,7 @@ def method_table(rows: Results) -> Table:
         for key, each in own.group("world", "change", "method").items() if len(own.unique("method")) > 1 else ():
             ratio = each.numbers("ratio")
             numbers = each.numbers("test_mse").mean(), ratio.mean(), ratio.max(), np.median(each.numbers("seconds"))
-            lines.append((*key, *(f"{number:.3g}" for number in numbers)))
+            lines.append((*map(label, key), *(f"{number:.3g}" for number in numbers)))
     header = ("world", "change", "method", "test error", "over the source's", "worst", "processor time [s], median")
     return Table("Methods on the same ten seconds", header, lines)
 
@@ -98,11 +107,11 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
             ratio = own.numbers("ratio")
             y = np.full(len(ratio), names.index(tuple(case)))
             axes.plot(ratio, y, "o", ms=4, alpha=0.7, color=METHODS["adapted"], label="adapted, each flight")
-        axes.set(xscale="log", title=str(world), xlabel="test error over the source's")
-    words = {"nothing": "no change", "moving": "usual flight", "outliers": "usual flight with outliers"}
-    name_lines(panels[0], [": ".join(words.get(name) or name.replace("_", " ") for name in case) for case in names])
+        axes.set(xscale="log", title=label(str(world)), xlabel="error / error of the source")
+    name_lines(panels[0], [label(*case) for case in names])
     caption = "Error of the adapted model over the source's, by the change and the flight that it adapted to"
-    return {"ratios": (legend_below(figure, "Is an adapted model ever worse than its source?"), caption)}
+    title = "Is an adapted model ever worse than its source? (lower is better)"
+    return {"ratios": (legend_below(figure, title), caption)}
 
 
 def _expecting(rows: Results) -> dict[tuple, Results]:

@@ -71,9 +71,7 @@ def test_contradictory_values_are_refused_before_any_flight(tmp_path):
 def test_tables_have_a_line_per_value_and_domain():
     norm, solver = ablation_tables(ROWS, TRUTH)
     assert [line[:2] for line in norm.lines] == [
-        (target, value)
-        for target in ("parameter shift, 100", "external force, 100")
-        for value in ("batch (default)", "none")
+        (target, value) for target in ("other inertia, 100", "side wind, 100") for value in ("batch (default)", "none")
     ]
     assert [line[1] for line in solver.lines] == ["heun", "heun"]
     assert norm.lines[0][4].startswith("0.15 ")  # of 0.1 and 0.2
@@ -87,7 +85,7 @@ def test_the_conclusion_says_what_helps_what_harms_and_what_does_nothing():
     values += trial("norm", "batch", True, [1e-3, 2e-3], 0.1)
     values += trial("weight", "0", True, [1e-3, 2e-3], 0.1) + trial("weight", "1", False, [1e-3, 2e-3], 0.102)
     best, worst, idle = conclusion(values)
-    assert best.startswith("Best of all is norm = none: 0.50 times (parameter shift), 0.50 times (external force)")
+    assert best.startswith("Best of all is norm = none: 0.50 times (other inertia), 0.50 times (side wind)")
     assert worst.startswith("What harms most is norm = layer: 3.00 times")
     assert idle == "Changes nothing by more than 5%: weight."
     assert conclusion(ROWS.where(value="batch")) == []
@@ -95,7 +93,7 @@ def test_the_conclusion_says_what_helps_what_harms_and_what_does_nothing():
 
 def test_figure_has_a_panel_per_domain_and_a_line_per_value():
     drawn = ablation(ROWS.where(choice="norm"), "norm", {"external_force": 0.05})
-    assert [axes.get_title() for axes in drawn.axes] == ["Parameter shift", "External force"]
+    assert [axes.get_title() for axes in drawn.axes] == ["Other inertia", "Side wind"]
     assert [label.get_text() for label in drawn.axes[0].get_yticklabels()] == ["batch (default)", "none"]
 
 

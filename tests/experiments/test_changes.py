@@ -53,7 +53,7 @@ def test_regret_counts_candidates_alone():
 
 def test_tables_have_a_line_for_each_change_and_each_method():
     found = rows()
-    assert [line[0] for line in regret_table(found).lines] == ["parameter_shift", "external_force"]
+    assert [line[0] for line in regret_table(found).lines] == ["other inertia", "side wind"]
     assert regret_table(found).lines[0][-1] == "theta 36"
     assert [line[0] for line in error_table(found).lines] == ["auto", "source", "theta", "force", "fine_tune"]
 

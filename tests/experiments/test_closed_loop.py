@@ -68,7 +68,7 @@ def models():
 
 @pytest.fixture(scope="module")
 def flights(models, tmp_path_factory):
-    """A figure-8 under the parameter shift, flown once and then found in the cache."""
+    """A figure-8 with the other inertia, flown once and then found in the cache."""
     stages = Stages(tmp_path_factory.mktemp("closed_loop"), Console(quiet=True))
     scenarios = [Scenario(PARAMETER_SHIFT, "figure_eight", 0.0, models[0], 10.0)]
     runs = [fly_all(scenarios, CONTROLLER, SECONDS, stages)[0] for _ in range(2)]

@@ -14,7 +14,7 @@ from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 
 FEW, SEEDS = 100, 3
-AGENTS = {  # position RMSE [m] under the parameter shift and in the wind
+AGENTS = {  # position RMSE [m] with the other inertia and in the wind
     Agent("nominal"): (0.1, 0.4),
     Agent("oracle"): (0.01, 0.05),
     Agent("hybrid"): (0.02, 0.4),
@@ -176,7 +176,7 @@ def test_tables_have_a_line_per_agent_and_count_crashes():
     assert set(lines) == {agent.name for agent in AGENTS}
     assert lines["nominal physics"][0] == "10.00"
     assert lines["invariant hybrid, N = 100"][0] == "1.11 ± 0.01"
-    wind = next(table for table in tables(rows) if "RMSE [cm]" in table.title and "external force" in table.title)
+    wind = next(table for table in tables(rows) if "RMSE [cm]" in table.title and "side wind" in table.title)
     assert {line[0]: line[1] for line in wind.lines}["hybrid, N = 100"] == "∞ (3 of 3 seeds crashed, median ∞)"
     assert len(tables(ROWS)) == 2 * (5 + 1)
     assert len(gap_tables(ROWS)) == 2

@@ -78,7 +78,7 @@ def test_ranking_has_a_line_per_method_best_first():
     assert methods_of(shift)[-1] == "hybrid, source-only"
     assert set(methods_of(force)) == set(methods_of(shift))
     assert shift.yaxis_inverted()
-    assert (shift.get_xscale(), shift.get_title(), force.get_title()) == ("log", "Parameter shift", "External force")
+    assert (shift.get_xscale(), shift.get_title(), force.get_title()) == ("log", "Other inertia", "Side wind")
     dots = [line for line in shift.lines if line.get_marker() == "o"]
     assert [len(line.get_xdata()) for line in dots] == [3] * len(methods_of(shift))
     assert dots[0].get_xdata() == pytest.approx([3.26e-3 * factor for factor in (0.99, 1, 1.01)])

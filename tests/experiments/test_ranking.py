@@ -58,8 +58,8 @@ def test_c9_holds_for_the_papers_numbers():
     assert claim.holds is True
     for number in ("0.00326", "0.00368", "0.00376", "0.00264", "0.00402", "0.00453"):
         assert number in claim.measured
-    assert "parameter shift: " in claim.measured
-    assert "external force: " in claim.measured
+    assert "other inertia: " in claim.measured
+    assert "side wind: " in claim.measured
 
 
 @pytest.mark.parametrize("domain", DOMAINS)
@@ -134,10 +134,10 @@ def test_page_of_a_comparison(tmp_path):
     write_report(tmp_path, report)
     page = (tmp_path / "report.md").read_text()
     headings = re.findall(r"^(## .*|<details.*)$", page, flags=re.MULTILINE)
-    assert headings[0].startswith("## Test error L^T_MSE, parameter shift (experiment 1 of the paper; 3 seeds")
+    assert headings[0].startswith("## Test error L^T_MSE, other inertia (experiment 1 of the paper; 3 seeds")
     shown = " ".join(headings)
-    assert "Test error L^T_MSE, external force (experiment 2 of the paper; 3 seeds" in shown
-    assert all(f" θ_p, {domain}" in shown for domain in ("parameter shift", "external force"))
+    assert "Test error L^T_MSE, side wind (experiment 2 of the paper; 3 seeds" in shown
+    assert all(f" θ_p, {domain}" in shown for domain in ("other inertia", "side wind"))
     assert "<summary>Claims of the paper" in shown
     assert page.count("| C9 |") == 1
     assert "N, target trajectories" not in page

@@ -83,8 +83,8 @@ def test_parameters_of_two_domains_have_the_truth_of_each():
     truth = {"parameter_shift": TRUTH, "external_force": TRUTH | {"Ix": 0.029}}
     shift, force = parameters(both, truth)
     assert (shift.lines[-1][3], force.lines[-1][3]) == ("0.04", "0.029")
-    assert "parameter shift" in shift.title
-    assert "external force" in force.title
+    assert "other inertia" in shift.title
+    assert "side wind" in force.title
 
 
 def test_page_has_everything_once(tmp_path):

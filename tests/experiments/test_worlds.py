@@ -102,7 +102,7 @@ def test_each_claim_fails_where_it_should(change, fails):
 
 def test_the_worst_case_comes_first_and_the_conclusion_names_it():
     found = rows(nothing=0.5, drag=9.0)
-    assert [line[1] for line in ratio_table(found).lines] == ["drag", "nothing"]
+    assert [line[1] for line in ratio_table(found).lines] == ["drag", "no change"]
     first, second = conclusion(found)
     assert first.startswith("In 1 of 2 cases")
     assert second == "The worst is iris drag moving (world, change, flight): 18 times."
