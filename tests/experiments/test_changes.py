@@ -1,13 +1,9 @@
 """The claims and tables about what the windows choose, and the command that makes them."""
 
-import json
-
 import numpy as np
 import pytest
-from smoke import experiments
 
-from experiments.changes import ChangesConfig
-from experiments.paper.regret import CLAIMS, error_table, of_each_case, regret, regret_table
+from experiments.paper.regret import CLAIMS, of_each_case, regret
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 
@@ -49,27 +45,3 @@ def test_regret_counts_candidates_alone():
     np.testing.assert_allclose(regret(found), 1.0)  # fine-tuning is no candidate
     np.testing.assert_allclose(of_each_case(found, "fine_tune"), 0.01)
     np.testing.assert_allclose(regret(rows(taken="force")), 0.06 / 0.05)
-
-
-def test_tables_have_a_line_for_each_change_and_each_method():
-    found = rows()
-    assert [line[0] for line in regret_table(found).lines] == ["other inertia", "side wind"]
-    assert regret_table(found).lines[0][-1] == "theta 36"
-    assert [line[0] for line in error_table(found).lines] == ["auto", "source", "theta", "force", "fine_tune"]
-
-
-def test_one_size_is_asked_for():
-    with pytest.raises(ValueError, match="--sizes must be one number"):
-        ChangesConfig(sizes=(100, 300))
-
-
-@pytest.mark.slow
-def test_the_command_writes_a_row_for_every_candidate_and_method(tmp_path):
-    (run,) = experiments("changes", "changes", folder=tmp_path)
-    assert run.returncode == 0, run.stderr
-    report = json.loads((tmp_path / "out" / "changes" / "report.json").read_text())
-    names = {row["candidate"] for row in report["rows"]}
-    assert {"source", "theta", "efficiency", "all", "network", "fine_tune"} <= names
-    assert sum(row["taken"] for row in report["rows"]) == 1
-    assert [each["id"] for each in report["claims"]] == ["A1", "A2", "A3", "A4"]
-    assert [each["id"] for each in report["not_judged"]] == ["A5"]  # with one draw there is no other flight

@@ -5,7 +5,7 @@ from reports import TRUTH, changed, make_rows, verdicts
 
 from experiments.paper.claims import claims
 from experiments.paper.lanes import DOMAINS, TAGS, with_rho
-from experiments.reporting.claims import Claim, Undecided, Verdict, all_of, evaluate, to_json
+from experiments.reporting.claims import all_of
 from experiments.reporting.results import Results
 
 
@@ -108,17 +108,3 @@ def test_claims_are_undecided_without_the_rows_they_need():
 @pytest.mark.parametrize(("parts", "holds"), [([True, True], True), ([True, None], None), ([None, False, True], False)])
 def test_all_of_is_a_conjunction_of_three_values(parts, holds):
     assert all_of((part, "") for part in parts)[0] is holds
-
-
-def test_json_separates_what_lacks_data():
-    def lacks(_):
-        raise Undecided("no rows")
-
-    noise = Claim("C3", "noise", lambda x: (None, f"{x} (0 … 1)"))
-    found = evaluate([Claim("C2", "less", lambda x: (x < 1, f"{x}")), noise, Claim("C10", "?", lacks)], 0.5)
-    assert found[2] == Verdict("C10", "?", None, "no rows", lacks_data=True)
-    assert to_json(found)["claims"] == [
-        {"id": "C2", "text": "less", "holds": True, "measured": "0.5"},
-        {"id": "C3", "text": "noise", "holds": None, "measured": "0.5 (0 … 1)"},
-    ]
-    assert to_json(found)["not_judged"] == [{"id": "C10", "text": "?", "why": "no rows"}]

@@ -9,8 +9,6 @@ from smoke import experiments
 from test_experiments import ROW
 
 import hybrid_jax
-from experiments import comparison
-from experiments.paper.config import TABLE_SIZES
 
 pytestmark = pytest.mark.slow
 
@@ -66,9 +64,3 @@ def test_what_a_method_does_not_adapt_stays_as_it_was(folder, domain):
         assert not eqx.tree_equal(adapted.residual, source.residual)
     np.testing.assert_array_equal(last.residual.weight_in, source.residual.weight_in)
     assert eqx.tree_equal(field(folder, domain, "expert_augmentation", "source_only", 0).expert.field, source)
-
-
-def test_other_draws_need_no_other_option():
-    assert comparison.ComparisonConfig().pooled() == max(TABLE_SIZES)
-    assert comparison.ComparisonConfig(sizes=(2000,)).pooled() == 2000
-    assert comparison.ComparisonConfig(draw="contiguous", draws=4).shared_pool() is None

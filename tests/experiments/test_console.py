@@ -39,18 +39,6 @@ def test_no_word_or_number_is_broken(name):
             assert {word for line in printed for word in line.split() if not set(word) <= {"─"}} <= words
 
 
-def test_a_table_that_is_too_wide_is_turned_or_cut():
-    numbers = [[f"{n}", *(f"{i}.123 ± 0.001" for i in range(5))] for n in (100, 1000)]
-    table = Table("Errors", ("N", *(f"method_{i}, fine-tuned" for i in range(5))), numbers)
-    text = io.StringIO()
-    print_table(Console(file=text, width=60), table, 5)
-    assert "method_4," in text.getvalue()
-    assert "4.123±0.001" in text.getvalue()
-    text = io.StringIO()
-    print_table(Console(file=text, width=60), table)
-    assert text.getvalue().splitlines()[-1] == "Not shown here: columns: 2"
-
-
 def test_a_terminal_shows_a_headline_one_table_and_the_reports_path(tmp_path):
     text = io.StringIO()
     report = replace(make_report(make_rows()), warnings=["Look twice."])
@@ -83,10 +71,3 @@ def test_a_file_says_after_a_second_what_is_being_done_and_a_terminal_at_once(mo
         assert "a stage: flying, 0:00 elapsed" in text.getvalue()
         line.show_share("flying", 0.5)
         assert str(line).startswith("a stage: flying 50%, 0:0")
-
-
-def test_a_short_stage_adds_no_line_to_a_file():
-    text = io.StringIO()
-    with Line("a stage", Console(file=text, width=80)) as line:
-        line.show_parts(1, 2)
-    assert text.getvalue() == ""

@@ -1,12 +1,9 @@
 """Coverage of intervals pooled over sources, and the command that measures it."""
 
-import json
-
 import numpy as np
 import pytest
-from smoke import experiments
 
-from experiments.coverage import CLAIMS, CoverageConfig, _compared, conclusion, pooled_table
+from experiments.coverage import CLAIMS, _compared
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 
@@ -37,20 +34,6 @@ def test_the_claim_fails_from_above_where_intervals_are_too_wide(change, holds):
     assert verdict.holds is holds
 
 
-@pytest.mark.parametrize(("inside", "means"), [(97, "So they are not too narrow"), (80, "something acts")])
-def test_the_conclusion_says_how_many_hold_and_where_fewest(inside, means):
-    first, second = conclusion(rows(inside))
-    assert first == f"Of 100 pooled 95 % intervals {inside}% contain the true value, of single sources 50%."
-    assert second.startswith(f"The fewest do for weak_rotor 1 Ix (change, noise, parameter): {inside}%")
-    assert means in second
-
-
-def test_a_parameter_that_was_not_fitted_does_not_count():
-    of_ix, of_k = pooled_table(rows(97)).lines
-    assert of_ix[3:] == ("100", "97", "50", "+1.60", "2.00")
-    assert of_k[3:] == ("0", "–", "–", "–", "–")
-
-
 def test_pooled_intervals_have_their_coverage_where_sources_differ_and_single_ones_have_not():
     """Each source absorbed something else: its estimate is off by as much as the flights' noise, and more."""
     rng = np.random.default_rng(0)
@@ -58,17 +41,3 @@ def test_pooled_intervals_have_their_coverage_where_sources_differ_and_single_on
     found = [_compared(row + rng.normal(0, 0.01), np.full(3, 0.01), 0.0) for row in shifts]
     assert np.mean([row["inside"] for row in found]) > 0.93
     assert np.mean([row["alone"] for row in found]) < 0.75
-
-
-def test_three_sources_are_needed():
-    with pytest.raises(ValueError, match="--seeds must be at least 3, got 2"):
-        CoverageConfig(seeds=2)
-
-
-@pytest.mark.slow
-def test_the_command_writes_a_row_for_every_flight_and_parameter(tmp_path):
-    (run,) = experiments("coverage", "coverage", folder=tmp_path)
-    assert run.returncode == 0, run.stderr
-    report = json.loads((tmp_path / "out" / "coverage" / "report.json").read_text())
-    assert [row["parameter"] for row in report["rows"]] == ["Ix", "Iy", "k"]
-    assert len(report["known_body"]) == 12  # two truths, noise on two sets of states, three parameters

@@ -1,11 +1,9 @@
 """The comparison of a designed flight with others: its verdicts and tables, and the command."""
 
-import json
 import math
 
 import numpy as np
 import pytest
-from smoke import experiments, refused, unbegun
 
 from experiments.excitation.results import (
     CLAIMS,
@@ -13,10 +11,8 @@ from experiments.excitation.results import (
     FLIGHTS,
     RANDOM,
     Evidence,
-    conclusion,
     margins,
     ratio,
-    tables,
 )
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
@@ -62,39 +58,3 @@ def test_margins_are_measured_from_the_middle_of_the_box():
     assert found["tilt [rad]"] == pytest.approx((0.3, 0.6), rel=1e-3)
     assert found["speed [m/s]"] == pytest.approx((2.0, 4.0))
     assert found["yaw [rad]"][0] == pytest.approx(0, abs=1e-6)
-
-
-def test_an_interval_that_says_nothing_is_shown_as_wide():
-    wide = Results([{**row, "half_width": math.inf} for row in rows(0.3, 1)], ("flight", "parameter", "seed"))
-    assert all("> 1000" in line[1:] for line in tables(wide)[0].lines)
-
-
-def test_beside_an_unbounded_interval_any_other_is_nothing():
-    given = Results([{**row, "half_width": math.inf if row["flight"] == "hover" else 1.0} for row in rows(0.3)])
-    assert ratio(given, "hover").value == 0
-    assert "more than 1000 times narrower than after hover" in conclusion(given)[0]
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--change", "rain"], "--change must be one of source, parameter_shift"),
-        (["--noise", "0"], "--noise must be above 0"),
-        (["--seconds", "30"], "--seconds must be from 3 to 11"),
-        (["--parameters", "k", "k"], "--parameters must be at least one, each different"),
-        (["--bounds.low", "0", "0", "5"], "low must be below high, else the box is empty"),
-    ],
-)
-def test_bad_options_are_refused(options, said):
-    assert said in refused(unbegun("excitation", *options), "excitation")
-
-
-@pytest.mark.slow
-def test_the_command_writes_a_row_for_every_flight_parameter_and_seed(tmp_path):
-    (run,) = experiments("excitation", "excitation", folder=tmp_path)
-    assert run.returncode == 0, run.stderr
-    out = tmp_path / "out" / "excitation"
-    report = json.loads((out / "report.json").read_text())
-    assert len(report["rows"]) == len(FLIGHTS) * 3 * 2  # parameters, seeds
-    assert min(report["design"]["margins"].values()) >= 0
-    assert all((out / name).stat().st_size for name in report["figures"])

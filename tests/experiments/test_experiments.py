@@ -168,6 +168,24 @@ REFUSED = {
         (("--seeds", "2"), "--seeds must be at least 3, got 2"),
         (("--repeats", "0"), "--repeats must be an integer of at least 1, got 0"),
     ],
+    "changes": [(("--sizes", "100", "300"), "--sizes must be one number")],
+    "excitation": [
+        (("--change", "rain"), "--change must be one of source, parameter_shift"),
+        (("--noise", "0"), "--noise must be above 0"),
+        (("--seconds", "30"), "--seconds must be from 3 to 11"),
+        (("--parameters", "k", "k"), "--parameters must be at least one, each different"),
+        (("--bounds.low", "0", "0", "5"), "low must be below high, else the box is empty"),
+    ],
+    "online": [
+        (("--latency", "0.015"), "latency must be a multiple"),
+        (("--seconds", "1"), "--seconds must be"),
+        (("--references", "hover", "hover"), "--references must be at least one, each different"),
+    ],
+    "reaction_diffusion": [
+        (("--points", "4"), "--points must be at least 8"),
+        (("--sizes", "2", "1"), "--sizes must be in ascending order"),
+        (("--steps", "0"), "--steps must be an integer of at least 1"),
+    ],
     "closed_loop": [
         (("--references", "hover", "hover"), "--references must be at least one, each different"),
         (("--references", "hover", "--away-references", "low_pass"), "--away-references must be among --references"),

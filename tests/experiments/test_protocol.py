@@ -3,21 +3,15 @@
 import math
 from dataclasses import replace
 from functools import partial
-from unittest import mock
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from rich.console import Console
 
-from experiments.paper import study
-from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, settings, subsets
-from experiments.paper.config import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
-from experiments.paper.lanes import fit_of
-from experiments.paper.study import SOLVED, drawn_splits, placeholder, pretrained, target_splits
-from experiments.runner.cache import sweep_identity
-from experiments.runner.stages import stages_of
+from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, subsets
+from experiments.paper.config import PAPER, PRESETS, AdaptationConfig, Stopping, column
+from experiments.paper.study import drawn_splits, placeholder, pretrained
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sim.flight import SplitSpec
@@ -87,18 +81,6 @@ def test_the_rate_of_theta_in_fine_tuning_reaches_fine_tuning_only(model):
             np.testing.assert_allclose(physics, 0.5 if mode == "fine_tuned" else 1e-2, rtol=1e-6)
 
 
-def test_other_input_scaling_is_another_pretraining():
-    windows = placeholder(SplitSpec(2, 10))
-    data = Dataset({"train": windows, "validation": windows}, {})
-    identities = {
-        sweep_identity(
-            *pretraining("no_physics", fresh_fields("no_physics", IRIS, config), config), settings(config), data
-        )
-        for config in (SMOKE, replace(SMOKE), replace(SMOKE, inputs="raw"))
-    }
-    assert len(identities) == 2
-
-
 @pytest.mark.parametrize(
     ("model", "minimum", "patience"), [("hybrid", 100, 20), ("no_physics", 300, 50), ("physics_only", 100, 20)]
 )
@@ -128,33 +110,6 @@ def test_pretraining_goes_on_from_the_best_with_all_rates_times_each_decay():
     for each, factor in zip(rates, (1, 0.1, 0.01), strict=True):
         np.testing.assert_allclose(each.physics, factor * 1e-2, rtol=1e-6)
         np.testing.assert_allclose(each.residual, factor * 1e-4, rtol=1e-6)
-
-
-@pytest.mark.parametrize("model", SOLVED)
-def test_programs_compiled_ahead_are_those_that_solve(model, monkeypatch):
-    config, asked, ran = replace(SMALL, sizes=(100, 300)), [], []
-
-    def kind(*arguments):
-        leaves, structure = jax.tree.flatten(arguments)
-        return structure, [(leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves]
-
-    class Found:
-        def __call__(self, *arguments):
-            ran.append(kind(*arguments))
-            return np.zeros(config.seeds)
-
-        def lower(self, *arguments):
-            asked.append(kind(*arguments))
-            return mock.Mock()
-
-    monkeypatch.setattr(study, "_solved", Found())
-    study._compile_solved(model, IRIS, config)
-    start = study.source_of(model)
-    learned = fit_of(pretraining(start, fresh_fields(start, IRIS, config), config)[0])
-    target = Dataset({name: placeholder(spec) for name, spec in target_splits(config).items()}, {})
-    study.solved("", SOLVED[model], learned.fields, config, stages_of(config, Console(quiet=True)), target)
-    assert len(asked) == len(config.sizes)
-    assert asked == ran
 
 
 def test_subsets_are_nested_by_size_differ_by_seed_and_agree_between_models():

@@ -1,15 +1,12 @@
 """The comparison: claim C9, the ranking beside the paper's Table 2, the page."""
 
 import math
-import re
 
 import pytest
-from reports import TRUTH, make_report, row
+from reports import TRUTH, row
 
 from experiments.paper.claims import claims
 from experiments.paper.lanes import BASELINES, DOMAINS, TAGS, with_rho
-from experiments.paper.tables import ranking
-from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
 
 # As in Table 2, and other baselines behind: means for the hybrid, the best of the seeds for the rest.
@@ -98,48 +95,3 @@ def test_c9_is_undecided_without_a_domain_or_a_method(lacks):
     claim = verdict(compared_rows().where(lambda row: not lacks(row)))
     assert claim.holds is None
     assert "there are no rows of" in claim.measured
-
-
-def test_ranking_of_the_papers_rows_has_the_papers_numbers():
-    quoted = (
-        ["3.26e-03 ± 2.66e-05", "3.68e-03 (smallest)", "3.76e-03 (smallest)"],
-        ["2.64e-03 ± 1.56e-04", "4.02e-03 (smallest)", "4.53e-03 (smallest)"],
-    )
-    tables = ranking(compared_rows())
-    for table, paper in zip(tables, quoted, strict=True):
-        methods = [line[0] for line in table.lines]
-        assert methods[:3] == ["hybrid", "Expert Augmentation", "physics-only"]
-        assert len(set(methods)) == len(methods) == len(ERRORS)
-        assert [line[5] for line in table.lines] == [*paper, *["–"] * (len(ERRORS) - 3)]
-        for line in table.lines[:3]:
-            assert line[4] == line[6]  # ratio to physics-only's smallest, ours and the paper's
-        assert float(table.lines[2][2]) == float(paper[2].split()[0])
-        assert {line[1] for line in table.lines if line[0] in ("hybrid, source-only", "Expert Augmentation")} == {"–"}
-    assert [line[6] for line in tables[0].lines[:3]] == ["0.867 (mean)", "0.979 (smallest)", "1 (smallest)"]
-
-
-def test_methods_with_infinite_errors_are_last():
-    rows = spoilt(compared_rows(), "theta_p_only", lambda row: math.inf if row["seed"] == 1 else row["test_mse"])
-    rows = spoilt(rows, "physics_only", lambda row: math.nan, "external_force")
-    shift, force = ranking(rows)
-    worst = ("θ_p only", "100", "0.005", "∞ (1 of 3 seeds not finite, median 0.0051)", "1.33 (smallest)")
-    assert shift.lines[-1][:5] == worst
-    assert force.lines[-1][:5] == ("physics-only", "100", "∞", "∞ (3 of 3 seeds not finite, median ∞)", "–")
-    assert {line[4] for line in force.lines} == {"–"}
-
-
-def test_page_of_a_comparison(tmp_path):
-    report = make_report(compared_rows(), "comparison", TRUTHS, figures={"standings.png": "Every seed"}, notes=["A."])
-    (tmp_path / "standings.png").write_bytes(b"\x89PNG")
-    write_report(tmp_path, report)
-    page = (tmp_path / "report.md").read_text()
-    headings = re.findall(r"^(## .*|<details.*)$", page, flags=re.MULTILINE)
-    assert headings[0].startswith("## Test error L^T_MSE, other inertia (experiment 1 of the paper; 3 seeds")
-    shown = " ".join(headings)
-    assert "Test error L^T_MSE, side wind (experiment 2 of the paper; 3 seeds" in shown
-    assert all(f" θ_p, {domain}" in shown for domain in ("other inertia", "side wind"))
-    assert "<summary>Claims of the paper" in shown
-    assert page.count("| C9 |") == 1
-    assert "N, target trajectories" not in page
-    assert all(page.count(f"| {name}: ") == 1 for name in ("Expert Augmentation", "θ_p only", "last layer (ridge)"))
-    assert "✓ holds" in page

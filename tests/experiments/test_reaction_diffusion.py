@@ -1,14 +1,11 @@
 """Reaction-diffusion equations: the generator, the jobs, the smallest preset, and what the command refuses."""
 
-import json
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from smoke import experiments, refused, unbegun
 
 import hybrid_jax as hj
-from experiments.reaction_diffusion.config import CASES, POINTWISE
+from experiments.reaction_diffusion.config import POINTWISE
 from experiments.reaction_diffusion.models import pieces
 from experiments.reaction_diffusion.report import claims, tables
 from experiments.reaction_diffusion.systems import (
@@ -102,29 +99,3 @@ def test_claims_are_decided_by_the_rows():
     assert verdicts["G2"] is False  # one seed is off by 0.3 %
     assert verdicts["C8"] is False  # twice the error
     assert len(tables(results)) == 3
-
-
-@pytest.mark.slow
-def test_the_smallest_preset_reports(tmp_path):
-    (run,) = experiments("reaction_diffusion", "reaction_diffusion", folder=tmp_path)
-    assert run.returncode == 0, run.stderr
-    report = json.loads((tmp_path / "out/reaction_diffusion/report.json").read_text())
-    assert {each["part"] for each in report["rows"]} == {"forecast", "shifted", "gray_scott"}
-    assert set(report["figures"]) == {"forecasts.png", "scores.png"}
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--points", "4"), "--points must be at least 8"),
-        (("--sizes", "2", "1"), "--sizes must be in ascending order"),
-        (("--sizes", "1", "1"), "--sizes must be at least one, each different"),
-        (("--steps", "0"), "--steps must be an integer of at least 1"),
-    ],
-)
-def test_bad_options_are_refused_in_one_line(options, message):
-    assert message in refused(unbegun("reaction_diffusion", *options), "reaction_diffusion")
-
-
-def test_every_case_has_a_name_of_its_own():
-    assert len({case.name for case in CASES}) == len(CASES)

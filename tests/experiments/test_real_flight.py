@@ -1,7 +1,6 @@
 """Folds around what the tool learns: which flights train and test, what is refused, and what a run writes."""
 
 import json
-import os
 import re
 from dataclasses import fields, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from smoke import command, experiments, refused
 
 from experiments.real_flight.__main__ import LISTS, main, prepare
 from experiments.real_flight.config import PRESETS, RealFlightConfig
-from experiments.real_flight.report import cells, expected_table, parameter_table, pooled, verdicts
+from experiments.real_flight.report import cells, pooled, verdicts
 from experiments.real_flight.simulated import vehicle_toml
 from experiments.real_flight.study import ADAPTED, LEARNED, TAGS, make_folds, run_folds
 from experiments.reporting import names
@@ -27,14 +26,11 @@ from hybrid_jax.cli.errors import UNITS
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 from hybrid_jax.flights.windows import (
-    cut_windows,
     manoeuvre_of,
     require_common_interval,
 )
 from hybrid_jax.vehicle import IRIS
 
-ROOT = Path(__file__).parents[2]
-REAL = Path(os.environ.get("HYBRID_JAX_FLIGHTS", ROOT.parent / "shared" / "flights"))
 CASES = {
     "by flight": ("flight", None),
     "by manoeuvre": ("manoeuvre", None),
@@ -51,11 +47,6 @@ def test_every_flight_is_tested_once_by_models_of_others(case):
     of = {"flight": lambda log: log.name, "manoeuvre": manoeuvre_of}[by]
     for fold in folds:
         assert not {of(log) for log in fold.train} & {of(log) for log in fold.test}
-
-
-def test_windows_stop_at_gaps():
-    gap = LOGS[1][[*range(20), *range(40, SAMPLES)]]
-    assert len(cut_windows([LOGS[0], gap], 25)) == 65 + 25
 
 
 @pytest.mark.parametrize(
@@ -197,26 +188,6 @@ def test_verdicts_are_decided_by_ratios_of_errors_over_flights_and_seeds(noise, 
         assert float(ratio) == pytest.approx(0.25, rel=0.03)
     else:
         assert found["F2"].holds is None
-
-
-def test_parameters_and_expected_errors_are_means_over_those_that_have_them():
-    theta = [{"Ix": 2.0, "drag": 3.0}, {"Ix": 3.0, "drag": None}]
-    rows = [
-        row(LEARNED, 1.0, flight=flight, theta=each, theta_interval={name: [1.0, 5.0] for name in each})
-        | {"expected": dict.fromkeys(UNITS, 2.0), "inside": dict.fromkeys(UNITS, flight == "a")}
-        for flight, each in zip("ab", theta, strict=True)
-    ]
-    found = cells(Results(rows, TAGS))
-    assert [line[-1] for line in parameter_table(found).lines] == ["2.5 ± 0.7 [1, 5]", "nan ± nan [1, 5]"]
-    assert expected_table(found).lines == [("hybrid-jax fit", *["2: 1, 1 of 2"] * 4)]
-
-
-@pytest.mark.skipif(not (REAL / "nanodrone").exists(), reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder")
-def test_manoeuvres_of_real_flights_are_held_out():
-    folder = REAL / "nanodrone"
-    _, sets = prepare(replace(CONFIG, vehicle=folder / "vehicle.toml", source=folder / "train"))
-    folds = make_folds(sets["source"].logs, None, replace(CONFIG, folds_by="manoeuvre"))
-    assert {fold.name for fold in folds} == {"chirp", "random", "square"}
 
 
 @pytest.mark.slow

@@ -10,13 +10,11 @@ from hypothesis import strategies as st
 from reports import ODD_ROWS, TRUTH, changed, make_report, make_rows
 
 from experiments.paper.claims import DOMAINS_OF
-from experiments.paper.figures import HOME, scores
 from experiments.paper.lanes import by_altitude
 from experiments.paper.study import placeholder
-from experiments.paper.tables import altitudes, parameters, run_notes
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
-from experiments.reporting.tables import measured, spread_text
+from experiments.reporting.tables import measured
 from experiments.runner.run_record import PACKAGES
 from hybrid_jax.sim.flight import SplitSpec
 
@@ -40,15 +38,6 @@ def test_report_json_keeps_the_contract(tmp_path):
     assert record["truth_theta"] == TRUTH
 
 
-def test_parameters_have_the_spread_over_seeds_and_the_truth():
-    cell = make_rows().where(model="hybrid", mode="fine_tuned", n_train=100)
-    thetas = [TRUTH | {"Ix": 0.0398 + offset} for offset in (-4e-4, 0.0, 4e-4)]
-    rows = Results([{**row, "theta": theta} for row, theta in zip(cell, thetas, strict=True)])
-    (table,), (unknown,) = parameters(rows, TRUTH), parameters(rows, None)
-    assert table.lines[0][3:5] == unknown.lines[0][3:5] == ("0.0398 ± 0.0004", "0.02 ± 0")
-    assert table.lines[-1] == ("truth", "", "", "0.04", "0.02", "8.5e-06")
-
-
 def test_errors_by_altitude_are_means_over_the_windows_of_each_band():
     windows = placeholder(SplitSpec(3, 10))
     windows.x[..., 2] = [[1.0], [1.0], [0.3]]
@@ -59,32 +48,6 @@ def test_errors_by_altitude_are_means_over_the_windows_of_each_band():
     np.testing.assert_array_equal(found["test_mse_high"], [2.0, 2.0])
     np.testing.assert_array_equal(found["test_mse_middle"], [5.0, math.inf])
     assert np.isnan(found["test_mse_low"]).all()
-
-
-def test_altitudes_and_the_sources_own_error_are_in_table_and_figure():
-    assert altitudes(make_rows()) == []
-    ends = {"test_mse_low": 0.5, "test_mse_middle": 0.25, "test_mse_high": math.nan}
-    home = {"source_mse": 0.015, "source_mse_low": 0.2, "source_mse_middle": 0.01, "source_mse_high": math.nan}
-    rows = Results([{**row, **ends, **(home if row["mode"] == "source_only" else {})} for row in make_rows()])
-    (table,) = altitudes(rows)
-    lines = {line[:3]: line[3:] for line in table.lines}
-    tuned = lines["hybrid", "fine-tuned", "100"]
-    assert tuned == ("0.0220 ± 0.0004", "0.5 ± 0", "0.25 ± 0", "–")
-    assert lines["hybrid", "source-only, on source flights", "–"][0].startswith("0.015")
-    assert {key[2] for key in lines} == {"–", "100", "1000"}  # the smallest and the largest N
-    left, _ = scores(rows, "Scores").axes
-    drawn = dict(zip(*reversed(left.get_legend_handles_labels()), strict=True))
-    assert drawn[HOME].get_ydata()[0] == 0.015
-    assert left.get_ylim()[0] <= 0.0075
-
-
-def test_parameters_of_two_domains_have_the_truth_of_each():
-    both = make_rows() + make_rows(domain="external_force")
-    truth = {"parameter_shift": TRUTH, "external_force": TRUTH | {"Ix": 0.029}}
-    shift, force = parameters(both, truth)
-    assert (shift.lines[-1][3], force.lines[-1][3]) == ("0.04", "0.029")
-    assert "other inertia" in shift.title
-    assert "side wind" in force.title
 
 
 def test_page_has_everything_once(tmp_path):
@@ -112,30 +75,11 @@ def test_page_has_everything_once(tmp_path):
     assert "a &lt; b" in html
 
 
-def test_notes_count_diverged_runs_and_name_their_epochs():
-    rows = changed(make_rows(), "no_physics", "fine_tuned", 500, status="diverged", epochs=7)
-    notes = run_notes(changed(rows, "hybrid", "fine_tuned", 100, status="diverged", epochs=1))
-    assert notes[1].startswith(f"6 of {len(rows)} runs met a non-finite loss, in epoch 1, 7, and count with their best")
-    assert run_notes(make_rows())[1].startswith(f"0 of {len(rows)} runs met a non-finite loss and count")
-
-
 def test_nothing_is_written_if_a_value_has_no_json_form(tmp_path):
     for extra in ({"rows": 1}, {"thing": object()}, {"text": "\ud800"}):
         with pytest.raises(ValueError):  # noqa: PT011  three refusals, three messages
             write_report(tmp_path / "new", make_report(make_rows(), extra=extra))
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [([0.1, 0.3], "2.00e-01 ± 1.4e-01"), ([0.1], "1.00e-01"),
-     ([0.1, math.inf], "∞ (1 of 2 seeds not finite, median ∞)"),
-     ([0.1, 0.2, -math.inf], "−∞ (1 of 3 seeds not finite, median 1.00e-01)")],
-)  # fmt: skip
-def test_spread_text_in_a_given_format(values, text):
-    rows = Results([{"seed": seed, "error": value} for seed, value in enumerate(values)])
-    missing = -math.inf if -math.inf in values else math.inf
-    assert spread_text(rows.spread("error", missing), ".2e", ".1e") == text
 
 
 @pytest.mark.parametrize(

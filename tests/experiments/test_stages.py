@@ -171,35 +171,12 @@ def test_finished_parts_are_kept(tmp_path):
     assert done == [2, 3]
 
 
-def test_a_job_that_is_kept_gives_the_same_rows_and_arrays(tmp_path):
-    ran = []
-
-    def job():
-        ran.append(1)
-        return [{"error": np.inf, "seed": np.int32(3)}], {"path": np.arange(3.0)}
-
-    stages = [Stages(tmp_path, Console(quiet=True)) for _ in range(2)]
-    found = [each.kept("jobs", {"a: job": job}, identity_of(1))["a: job"] for each in stages]
-    assert len(ran) == 1
-    assert (stages[0].reused, stages[1].reused) == ([], ["jobs"])
-    assert found[0][0] == found[1][0] == [{"error": np.inf, "seed": 3}]
-    assert np.array_equal(found[0][1]["path"], found[1][1]["path"])
-
-
 @pytest.mark.parametrize("inputs", [(2,), (DATA,)])
 def test_parts_of_other_inputs_run(tmp_path, inputs):
     parts(tmp_path, [])
     done = []
     parts(tmp_path, done, inputs)
     assert done == [0, 1, 2, 3]
-
-
-def test_a_damaged_part_is_named(tmp_path):
-    parts(tmp_path, [])
-    (file,) = tmp_path.glob("some-parts-1-*.npz")
-    file.write_bytes(file.read_bytes()[:-30])
-    with pytest.raises(ValueError, match=r"\.npz: truncated, damaged or not a hybrid_jax stage"):
-        parts(tmp_path, [])
 
 
 def test_stages_run_in_order_on_what_they_need_and_compile_ahead(tmp_path):

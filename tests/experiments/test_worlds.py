@@ -1,19 +1,16 @@
 """Worlds: RotorPy's equations and the logs of a flight; and what the command says of its rows."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from smoke import experiments
 
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 from experiments.worlds.cases import WORLDS
 from experiments.worlds.measures import EXPECTED, parameters_of
 from experiments.worlds.rotorpy import CRAZYFLIE, HUMMINGBIRD, ROTORPY, decide, derivative
-from experiments.worlds.verdicts import CLAIMS, conclusion, ratio_table
+from experiments.worlds.verdicts import CLAIMS
 from experiments.worlds.world import BURST, CHANGES, Reference, logged
 from hybrid_jax.adaptation.results import Parameter
 from hybrid_jax.vehicle import IRIS
@@ -100,14 +97,6 @@ def test_each_claim_fails_where_it_should(change, fails):
     assert [id for id, holds in found.items() if not holds] == fails
 
 
-def test_the_worst_case_comes_first_and_the_conclusion_names_it():
-    found = rows(nothing=0.5, drag=9.0)
-    assert [line[1] for line in ratio_table(found).lines] == ["drag", "no change"]
-    first, second = conclusion(found)
-    assert first.startswith("In 1 of 2 cases")
-    assert second == "The worst is iris drag moving (world, change, flight): 18 times."
-
-
 def test_a_parameter_is_judged_where_it_is_the_vehicles():
     """A load changes the mass, which the model keeps; a weak rotor has no k of its own."""
     found = {"Ix": Parameter(0.03, 0.028, 0.032), "k": Parameter(8.5e-6, 0.0, np.inf)}
@@ -118,13 +107,3 @@ def test_a_parameter_is_judged_where_it_is_the_vehicles():
     assert row["Iy_error"] is None  # not fitted
     assert parameters_of(WORLDS["iris"], "weak_rotor", found)["k_error"] is None
     assert set(parameters_of(WORLDS["hummingbird"], "off_centre_load", found).values()) == {None, False}
-
-
-@pytest.mark.slow
-def test_the_command_writes_a_row_for_each_case(tmp_path):
-    (run,) = experiments("worlds", "worlds", folder=tmp_path)
-    assert run.returncode == 0, run.stderr
-    report = json.loads((tmp_path / "out" / "worlds" / "report.json").read_text())
-    assert [(row["world"], row["change"], row["flight"]) for row in report["rows"]] == [
-        ("hummingbird", "nothing", "short")
-    ]
