@@ -11,7 +11,7 @@ from pendulum import pendulum
 
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.integrate import RK4, SOLVERS, along, integrate, rollout, rollout_batch
+from hybrid_jax.integrate import RK4, SOLVERS, integrate, rollout, rollout_batch
 from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.rollouts import predict, rollout_minibatch
 from hybrid_jax.vehicle import IRIS
@@ -175,15 +175,6 @@ def test_a_second_prediction_compiles_nothing():
         jax.monitoring.unregister_event_duration_listener(listen)
     assert not compiled
     np.testing.assert_allclose(many[0], one, rtol=1e-6)
-
-
-def test_along_pairs_each_input_with_the_state_it_found():
-    rng = np.random.default_rng(0)
-    x0, u, x = rng.normal(size=(2, 3)), rng.normal(size=(4, 1, 3)), rng.normal(size=(4, 2, 3))
-    states, inputs = along(jnp.asarray(x0), jnp.asarray(x), jnp.asarray(u))
-    pairs = {(*state, *held) for state, held in zip(np.asarray(states).T, np.asarray(inputs).T, strict=True)}
-    starts = np.concatenate([x0[None], x[:-1]])
-    assert pairs == {(*starts[t, :, b], *u[t, :, b]) for t in range(4) for b in range(3)}
 
 
 def test_an_attitude_stays_one_however_long_it_turns():

@@ -129,22 +129,6 @@ def test_windows_whose_squares_overflow_diverge_before_a_step(fit):
         json.dumps(result.to_dict(), allow_nan=False)
 
 
-class Leak(AbstractVectorField):
-    """Thirteen states, and no rigid body."""
-
-    rate: Array
-
-    def __call__(self, x, u):
-        return -self.rate * x
-
-
-def test_thirteen_states_are_not_taken_for_a_rigid_body():
-    x = np.random.default_rng(0).normal(size=(20, 4, 13)).astype(np.float32)
-    windows = hj.Trajectories(x[:, 0], x[:, 1:, :2], x[:, 1:], 0.1)
-    found = adapt(Leak(jnp.array(1.0)), windows, method="source", learned_from=windows)
-    assert list(found.outside) == [*(f"x[{i}]" for i in range(13)), "u[0]", "u[1]"]
-
-
 WIDE = replace(swings(40), u=np.zeros((40, 8, 2), np.float32))
 OTHERS = {
     "another dt": ("validation", replace(swings(40), dt=0.1), "dt must be 0.05, as in the other windows, got 0.1"),

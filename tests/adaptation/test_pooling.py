@@ -21,12 +21,6 @@ def test_the_interval_holds_errors_within_and_between_sources():
     assert np.mean(held) == pytest.approx(0.95, abs=0.02)
 
 
-def test_of_equal_estimates_it_is_the_interval_of_one():
-    centre, away = combined(np.full(3, 2.0), np.full(3, 0.25))
-    assert centre == 2.0
-    assert away == pytest.approx(1.96 * 0.5, rel=1e-3)
-
-
 def test_sources_that_differ_widen_the_interval():
     exact = swings(40, damping=0.0)
     noise = 0.02 * np.random.default_rng(0).normal(size=exact.x.shape).astype(np.float32)

@@ -8,20 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pendulum import LENGTH, Brake, log_lengths, pendulum, swings
+from pendulum import LENGTH, log_lengths, pendulum, swings
 from pushes import Push, pushes
 
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.estimation import least_squares, levenberg_marquardt
-from hybrid_jax.estimation.least_squares import fit_least_squares, ravel_parameters
+from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.uncertainty import covariance_of
 from hybrid_jax.integrate import RK4, rollout_batch
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS
 
 _mse, _flown = eqx.filter_jit(rollout_mse), eqx.filter_jit(rollout_batch)
 EXACT, DAMPED = swings(40, damping=0.0), swings(40)  # of a pendulum as the model has it, and of one with damping
@@ -97,16 +94,6 @@ def test_an_implicit_solver_that_finds_no_step_ends_in_a_line():
     assert len(str(said.value).splitlines()) == 1
 
 
-def test_the_residual_of_a_hybrid_is_held():
-    brake = Brake(jnp.array(0.8))
-    truth = Hybrid(pendulum(LENGTH), brake)
-    windows = eqx.tree_at(lambda w: w.x, EXACT, _flown(truth, EXACT.x0, EXACT.u, EXACT.dt))
-    found = fit_least_squares(Hybrid(pendulum(LENGTH * 0.75), brake), windows)
-    assert found.converged
-    np.testing.assert_allclose(jnp.exp(found.field.physics.log_length), LENGTH, rtol=1e-5)  # float32 states
-    assert eqx.tree_equal(found.field.residual, brake)
-
-
 def test_it_is_the_minimum_of_l_mse():
     found = fit_least_squares(pendulum(0.8), DAMPED)
     assert found.converged
@@ -146,23 +133,6 @@ def test_windows_that_are_not_finite_are_refused_or_leave_the_start_where_nothin
     assert found.field.log_length == pendulum(0.8).log_length
 
 
-def test_a_parameter_without_effect_stays_where_it_is():
-    windows, _ = pushes(30, 0.1)
-    still = eqx.tree_at(lambda w: w.u, windows, windows.u * np.array([1.0, 0.0], np.float32))
-
-    class First(AbstractVectorField):
-        push: Push
-
-        def __call__(self, x, u):
-            return self.push(x, u).at[1].set(0.0)  # b then acts through u₁ alone, which is off
-
-    found = fit_least_squares(First(Push(jnp.array([1.0, 1.0]))), still)
-    assert found.converged
-    assert found.field.push.gains[1] == 1.0
-    dark = eqx.tree_at(lambda w: w.u, windows, 0 * windows.u)
-    assert fit_least_squares(First(Push(jnp.array([1.0, 1.0]))), dark).status == Status.STALLED  # it has seen nothing
-
-
 class Drift(AbstractVectorField):
     """ẋ = u: nothing in it can be learned."""
 
@@ -175,14 +145,6 @@ def test_a_field_with_nothing_to_fit_is_refused():
     for field in (Drift(), Hybrid(Drift(), Push(jnp.ones(2)))):
         with pytest.raises(ValueError, match="Drift, has no parameter to fit"):
             fit_least_squares(field, windows)
-
-
-def test_parameters_as_a_vector_and_back():
-    logs = jnp.array([0.1, -0.2, 0.3])
-    field = Hybrid(RigidBody(dict(zip(LEARNED, logs, strict=True)), IRIS), Push(jnp.ones(2)))
-    theta, rebuild = ravel_parameters(field)
-    np.testing.assert_allclose(theta, logs, rtol=1e-6)
-    assert eqx.tree_equal(rebuild(theta), field)
 
 
 def test_a_narrow_curved_valley_takes_few_steps():

@@ -19,17 +19,18 @@ ERRORS = np.arange(1, 9) / 100  # in the order of the leaves: Ix, drag, k_rotors
 Z = 1.959964  # of 95 %, from the normal distribution's table
 
 
+@pytest.mark.parametrize(("level", "z"), [(0.6826895, 1.0), (0.95, Z)])
 @pytest.mark.parametrize("wrap", [lambda field: field, lambda field: Hybrid(field, Push(jnp.ones(2)))])
-def test_every_entry_has_its_interval_in_si_units(wrap):
-    found = intervals(wrap(rigid_body(IRIS, LEARN)), np.diag(ERRORS**2))
+def test_every_entry_has_its_interval_in_si_units(wrap, level, z):
+    found = intervals(wrap(rigid_body(IRIS, LEARN)), np.diag(ERRORS**2), level)
     drag, rotors = ([f"{name}[{i}]" for i in range(count)] for name, count in (("drag", 3), ("k_rotors", 4)))
     assert set(found) == {"Ix", *drag, *rotors}
     for name, error in zip(("Ix", *rotors), ERRORS[[0, 4, 5, 6, 7]], strict=True):
         value, low, high = found[name]  # held as a logarithm
-        np.testing.assert_allclose([high / value, value / low], np.exp(Z * error), rtol=1e-5)  # float32
+        np.testing.assert_allclose([high / value, value / low], np.exp(z * error), rtol=1e-5)  # float32
     for name, error in zip(drag, ERRORS[1:4], strict=True):
         assert found[name].value == 0  # held in units of the vehicle's weight at 1 m/s
-        np.testing.assert_allclose(found[name][1:], Z * error * IRIS.mass * IRIS.gravity * np.array([-1, 1]), rtol=1e-5)
+        np.testing.assert_allclose(found[name][1:], z * error * IRIS.mass * IRIS.gravity * np.array([-1, 1]), rtol=1e-5)
 
 
 def test_a_matrix_has_rows_and_columns():

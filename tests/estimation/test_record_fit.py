@@ -123,19 +123,21 @@ def test_a_burst_of_outliers_is_set_aside(records):
 
 
 class Twofold(hj.AbstractVectorField):
-    """Two factors of which only the product acts."""
+    """Two factors of which only the product acts, and a number that nothing depends on."""
 
     a: jax.Array
     b: jax.Array
     damping: jax.Array
+    unused: jax.Array
 
     def __call__(self, x, u):
         return jnp.stack([x[1], u[0] - self.a * self.b * x[0] - self.damping * x[1]])
 
 
 def test_what_no_output_tells_is_named_and_has_no_interval(records):
-    fit = fit_records(model_of(Twofold(jnp.array(3.0), jnp.array(4.0), jnp.array(0.3))), records[:1], dt=0.02)
-    assert set(fit.undetermined) == {"a", "b"}
+    fit = fit_records(model_of(Twofold(*map(jnp.array, (3.0, 4.0, 0.3, 1.0)))), records[:1], dt=0.02)
+    assert set(fit.undetermined) == {"a", "b", "unused"}
+    assert float(fit.intervals["unused"].value) == 1.0
     assert np.isfinite(float(fit.intervals["damping"].high))
 
 
@@ -271,16 +273,3 @@ def test_the_start_of_a_body_is_corrected_in_the_tangent_space_of_its_attitude()
     assert fit.starts_error.shape == (1, 12)
     assert (fit.starts_error[0, 3:5] > 0).all()
     assert float(fit.model.field.deviations["k"]) == pytest.approx(0.1, abs=5e-3)
-
-
-class Blind(Pendulum):
-    """With a number that nothing depends on."""
-
-    unused: jax.Array
-
-
-def test_a_number_without_any_effect_is_named_and_the_others_keep_their_intervals(records):
-    field = Blind(jnp.log(jnp.array(0.8)), jnp.array(0.3), jnp.array(1.0))
-    fit = fit_records(model_of(field), records[:1], dt=0.02)
-    assert fit.undetermined == ("unused",)
-    assert float(fit.intervals["unused"].value) == 1.0

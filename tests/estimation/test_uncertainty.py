@@ -9,12 +9,13 @@ from pendulum import Brake, log_lengths, pendulum, swings
 from pushes import Push, pushes
 from rich.console import Console
 
-from experiments.paper.known_body import coverage, known_body_table
+from experiments.paper.known_body import coverage
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals
+from hybrid_jax.status import Status
 from hybrid_jax.vehicle import IRIS
 
 SWINGS = swings(40)
@@ -80,17 +81,6 @@ def test_a_residual_is_taken_as_given():
     np.testing.assert_allclose(hybrid, bare, rtol=1e-5)  # float32
 
 
-@pytest.mark.parametrize(("level", "z"), [(0.6827, 1.0), (0.95, 1.95996)])  # of the normal distribution's table
-def test_an_interval_is_the_value_times_and_over_a_factor(level, z):
-    for field in (rigid_body(IRIS), Hybrid(rigid_body(IRIS), Push(jnp.ones(2)))):
-        found = intervals(field, COVARIANCE, level)
-        assert list(found) == ["Ix", "Iy", "k"]
-        for name, error in zip(found, (0.01, 0.02, 0.03), strict=True):
-            value, low, high = found[name]
-            assert value == rigid_body(IRIS).theta()[name]
-            np.testing.assert_allclose([high / value, value / low], np.exp(z * error), rtol=1e-5)  # float32
-
-
 def test_a_parameter_that_the_windows_do_not_depend_on_stays_and_may_be_anything():
     windows, _ = pushes(30, 0.1)
     still = eqx.tree_at(lambda w: w.u, windows, windows.u * np.float32([1, 0]))
@@ -102,6 +92,8 @@ def test_a_parameter_that_the_windows_do_not_depend_on_stays_and_may_be_anything
     known = covariance_of(found.field, still, scale=first, free=np.array([True, False]))
     assert found.converged
     assert 0 < known[0, 0] < np.inf
+    dark = eqx.tree_at(lambda w: w.u, windows, 0 * windows.u)
+    assert fit_least_squares(Push(jnp.ones(2)), dark).status == Status.STALLED  # it has seen nothing
     np.testing.assert_allclose(covariance[0, 0], known[0, 0] * 29 / 28, rtol=1e-5)  # the factor n / (n - p)
 
 
@@ -178,10 +170,3 @@ def test_intervals_miss_the_truth_when_the_vehicle_has_drag_that_the_model_has_n
     # c v / m of drag against a lean of c v / (m g): c² E[v_x² + v_y²] / (m g)², with 2 m/s along each axis. The mean
     # of 100 fits is good to 0.03 %; drag on what is vertical or beside the lean averages out.
     np.testing.assert_allclose(row["bias"], -100 * 0.4**2 * 8 / (1.5 * 9.81) ** 2, atol=0.15)
-
-
-@pytest.mark.slow
-def test_the_table_has_a_line_for_every_case(found, rows):
-    lines = {tuple(line[:3]): line[3] for line in known_body_table(found).lines}
-    assert lines.keys() == rows.keys()  # two truths, noise on targets or on all, three parameters
-    assert all(text.startswith(f"{100 * rows[case]['coverage']:.1f} ±") for case, text in lines.items())

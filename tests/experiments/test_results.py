@@ -12,7 +12,6 @@ from reports import ERRORS, ODD_ROWS, changed, make_rows, row
 
 from experiments.paper.lanes import BASELINES, DOMAINS, TAGS, by_domain, cells, gain, with_rho
 from experiments.reporting.results import Results
-from experiments.reporting.statistics import spread
 
 
 def test_rho_is_eq_9_of_the_seeds_own_source_only_error():
@@ -58,11 +57,6 @@ def test_rows_that_are_not_finite_count_as_infinitely_bad():
 def test_gain_is_one_where_only_the_source_error_is_infinite():
     rows = changed(make_rows(), "no_physics", "source_only", 0, test_mse=math.inf)
     assert rows.where(model="no_physics", mode="fine_tuned", n_train=100).spread(gain).mean == 1.0
-
-
-def test_standard_deviation_is_that_of_a_sample():
-    assert spread([1.0, 2.0, 3.0]).std == pytest.approx(1.0)
-    assert math.isnan(spread([1.0]).std)
 
 
 def test_select_group_and_sort():

@@ -36,16 +36,6 @@ def test_a_random_walk_is_a_line_and_a_bridge_between_its_samples():
     np.testing.assert_allclose(found, strayed.T @ strayed / len(strayed), rtol=0.25)
 
 
-def test_a_bridge_is_nothing_outside_its_interval():
-    sampled = Signal(np.array([0.9, 1.0, 1.1, 1.2]), np.zeros((4, 1)), ("0",), "walk")
-    edges = np.linspace(0.8, 1.18, 20)
-    spans = slow_commands.spans(sampled, edges[:1], edges[-1:], 2)
-    found = slow_commands.bridges(spans, edges - edges[0], np.eye(1))[0].reshape(2, 2, -1)
-    assert np.abs(found[0, :, 15:]).max() > 0.01
-    np.testing.assert_allclose(found[0, :, :14], 0, atol=1e-12)
-    np.testing.assert_allclose(found[1, :, 15:], 0, atol=1e-12)
-
-
 def test_fast_commands_are_held_and_know_no_bridge():
     fast = Signal(0.01 * np.arange(50), np.random.default_rng(0).normal(size=(50, 4)), tuple("0123"), "fast")
     assert slow_commands.count(fast, 0.5) == 0

@@ -1,51 +1,10 @@
 """One source of numbers: the Vehicle."""
 
-from dataclasses import replace
-
-import jax
-import numpy as np
 import pytest
-from mujoco import mjx
 from smoke import script
 
 from experiments.flying.images import picture
 from hybrid_jax.sim import check_versions
-from hybrid_jax.sim.forces import parameters_of
-from hybrid_jax.sim.scene import build_model, traced_model
-from hybrid_jax.vehicle import IRIS
-
-OTHER = replace(
-    IRIS, mass=2.0, inertia=(0.04, 0.02, 0.05), thrust_coefficient=1e-5, torque_coefficient=3e-6, gravity=9.7
-)
-
-
-def test_the_compiled_model_carries_the_vehicles_numbers_and_no_others():
-    model = build_model(OTHER)
-    np.testing.assert_allclose(model.body_mass, [0, OTHER.mass])
-    np.testing.assert_allclose(model.body_inertia[1], OTHER.inertia)
-    np.testing.assert_allclose(model.opt.gravity, [0, 0, -OTHER.gravity])
-    np.testing.assert_allclose(model.site_pos[:, :2], OTHER.rotor_positions)
-    np.testing.assert_allclose(model.actuator_gainprm[:, 0], OTHER.thrust_coefficient)
-    np.testing.assert_allclose(model.actuator_gear[:, 5], 0.3 * np.array(OTHER.spin))
-    assert model.nv == 6
-    assert not model.geom_contype.any()
-    assert not model.geom_conaffinity.any()
-    # Not one force of MuJoCo's own: air, joints.
-    assert model.opt.density == model.opt.viscosity == 0
-    assert not model.dof_damping.any()
-    assert not model.dof_armature.any()
-
-
-def test_traced_parameters_replace_every_number_that_differs_between_two_vehicles():
-    built = mjx.put_model(build_model(OTHER))
-    replaced = traced_model(parameters_of(OTHER))
-    # MuJoCo derives these for constraints, limits and the camera; a free body's acceleration does not read them.
-    unused = ("invweight0", "acc0", "M0", "stat", "geom_", "cam_", "light_", "mesh_", "bvh", "names", "qpos0")
-    for path, leaf in jax.tree_util.tree_leaves_with_path(built):
-        name = jax.tree_util.keystr(path)
-        if not any(word in name for word in unused):
-            other = dict(jax.tree_util.tree_leaves_with_path(replaced))[path]
-            np.testing.assert_allclose(leaf, other, rtol=1e-12, err_msg=name)
 
 
 @pytest.mark.parametrize(("mujoco", "mjx"), [("4.0.0", "3.17.0"), ("3.17.0", "not installed"), ("3.16.2", "3.16.2")])

@@ -1,7 +1,5 @@
 """Laws of the true vehicle's dynamics."""
 
-import math
-
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -65,17 +63,6 @@ def test_free_fall_is_exact(step):
         x = step(quadrotor(IRIS), x, jnp.zeros(4), jnp.asarray(0.0), 0.02)
     expected = np.array([1.0, -2.0, 5 + 3 - 0.5 * IRIS.gravity, 1, 0, 0, 0, 1, -2, 3 - IRIS.gravity, 0, 0, 0])
     np.testing.assert_allclose(x, expected, atol=1e-13)
-
-
-def test_falling_with_drag_follows_the_exponential_to_terminal_velocity(step):
-    body = quadrotor(IRIS, *ALL)
-    drag_coefficient = float(body.parameters.drag_coefficient)
-    terminal = IRIS.mass * IRIS.gravity / drag_coefficient
-    x = at_rest(5000.0)
-    for _ in range(20):
-        x = step(body, x, jnp.zeros(4), jnp.asarray(0.0), 0.05)
-    expected = -terminal * (1 - math.exp(-drag_coefficient / IRIS.mass))
-    assert float(x[9]) == pytest.approx(expected, abs=3e-9)  # 20 steps of RK4, each (C_D dt / m)⁵ / 120 of 37 m/s
 
 
 def reference_flight(x0, u, t0, duration):

@@ -9,7 +9,7 @@ import pytest
 from experiments import make_flights
 from hybrid_jax.io.datasets import content_hash, load_dataset
 from hybrid_jax.sim import flight as recording
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, SOURCE, Domain
 from hybrid_jax.sim.flight import Flights, SplitSpec, cut, gone_wrong, make_dataset, permutation, random_flights
 from hybrid_jax.vehicle import IRIS, Vehicle
 
@@ -68,26 +68,6 @@ def test_flights_are_lively_and_partly_in_ground_effect(source):
     assert 25 < statistics["tilt [deg] p99"] < 45
     assert statistics["altitude [m] p99"] > 2
     assert statistics["distance from home [m] p99"] < 15
-
-
-def test_a_hundred_windows_identify_the_shifted_inertia_and_the_thrust_coefficient():
-    """Least squares of Newton–Euler on one-step differences; the residual forces bias it by a few percent."""
-    windows = make_dataset(PARAMETER_SHIFT, {"train": SplitSpec(100, 10)}, seed=0).splits["train"]
-    before = np.concatenate([windows.x0[:, None], windows.x[:, :-1]], axis=1).astype(float)
-    middle = 0.5 * (before + windows.x)
-    slope = (windows.x.astype(float) - before) / windows.dt
-    thrusts = IRIS.thrust_coefficient * windows.u.astype(float) ** 2
-    arm_x, arm_y = np.array(IRIS.rotor_positions).T
-    wx, wy, wz = np.moveaxis(middle[..., 10:], -1, 0)
-    ix, iy, iz = PARAMETER_SHIFT.vehicle.inertia
-    for torque, spin, truth in (
-        ((arm_y * thrusts).sum(-1) - (iz - iy) * wy * wz, slope[..., 10], ix),
-        (-(arm_x * thrusts).sum(-1) - (ix - iz) * wx * wz, slope[..., 11], iy),
-    ):
-        assert (torque * spin).sum() / (spin**2).sum() == pytest.approx(truth, rel=0.05)
-    up = 1 - 2 * (middle[..., 4] ** 2 + middle[..., 5] ** 2)
-    lift = IRIS.mass * (slope[..., 9] + IRIS.gravity) + 0.4 * middle[..., 9]
-    assert (lift * up * thrusts.sum(-1)).sum() / ((up * thrusts.sum(-1)) ** 2).sum() == pytest.approx(1, rel=0.02)
 
 
 @pytest.mark.slow
