@@ -1,6 +1,6 @@
 """`hybrid-jax replay`: show a flight in 3-D with the models' predictions."""
 
-import tempfile
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +9,9 @@ from typing import Annotated
 import numpy as np
 import tyro
 from jaxtyping import Float
-from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
@@ -92,6 +93,7 @@ def _animated(windows: Trajectories, forecasts: Forecasts, dt: float) -> bytes:
     path = np.asarray(windows.x0)[:, POSITION]
     middle, half = (path.min(axis=0) + path.max(axis=0)) / 2, max(0.6, 0.6 * np.ptp(path, axis=0).max())
     figure = Figure(figsize=(6.4, 5.2), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot(projection="3d")
     limits = np.stack([middle - half, middle + half]).T
     axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
@@ -100,15 +102,15 @@ def _animated(windows: Trajectories, forecasts: Forecasts, dt: float) -> bytes:
     nexts = [axes.plot([], [], [], color=each, label=name)[0] for name, each in zip(forecasts, COLOURS, strict=False)]
     axes.legend(loc="upper left", fontsize=8)
 
-    def frame(i: int):
+    pictures = []
+    for i in range(len(path)):
         figure.suptitle(f"{i * dt:.1f} s")
         points = path[: i + 1], path[i : i + 1], *(each[i] for each in forecasts.values())
         for line, place in zip((trail, vehicle, *nexts), points, strict=True):
-            line.set_data_3d(  # pyright: ignore[reportAttributeAccessIssue]
-                *np.where(np.abs(place - middle) < 4 * half, place, np.nan).T
-            )
-
-    moving = FuncAnimation(figure, frame, frames=len(path))  # pyright: ignore[reportArgumentType]
-    with tempfile.TemporaryDirectory() as folder:
-        moving.save(Path(folder) / "a.gif", PillowWriter(fps=round(1 / dt)))
-        return (Path(folder) / "a.gif").read_bytes()
+            shown = np.where(np.abs(place - middle) < 4 * half, place, np.nan)
+            line.set_data_3d(*shown.T)  # pyright: ignore[reportAttributeAccessIssue]
+        canvas.draw()
+        pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+    content = io.BytesIO()
+    pictures[0].save(content, "GIF", save_all=True, append_images=pictures[1:], duration=round(1000 * dt), loop=0)
+    return content.getvalue()

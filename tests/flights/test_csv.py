@@ -157,3 +157,21 @@ def test_memory_is_bounded_by_the_numbers_kept(flight, written):
 
     numbers = 25_000 * len(COLUMNS) * 8
     assert peak(50_000) - peak(25_000) < 2.2 * numbers
+
+
+def test_semicolons_and_decimal_commas_are_said_and_read(flight, tmp_path):
+    path = tmp_path / "flight.csv"
+    path.write_text("\n".join([HEADER, *rows_of(flight)]).replace(",", ";").replace(".", ","))
+    refusal(lambda: read_recording(path), path, "row 1", "separated by ';'", "columns=")
+    tables = 'frames = {world = "ENU", body = "FLU", velocity = "world"}\ntime = {columns = ["t"], unit = "s"}\n'
+    tables += 'velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}\n'
+    tables += 'motors = {columns = ["u0", "u1", "u2", "u3"], unit = "pwm"}\n'
+    (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";"}')
+    refusal(lambda: read_recording(path, tmp_path / "map.toml"), "row 2, field t", "decimal comma", 'decimal = ","')
+    (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";", decimal = ","}')
+    signals = read_recording(path, tmp_path / "map.toml").signals
+    assert [*signals] == ["velocity", "command"]
+    np.testing.assert_allclose(signals["velocity"].values, flight.x[:, 7:10], atol=1e-8)
+    np.testing.assert_allclose(
+        signals["command"].values, np.where(flight.u < 800, flight.u - 1000, 0) / 1000, atol=1e-8
+    )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from surface import refusal
-from writers import MOTORS, STATES, bag, blackbox, crazyflie, usd
+from writers import MOTORS, STATES, bag, crazyflie, usd
 
 from hybrid_jax.flights import load_logs
 from hybrid_jax.flights.checks.suitability import check_recording, failures
@@ -15,7 +15,7 @@ from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.formats.column_map import SCALES, of_unit
 from hybrid_jax.flights.formats.raw import Samples, record
 from hybrid_jax.flights.load import find_logs, read_recording
-from hybrid_jax.flights.log import COLUMNS, FlightLog
+from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.vehicle import IRIS
 
 
@@ -162,51 +162,6 @@ def test_channels_of_motors_are_chosen_and_other_types_named(flight, tmp_path):
     assert not failures(check_recording(sixteen, IRIS), "log")[1:]  # no velocity and no rates
 
 
-def test_a_blackbox_log_is_the_flight_it_holds(flight, written):
-    pytest.importorskip("orangebox")
-    recording = read_recording(written(blackbox(flight[:200]), "flight.bbl"))
-    signals, last = recording.signals, len(recording.signals["rates"])
-    assert last >= 199
-    np.testing.assert_allclose(signals["rates"].values, flight.x[:last, 10:], atol=0.01)
-    np.testing.assert_allclose(signals["specific_force"].values, [[0, 0, 9.81]] * last)
-    np.testing.assert_allclose(signals["voltage"].values, 16.5)
-    np.testing.assert_allclose(signals["command"].values, flight.u[:last] / 1999, atol=3e-4)
-    np.testing.assert_allclose(signals["rotor_speed"].values, flight.u[:last], atol=1)
-    assert "damage" not in recording.facts
-    assert "damage" in read_recording(written(blackbox(flight[:200], ended=False), "cut.bbl")).facts
-    refusal(lambda: to_flight(recording), "no position", "identify")
-    packed = written(gzip.compress(blackbox(flight[:200])), "flight.bbl.gz")
-    assert len(read_recording(packed).signals["rates"]) == last
-
-
-def test_events_and_armings_without_frames_are_no_damage(flight, written):
-    """Of Betaflight 4: an adjustment in flight, logging that resumes, disarming; and an end with its reason."""
-    pytest.importorskip("orangebox")
-    events = b"E\x0d\x05\x02" + b"E\x0d\x85abcd" + b"E\x0e\x05\x06" + b"E\x0f\x04"
-    whole = blackbox(flight[:200], events=events)
-    empty = whole[: whole.index(b"motor_poles:14\n") + 15] + b"E\xffEnd of log\0"
-    recording = read_recording(written(empty + whole + empty, "flight.bbl"))
-    assert "damage" not in recording.facts
-    assert len(recording.signals["rates"]) >= 199
-    assert any("2 times the vehicle was armed" in note for note in recording.notes)
-    two = read_recording(written(blackbox(flight[:90]) + whole, "two.bbl"))
-    assert any("holds 2 flights: the longest is read" in note for note in two.notes)
-    assert len(two.signals["rates"]) >= 199
-    reasoned = blackbox(flight[:200], events=b"E\xffEnd of log (disarm reason:4)\0", ended=False)
-    assert "damage" not in read_recording(written(reasoned, "reasoned.bbl")).facts
-
-
-def test_commands_of_pwm_and_headers_of_other_types_are_read(flight, written):
-    pytest.importorskip("orangebox")
-    headers = ["vbatcellvoltage:unknown", "motor_poles:12", "blackbox_high_resolution:1"]
-    signals = read_recording(written(blackbox(flight[:200], headers=headers, digital=False), "flight.bbl")).signals
-    last = len(signals["command"])
-    np.testing.assert_allclose(signals["command"].values, flight.u[:last] / 1000, atol=6e-4)
-    np.testing.assert_allclose(signals["rotor_speed"].values, flight.u[:last] * 14 / 12, atol=1)
-    np.testing.assert_allclose(signals["rates"].values, flight.x[:last, 10:] / 10, atol=1e-3)
-    refusal(lambda: read_recording(written(blackbox(flight[:20], headers=["acc_1G:big"]), "a.bbl")), "header acc_1G")
-
-
 def test_the_compressed_state_and_the_filter_of_a_crazyflie_are_read(flight, written):
     """quatcompress.h: the place of the largest of x, y, z, w in two bits, then a sign and nine bits for each other."""
     columns = {f"stateEstimateZ.{axis}": 1000 * column for axis, column in zip("xyz", flight.x.T, strict=False)}
@@ -341,25 +296,3 @@ def test_logs_of_unequal_start_and_length_go_together(flight, written):
     assert [len(log) for log in logs] == [len(flight), 700, 900]
     assert {log.dt for log in logs} == {0.01}
     assert {log.t[0] for log in logs} == {0.0}
-
-
-def test_semicolons_and_decimal_commas_are_said_and_read(flight, tmp_path):
-    path, rows = tmp_path / "flight.csv", [",".join(COLUMNS)]
-    rows += [
-        ",".join(f"{value:.9f}" for value in (t, *x, *u)) for t, x, u in zip(flight.t, flight.x, flight.u, strict=True)
-    ]
-    german = "\n".join(rows).replace(",", ";").replace(".", ",")
-    path.write_text(german)
-    refusal(lambda: read_recording(path), path, "row 1", "separated by ';'", "columns=")
-    tables = 'frames = {world = "ENU", body = "FLU", velocity = "world"}\ntime = {columns = ["t"], unit = "s"}\n'
-    tables += 'velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}\n'
-    tables += 'motors = {columns = ["u0", "u1", "u2", "u3"], unit = "pwm"}\n'
-    (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";"}')
-    refusal(lambda: read_recording(path, tmp_path / "map.toml"), "row 2, field t", "decimal comma", 'decimal = ","')
-    (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";", decimal = ","}')
-    signals = read_recording(path, tmp_path / "map.toml").signals
-    assert [*signals] == ["velocity", "command"]
-    np.testing.assert_allclose(signals["velocity"].values, flight.x[:, 7:10], atol=1e-8)
-    np.testing.assert_allclose(
-        signals["command"].values, np.where(flight.u < 800, flight.u - 1000, 0) / 1000, atol=1e-8
-    )

@@ -5,10 +5,11 @@ Units are documented in betaflight/src/main/blackbox/blackbox.c: gyroADC in deg/
 """
 
 import contextlib
+import io
 import logging
+import os
 import re
 import struct
-import tempfile
 from collections.abc import Iterator
 from functools import cache
 from typing import Any
@@ -91,10 +92,13 @@ def _frames(content: bytes) -> tuple[Any, np.ndarray, str]:
     from orangebox.reader import Reader
     from orangebox.types import FrameType
 
-    with tempfile.NamedTemporaryFile() as file:  # orangebox only reads files
-        file.write(content)
-        file.flush()
-        parser = _parser()(Reader(file.name, 1))
+    # orangebox only reads files, and a temporary one would stay if the process were killed.
+    reader, stream = Reader(os.devnull), io.BytesIO(content)
+    reader._update_headers(stream)
+    reader._frame_data = stream.read()
+    reader._log_index, reader._frame_data_len = 1, len(reader._frame_data)
+    reader._build_field_defs()
+    parser = _parser()(reader)
     width, rows, ended, junk = len(parser.reader.field_defs[FrameType.INTRA]), [], True, 0
     try:
         for frame in parser.frames():
