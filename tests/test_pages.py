@@ -69,6 +69,12 @@ def test_no_line_of_code_scrolls(page):
     assert [line for block in code for line in block.splitlines() if len(line) > CODE] == []
 
 
+@pytest.mark.parametrize("page", written(), ids=lambda page: page.stem)
+def test_what_belongs_to_an_item_is_indented_by_four(page):
+    """Otherwise the list ends there, and the next item is set as a part of a paragraph."""
+    assert re.findall(r"\n\n {1,3}[^ \n].*", page.read_text()) == []
+
+
 @pytest.mark.parametrize("notebook", sorted(DOCS.glob("tutorials/*.ipynb")), ids=lambda path: path.stem)
 def test_every_exercise_has_an_answer(notebook):
     text = notebook.read_text()

@@ -68,6 +68,7 @@ METHODS: Mapping[str, Method] = {
     "linear_residual": Ridge(ridge.linear_residual),
     "source": Source(),
 }
+"""The methods of `adapt` by name."""
 
 
 @entry

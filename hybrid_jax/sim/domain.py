@@ -160,7 +160,9 @@ class Domain:
 
 
 SOURCE = Domain("source")
-# Table 1: Ix 0.02912 → 0.04000, Iy 0.02912 → 0.02000.
+"""The paper's quadrotor before the change, with drag and ground effect."""
 PARAMETER_SHIFT = Domain("parameter_shift", vehicle=replace(IRIS, inertia=(0.04, 0.02, IRIS.inertia[2])), nominal=IRIS)
+"""Another inertia [kg m²], as in Table 1 of the paper: Ix 0.02912 → 0.04000, Iy 0.02912 → 0.02000."""
 EXTERNAL_FORCE = Domain("external_force", forces=(drag, ground_effect, wind))
+"""A side wind of 4 N with a sine of 1 N."""
 DOMAINS = {domain.name: domain for domain in (SOURCE, PARAMETER_SHIFT, EXTERNAL_FORCE)}
