@@ -19,7 +19,7 @@ from pendulum import LENGTH, pendulum, swings
 import hybrid_jax as hj
 from hybrid_jax.adaptation import METHODS, Adaptation, FineTune, LeastSquares, Method, Solution, adapt
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, disturbed, physics_of
+from hybrid_jax.dynamics.disturbance import disturbance_of, disturbed, physics_of
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.status import Status
 
@@ -161,17 +161,6 @@ def test_a_method_of_a_user_is_the_example_of_the_docstring():
     result = adapt(pendulum(0.7), swings(40, damping=0.0), method=method)
     assert result.method == "BestOf"
     assert eqx.tree_equal(result.field, pendulum(LENGTH))
-
-
-def test_a_disturbance_acts_on_any_states():
-    x, u = jnp.ones((5, 3)), jnp.zeros((1, 3))
-    for field, expected in (
-        (ConstantDisturbance(jnp.array([1.0, 2.0])), [0, 0, 0, 1, 2]),
-        (ConstantDisturbance(jnp.array([1.0, 2.0]), (3, 0)), [2, 0, 0, 1, 0]),
-        (ConstantDisturbance(jnp.array(3.0)), [3, 3, 3, 3, 3]),
-    ):
-        np.testing.assert_array_equal(field(x, u), np.outer(expected, np.ones(3)))
-        np.testing.assert_array_equal(field(x[:, 0], u[:, 0]), expected)
 
 
 class Nothing(AbstractVectorField):

@@ -15,7 +15,7 @@ import hybrid_jax as hj
 from hybrid_jax.adaptation import FineTune, adapt
 from hybrid_jax.adaptation.anchored import fit_anchored, with_change
 from hybrid_jax.adaptation.auto import CANDIDATES, extended, free_parameters
-from hybrid_jax.adaptation.selection import STRONG, blocks_of, correlated, fit_each, left_out_steps, posterior
+from hybrid_jax.adaptation.selection import STRONG, blocks_of, correlated, fit_each, posterior
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
@@ -47,16 +47,6 @@ def test_blocks_hold_every_window_once_and_in_order(windows):
 def fits(field, windows, *free):
     """`fit_each` with hardly any prior."""
     return fit_each(field, windows, np.array(free), jnp.full(2, 1e6), None, None, 50)[0]
-
-
-def test_a_block_is_left_out_by_a_fit_to_the_others():
-    """Linear in its parameters, so that one Gauss–Newton step is the whole fit."""
-    windows, _ = pushes(40, noise=0.3)
-    found = jax.tree.map(lambda leaf: leaf[0], fits(Push(jnp.zeros(2)), windows, [True, True]))
-    without = found.theta + left_out_steps(found.equations, jnp.zeros((2, 2)), jnp.zeros(2), blocks_of(40, 8))
-    for block, theta in zip(blocks_of(40, 8)[0], without, strict=True):
-        own = fits(Push(jnp.zeros(2)), windows[np.setdiff1d(np.arange(40), block)], [True, True]).theta[0]
-        np.testing.assert_allclose(theta, own, atol=0.5 * float(jnp.std(without, axis=0).max()))
 
 
 class Half(hj.AbstractVectorField):

@@ -3,7 +3,6 @@
 import random
 
 import numpy as np
-import pytest
 
 from experiments.runner.checkpoint import Checkpoints
 
@@ -44,7 +43,7 @@ def test_the_last_save_is_loaded_bit_for_bit_and_two_are_kept(tmp_path):
     assert loaded(tmp_path / "absent") == (None, [])
 
 
-def test_a_flipped_bit_is_detected(tmp_path):
+def test_a_flipped_bit_and_a_missing_half_are_detected(tmp_path):
     saved(tmp_path, 2)
     file, rng = tmp_path / "000002.npz", random.Random(0)
     intact = file.read_bytes()
@@ -53,23 +52,12 @@ def test_a_flipped_bit_is_detected(tmp_path):
         content[place] ^= 1 << rng.randrange(8)
         file.write_bytes(content)
         (about, arrays), said = loaded(tmp_path)
+        assert all(line.startswith(f"{file}: truncated, damaged or not a hybrid_jax checkpoint") for line in said)
         assert all(arrays[name].tobytes() == ARRAYS[name].tobytes() for name in ARRAYS)
         assert about == {"number": 2 - len(said)}
     assert len(list(tmp_path.glob("000002.npz.damaged-*"))) > 10
-    file.write_bytes(intact)
-    assert loaded(tmp_path)[0][0] == {"number": 2}
-
-
-@pytest.mark.parametrize("left", [0.0, 0.5])
-def test_a_truncated_checkpoint_is_named_and_renamed(left, tmp_path):
-    saved(tmp_path, 2)
-    file = tmp_path / "000002.npz"
-    file.write_bytes(file.read_bytes()[: int(left * file.stat().st_size)])
-    (about, _), (line,) = loaded(tmp_path)
-    assert about == {"number": 1}
-    assert line.startswith(f"{file}: truncated, damaged or not a hybrid_jax checkpoint")
-    assert "renamed to 000002.npz.damaged-" in line
-    assert [name.split("-")[0] for name in names(tmp_path)] == ["000001.npz", "000002.npz.damaged"]
+    file.write_bytes(intact[: len(intact) // 2])
+    assert loaded(tmp_path)[0][0] == {"number": 1}
     Checkpoints(tmp_path).save({"number": 9}, ARRAYS)
     assert loaded(tmp_path)[0][0] == {"number": 9}
 

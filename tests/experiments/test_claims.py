@@ -36,26 +36,17 @@ def test_claim_fails(fails, change):
     assert verdicts(changed(make_rows(), *cell, **fields))[fails] is False
 
 
-@pytest.mark.parametrize(
-    ("claim", "cell", "errors"),
-    [
-        ("C1", ("no_physics", "fine_tuned", 500), [0.01, 0.03, 0.02]),
-        ("C2", ("no_physics", "fine_tuned", 1000), [0.01, 0.03, 0.01]),
-        ("C3", ("no_physics", "fine_tuned", 100), [1.5, 3.5, 2.0]),
-        ("C4", ("no_physics", "fine_tuned", 500), [0.0182, 0.0184, 0.0179]),
-        ("C5", ("hybrid", "fine_tuned", 500), [0.03, 0.01, 0.02]),
-        ("C6", ("hybrid", "fine_tuned", 1000), [1.0, 4.0, 2.0]),
-        ("C7", ("hybrid", "target_only", 100), [0.02, 0.05, 0.04]),
-        ("C7", ("hybrid", "target_only", 1000), [0.02, 0.03, 0.025]),
-        ("C8", ("hybrid", "fine_tuned", 100), [0.02, 0.03, 0.025]),
-    ],
-)
-def test_claim_is_undecided_within_the_noise_of_the_seeds(claim, cell, errors):
-    tags, rows = dict(zip(("model", "mode", "n_train"), cell, strict=True)), make_rows()
-    noisy = [{**r, "test_mse": errors[r["seed"]]} if tags.items() <= r.items() else r for r in rows]
-    (verdict,) = (v for v in claims(with_rho(Results(noisy, TAGS)), "param_shift", TRUTH) if v.id == claim)
-    assert (verdict.holds, verdict.lacks_data) == (None, False)
-    assert "…" in verdict.measured
+def test_claims_are_undecided_within_the_noise_of_the_seeds():
+    """Errors differ fiftyfold between seeds, in each cell in another order."""
+    order = {cell: i for i, cell in enumerate(make_rows().group("model", "mode", "n_train"))}
+
+    def noisy(row):
+        turn = row["seed"] + order[row["model"], row["mode"], row["n_train"]]
+        return {**row, "test_mse": 50.0 ** (turn % 3 - 1)}
+
+    found = claims(with_rho(Results([noisy(row) for row in make_rows()], TAGS)), "param_shift", TRUTH)
+    assert {each.id: each.holds for each in found} == dict.fromkeys(verdicts(make_rows())) | {"C10": True}
+    assert not any(each.lacks_data for each in found)
 
 
 def test_c10_is_an_equivalence():

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 
 import equinox as eqx
 import jax
@@ -20,13 +19,11 @@ from experiments.closed_loop.flights import Scenario, fly_all
 from experiments.closed_loop.models import as_stack, fused, true_field
 from experiments.closed_loop.results import TAGS, Agent
 from experiments.flying.scenario import PATHS
-from experiments.flying.timing import on_one_core
 from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
 from hybrid_jax.control import Controller, Hardware, fly, performance, sample
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.networks.views import multirotor_network
-from hybrid_jax.runtime import cores
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 
 CONTROLLER = Controller(hj.IRIS)
@@ -47,13 +44,6 @@ def test_true_field_equals_the_simulator_in_the_mean_wind(domain):
     expected = jax.jit(jax.vmap(lambda x, u: truth.derivative(x, u, jnp.zeros(()))))(x, u)
     found = jax.jit(jax.vmap(true_field(domain, hj.IRIS)))(x, u)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * float(jnp.abs(expected).max()))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system cannot bind a process to a core")
-def test_calls_are_timed_on_one_core():
-    assert on_one_core(cores) == 1
-    assert cores() == len(os.sched_getaffinity(0))
 
 
 @pytest.fixture(scope="module")

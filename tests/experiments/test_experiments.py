@@ -1,7 +1,6 @@
 """Both experiments from their command lines, in the smallest preset: their files, and the input they refuse."""
 
 import csv
-import io
 import json
 import re
 import shutil
@@ -20,7 +19,6 @@ import hybrid_jax
 from experiments.external_force import sine_floor
 from experiments.paper.config import SMOKE
 from experiments.paper.lanes import physics_in, source_of
-from experiments.paper.outcome import draw, paths
 from experiments.paper.study import placeholder, study
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
 from hybrid_jax.sim.flight import SplitSpec
@@ -105,22 +103,6 @@ def test_the_second_experiment_reuses_the_pretraining_of_the_first(finished):
     reused = [line for line in finished["external_force"].stderr.splitlines() if "as found in the cache" in line]
     assert len(reused) == 3
     assert all("pre-training" in line for line in reused)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("model", "figures"), [("no_physics", ["predictions"]), ("physics_only", [])])
-def test_one_model_is_an_experiment_too_and_comes_from_the_cache(model, figures, folder, finished):
-    config = replace(SMOKE, models=(model,), cache=folder / "cache")
-    text = io.StringIO()
-    found = study(PARAMETER_SHIFT, IRIS, config, Console(file=text))
-    assert text.getvalue().count("as found in the cache") == 3  # pre-training and two adaptations
-    before = [row for row in record(folder, "param_shift")["rows"] if row["model"] == model]
-    for row, expected in zip(found.rows, before, strict=True):
-        assert [row[key] for key in ("mode", "val_mse", "theta")] == [
-            expected[key] for key in ("mode", "val_mse", "theta")
-        ]
-        assert row["test_mse"] == pytest.approx(expected["test_mse"], rel=1e-5)
-    assert set(draw(found.rows, paths(found))) == {"scores", *figures}
 
 
 @pytest.mark.slow

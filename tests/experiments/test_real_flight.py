@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, write
 from rich.console import Console
-from smoke import command, experiments, refused
+from smoke import experiments
 
 from experiments.real_flight.__main__ import LISTS, main, prepare
 from experiments.real_flight.config import PRESETS, RealFlightConfig
@@ -21,7 +21,7 @@ from experiments.reporting import names
 from experiments.reporting.results import Results
 from experiments.runner.command import read
 from experiments.runner.stages import Stages
-from hybrid_jax.cli.command import FAILED_CHECKS, split_lists
+from hybrid_jax.cli.command import split_lists
 from hybrid_jax.cli.errors import UNITS
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
@@ -133,28 +133,6 @@ def test_a_flight_that_is_there_twice_is_refused(vehicle, tmp_path):
     write(folders["source"], [same])
     with pytest.raises(ValueError, match=r"chirp_run9.*the same flight as chirp_run1"):
         prepare(config)
-
-
-@pytest.mark.slow
-def test_logs_that_all_fail_their_checks_end_with_exit_code_3(vehicle, tmp_path):
-    source = write(tmp_path / "source", [replace(log, u=log.u + 900) for log in LOGS[:3]])
-    run = command("real_flight", "--vehicle", str(vehicle), "--source", str(source), folder=tmp_path)
-    assert run.returncode == FAILED_CHECKS
-    assert "motors within limits" in run.stderr
-    assert "Traceback" not in run.stderr
-
-
-@pytest.mark.slow
-def test_bad_log_is_refused_with_file_row_and_field(vehicle, tmp_path):
-    source = write(tmp_path / "source", LOGS[:3])
-    rows = ("0,0,0,1,1,0,0,0,0,0,0,0,0,0,600,600,600,600", "0.01,0,0,1,1,0,0,0,fast,0,0,0,0,0,600,600,600,600")
-    (source / "bad.csv").write_text("\n".join(["t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3", *rows]))
-    run = command("real_flight", "--vehicle", str(vehicle), "--source", str(source), folder=tmp_path)
-    run.stderr = run.stderr.splitlines()[-1]  # after that of the step
-    line = refused(run, "real_flight")
-    assert line.startswith(f"real_flight: {source / 'bad.csv'}: row 3, field vx: ")
-    left = (tmp_path / "out" / "real_flight").iterdir()
-    assert [path.name for path in left] == [".lock"]  # no partial results
 
 
 def row(model, value, *, n=0, seed=0, flight="a", **columns):

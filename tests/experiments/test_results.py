@@ -54,11 +54,6 @@ def test_rows_that_are_not_finite_count_as_infinitely_bad():
     assert all(each["test_mse"] is None and each["rho"] is None for each in cell)
 
 
-def test_gain_is_one_where_only_the_source_error_is_infinite():
-    rows = changed(make_rows(), "no_physics", "source_only", 0, test_mse=math.inf)
-    assert rows.where(model="no_physics", mode="fine_tuned", n_train=100).spread(gain).mean == 1.0
-
-
 def test_select_group_and_sort():
     rows = make_rows()
     few = rows.where(lambda each: each["seed"] > 0, n_train=(100, 500), model="hybrid")
