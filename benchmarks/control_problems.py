@@ -17,7 +17,7 @@ from hybrid_jax import rotation
 from hybrid_jax.control import Controller, figure_eight, hover, low_flyby, sample, step
 from hybrid_jax.control.references import Path
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.networks import multirotor_network
 from hybrid_jax.rotation import from_axis_angle
@@ -77,7 +77,10 @@ def trained(activation: str, epochs: int, hidden: int = 64, **options) -> Abstra
 
 def adapted(model: AbstractVectorField) -> AbstractVectorField:
     """The model after least squares on flights of `VEHICLE` with 1.2 times the inertia, in a wind."""
-    other = disturbed(hj.rigid_body(hj.IRIS, ("Ix", "Iy"), VEHICLE.terms), jnp.array([1.5, 0.5, 0.0, 0.0, 0.0, 0.0]))
+    other = hj.Hybrid(
+        hj.rigid_body(hj.IRIS, ("Ix", "Iy"), VEHICLE.terms),
+        ConstantDisturbance(jnp.array([1.5, 0.5, 0.0, 0.0, 0.0, 0.0])),
+    )
     heavier = jax.tree.map(lambda log_ratio: log_ratio + np.log(1.2), other.physics)
     other = hj.Hybrid(heavier, other.residual)
     return hj.adapt(model, flights(other, 200, seed=1), method="least_squares").field

@@ -24,7 +24,7 @@ from benchmarks.shooting import Shooting, Solution
 from benchmarks.timing import Findings, Ratio, run, table
 from hybrid_jax.control import Controller, Plan, advance, figure_eight, fly, performance, sample
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.networks import smoothed
 
 ITERATIONS = 40
@@ -85,7 +85,7 @@ def build(preset: Preset) -> dict[str, AbstractVectorField]:
 def _plan(model: AbstractVectorField, wind: Array, reference: Array, x: Array, plan: Plan, iterations: Array) -> Plan:
     """The number of iterations is traced, so that all share one program."""
     return Controller(CONTROLLER.vehicle, iterations=iterations)(  # pyright: ignore[reportArgumentType]
-        disturbed(model, wind), reference, x, plan
+        hj.Hybrid(model, ConstantDisturbance(wind)), reference, x, plan
     )[1]
 
 

@@ -13,7 +13,8 @@ from benchmarks.control_problems import Problem
 from hybrid_jax.control import Controller, Weights
 from hybrid_jax.control.controller import VARIABLE_BOUND
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.export import casadi_function
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 
@@ -104,7 +105,7 @@ def _step(model: AbstractVectorField, dt: float, half: float) -> ca.Function:
     """x⁺ from x, shares and a constant acceleration, with a quaternion of length 1."""
 
     def windy(x, both):
-        return disturbed(model, both[INPUT_SIZE:])(x, both[:INPUT_SIZE])
+        return Hybrid(model, ConstantDisturbance(both[INPUT_SIZE:]))(x, both[:INPUT_SIZE])
 
     x, share, wind = ca.SX.sym("x", STATE_SIZE), ca.SX.sym("s", INPUT_SIZE), ca.SX.sym("w", 6)
     step = casadi_function(windy, dt, state_size=STATE_SIZE, input_size=INPUT_SIZE + 6)  # pyright: ignore

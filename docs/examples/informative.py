@@ -25,7 +25,14 @@ limits = hj.InputBounds(
     state_high=(1.0, 2.0),
 )
 plan = hj.excitation(
-    cart, None, limits, noise=[1e-3, 1e-2], seconds=4.0, dt=0.02, steps=50
+    cart,
+    None,
+    limits,
+    jax.random.key(0),
+    noise=[1e-3, 1e-2],
+    seconds=4.0,
+    dt=0.02,
+    steps=50,
 )
 print(
     {name: f"± {error:.2g}" for name, error in plan.standard_errors.items()}

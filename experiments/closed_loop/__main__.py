@@ -7,7 +7,7 @@ import jax
 from rich.console import Console
 
 from experiments.closed_loop import models
-from experiments.closed_loop.claims import Evidence, Speed, claims
+from experiments.closed_loop.claims import FlightEvidence, Speed, claims
 from experiments.closed_loop.config import PRESETS, ClosedLoopConfig
 from experiments.closed_loop.figures import draw
 from experiments.closed_loop.flights import DOMAINS, Flown, ModelSet, Scenario, fly_all, results_of
@@ -135,7 +135,7 @@ def write(config: ClosedLoopConfig, trained: dict[str, Trained], flown: Sequence
     call, simulated = timed[Agent("hybrid", few).name], config.seconds * len(rows)
     spent, worked = sum(each.seconds for each in flown), sum(each.processor_seconds for each in flown)
     clocked = call["processor_ms"], call["median_ms"], simulated, spent, worked, flown[0].devices
-    verdicts = evaluate(claims(few), Evidence(rows, Speed(*clocked)))
+    verdicts = evaluate(claims(few), FlightEvidence(rows, Speed(*clocked)))
     notes = [f"{name}: {note}" for name, stages in training.items() for note in stages.notes()]
     notes += [f"least squares: {note}" for note in models.disturbance_counts(trained["least_squares"])]
     seconds = {f"{name}, {stage}": taken for name, own in training.items() for stage, taken in own.seconds.items()}

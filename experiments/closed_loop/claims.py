@@ -34,7 +34,7 @@ class Speed(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Evidence:
+class FlightEvidence:
     """All rows, and the speed."""
 
     rows: Results
@@ -61,15 +61,17 @@ class Evidence:
         return [name for name in REFERENCES if name in own]
 
 
-def claims(few: int) -> list[Claim[Evidence]]:
-    made: list[Claim[Evidence]] = [Claim(id, text, lambda e, f=fast: f(e.speed)) for id, text, fast in SPEED_CLAIMS]
+def claims(few: int) -> list[Claim[FlightEvidence]]:
+    made: list[Claim[FlightEvidence]] = [
+        Claim(id, text, lambda e, f=fast: f(e.speed)) for id, text, fast in SPEED_CLAIMS
+    ]
     for (number, text, parts), (letter, model) in product(CLAIMS, zip("abc", SOURCES, strict=True)):
         own = partial(parts, Agent(SOURCES[model]), Agent(model, few))
         made.append(Claim(f"R{number}{letter}", f"{LEARNED[model]}: {text}", lambda e, own=own: all_of(own(e))))
     return sorted(made, key=lambda claim: claim.id)
 
 
-def _smaller_in_wind(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
+def _smaller_in_wind(source: Agent, adapted: Agent, e: FlightEvidence) -> Iterator[Part]:
     for reference in THREE:
         before, after = (e.errors(agent, EXTERNAL_FORCE, reference).mean() for agent in (source, adapted))
         new, old = ((agent, EXTERNAL_FORCE, reference) for agent in (adapted, source))
@@ -78,7 +80,7 @@ def _smaller_in_wind(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Par
         yield excess.below(0), f"{words}, after − before / {WIND_FACTOR:g}: {excess.text('.2g')}"
 
 
-def _closes_the_gap(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
+def _closes_the_gap(source: Agent, adapted: Agent, e: FlightEvidence) -> Iterator[Part]:
     for reference in THREE:
         _, errors, _ = (e.errors(agent, EXTERNAL_FORCE, reference) for agent in (source, adapted, ORACLE))
         share = gaps(e.rows.where(reference=reference), EXTERNAL_FORCE)[adapted][reference]
@@ -88,7 +90,7 @@ def _closes_the_gap(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part
         yield closed, f"{REFERENCES[reference]}: {value:.1f} % ({low:.1f} … {high:.1f})"
 
 
-def _none_worse(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
+def _none_worse(source: Agent, adapted: Agent, e: FlightEvidence) -> Iterator[Part]:
     for reference in e.references(adapted):
         new, old = ((agent, PARAMETER_SHIFT, reference) for agent in (adapted, source))
         after, before, change = e.errors(*new).mean(), e.errors(*old).mean(), e.difference(new, old)
@@ -97,7 +99,7 @@ def _none_worse(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
         yield equal or change.below(0), f"{REFERENCES[reference]}: {' → '.join(_cm(before, after))}, {remark}"
 
 
-def _cost_predicted(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
+def _cost_predicted(source: Agent, adapted: Agent, e: FlightEvidence) -> Iterator[Part]:
     def error(*place: Any) -> Estimate:
         return e.group(*place).interval(uncrashed("excess", 100.0))
 
@@ -110,7 +112,7 @@ def _cost_predicted(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part
         yield within, f"{REFERENCES[reference]}: {value.text('+.1f')} % ({others})"
 
 
-def _observer_adds(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
+def _observer_adds(source: Agent, adapted: Agent, e: FlightEvidence) -> Iterator[Part]:
     agents = adapted, replace(source, observer=True), replace(adapted, observer=True)
     for place in product((PARAMETER_SHIFT, EXTERNAL_FORCE), THREE):
         *single, both = (e.errors(agent, *place).mean() for agent in agents)
@@ -122,7 +124,7 @@ def _observer_adds(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]
         yield smaller, f"{LABELS[place[0]]}, {REFERENCES[place[1]]}: {words}"
 
 
-def _same_away(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
+def _same_away(source: Agent, adapted: Agent, e: FlightEvidence) -> Iterator[Part]:
     places = e.rows.where(lambda row: row["distance"] > 0, **asdict(adapted)).group("domain", "reference", "distance")
     if not places:
         raise Undecided("nothing was flown away from home")
@@ -162,7 +164,7 @@ def _cm(*means: float) -> list[str]:
 _THREE = ", ".join(REFERENCES[reference] for reference in THREE)
 _EQUAL = f"equal: within {1e6 * RESOLUTION:.2f} µm, the rounding of single precision"
 _PAIRED = "95 % interval of the paired difference over seeds"
-CLAIMS: list[tuple[int, str, Callable[[Agent, Agent, Evidence], Iterator[Part]]]] = [
+CLAIMS: list[tuple[int, str, Callable[[Agent, Agent, FlightEvidence], Iterator[Part]]]] = [
     (1, f"in the wind the mean RMSE of the source model is at least {WIND_FACTOR:g} times that of the model adapted "
         f"with the smallest N, on each of {_THREE} ({_PAIRED} [cm]).", _smaller_in_wind),
     (2, f"in the wind adaptation with the smallest N closes at least {GAP_SHARE:.0%} of the gap between the source "

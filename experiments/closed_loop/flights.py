@@ -35,7 +35,7 @@ SPENT = ("seconds", "processor_seconds", "devices")
 ModelSet = Mapping[Agent, AbstractVectorField]  # stacked over seeds
 
 
-class Flight(NamedTuple):
+class FlightSetup(NamedTuple):
     """The arrays that define one flight: `home` is the reference's offset [m], `bandwidth` the observer's [rad/s]."""
 
     model: AbstractVectorField
@@ -68,12 +68,12 @@ class Scenario:
     def keys(self) -> list[tuple[Agent, int]]:
         return [(agent, seed) for agent, models in self.models.items() for seed in range(count(models))]
 
-    def flights(self) -> Iterator[Flight]:
+    def flights(self) -> Iterator[FlightSetup]:
         home = np.array([self.distance, self.distance, 0.0], np.float32) / np.float32(np.sqrt(2))
         world, path = world_of(self.domain), np.asarray(list(PATHS).index(self.reference), np.int32)
         for agent, seed in self.keys():
             bandwidth = np.asarray(self.bandwidth * agent.observer, np.float32)
-            yield Flight(lane(self.models[agent], seed), world, path, home, bandwidth, np.asarray(seed, np.int32))
+            yield FlightSetup(lane(self.models[agent], seed), world, path, home, bandwidth, np.asarray(seed, np.int32))
 
     def described(self) -> list[Any]:
         """Describe all inputs of the results except controller and hardware; see `identity_of`."""
@@ -154,7 +154,7 @@ def _fly(simulate, most: Mapping[tuple, int], made: dict[tuple, LaneMap], shared
 def _simulate(
     controller: Controller,
     hardware: Hardware,
-    flight: Flight,
+    flight: FlightSetup,
     references: Float[Array, "k n 13"],
     starts: Float[Array, "k 13"],
 ) -> dict[str, Array]:

@@ -18,7 +18,7 @@ from experiments.excitation.results import (
     DESIGNED,
     FLIGHTS,
     RANDOM,
-    Evidence,
+    DesignEvidence,
     Flown,
     conclusion,
     described,
@@ -120,7 +120,7 @@ def experiment(config: ExcitationConfig, console: Console) -> None:
     if not hosts.is_main_process():
         return
     own = flights[DESIGNED, 0]
-    evidence = Evidence(rows, margins(config.bounds, own[0]))
+    evidence = DesignEvidence(rows, margins(config.bounds, own[0]))
     verdicts, out = evaluate(CLAIMS, evidence), config.out / NAME
     report = Report(
         experiment=NAME,
@@ -142,7 +142,8 @@ def designed(config: ExcitationConfig) -> Excitation:
     model = with_disturbance(rigid_body(IRIS, config.parameters))
     noise = sizes(noise_of(config)).tolist()
     search = {name: getattr(config, name) for name in ("seconds", "bandwidth", "starts", "steps")}
-    return excitation(model, config.parameters, config.bounds, noise=noise, window=STEPS * DT, dt=DT, **search)
+    given = {"noise": noise, "window": STEPS * DT, "dt": DT} | search
+    return excitation(model, config.parameters, config.bounds, jax.random.key(0), **given)
 
 
 def noise_of(config: ExcitationConfig) -> Noise:

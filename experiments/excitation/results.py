@@ -27,7 +27,7 @@ WIDEST = 1000.0  # %: wider intervals say nothing
 Flown = tuple[Float[np.ndarray, "n+1 13"], Float[np.ndarray, "n rotors"]]  # true states, rotor speeds
 
 
-class Evidence(NamedTuple):
+class DesignEvidence(NamedTuple):
     rows: Results
     margins: Mapping[str, tuple[float, float]]  # of each limit: how far the flown flight went, and the limit
 
@@ -56,12 +56,12 @@ def ratio(rows: Results, name: str, column: str = "half_width") -> Estimate:
     return Estimate(*map(math.exp, mean_interval(logs, list(ours))))
 
 
-def _halves(evidence: Evidence) -> Part:
+def _halves(evidence: DesignEvidence) -> Part:
     found = ratio(evidence.rows, RANDOM)
     return found.below(GOAL), f"{found.text('.2f')} of that after random flight"
 
 
-def _stays_inside(evidence: Evidence) -> Part:
+def _stays_inside(evidence: DesignEvidence) -> Part:
     found = evidence.margins.items()
     return all_of((used <= limit, f"{name} {used:.2f} of {limit:.2g}") for name, (used, limit) in found)
 
@@ -118,7 +118,7 @@ def tables(rows: Results) -> list[Table]:
     ]
 
 
-def margin_table(design: Excitation, evidence: Evidence) -> Table:
+def margin_table(design: Excitation, evidence: DesignEvidence) -> Table:
     planned = {name: f"{left:.0%}" for name, left in design.margins.items()}
     lines = [
         (name, f"{limit:.2g}", planned.get(name.split(" ")[0], ""), f"{used:.2f}")

@@ -60,17 +60,21 @@ class Options:
     """`motor_data` of the data set, with the folders normal_flight and cut_propeller_M3_…"""
 
 
-class Flight(NamedTuple):
+class RecordedFlight(NamedTuple):
     """A flight, and the remaining length [mm] of its propeller M3."""
 
     recording: Recording
     length: float
 
 
-def flights(folder: Path, vehicle: str = "E8") -> tuple[list[Flight], list[Flight]]:
-    normal = [Flight(read_recording(path), WHOLE) for path in sorted((folder / "normal_flight").glob(f"{vehicle}_*"))]
+def flights(folder: Path, vehicle: str = "E8") -> tuple[list[RecordedFlight], list[RecordedFlight]]:
+    normal = [
+        RecordedFlight(read_recording(path), WHOLE) for path in sorted((folder / "normal_flight").glob(f"{vehicle}_*"))
+    ]
     found = sorted(folder.glob(f"cut_propeller_M3_*/{vehicle}_*"))
-    cut = [Flight(read_recording(path), float(re.findall(r"([\d.]+)mm", path.parent.name)[-1])) for path in found]
+    cut = [
+        RecordedFlight(read_recording(path), float(re.findall(r"([\d.]+)mm", path.parent.name)[-1])) for path in found
+    ]
     if not normal or not cut:
         raise ValueError(f"{folder}: no flights normal_flight/{vehicle}_* and cut_propeller_M3_*/{vehicle}_*")
     return normal, sorted(cut, key=lambda each: -each.length)
@@ -88,7 +92,7 @@ def force_errors(field: Any, recording: Recording, after: float = 0.0) -> np.nda
     return error[within(t, airborne(recording)) & (t >= after)]
 
 
-def source(normal: list[Flight]) -> Any:
+def source(normal: list[RecordedFlight]) -> Any:
     learn = rigid_body(VEHICLE, ("k_rotors",))
     field = actuated(learn, ACTUATOR, ("time_constant",))
     return identify(field, [each.recording for each in normal], LAYOUT, MEASURED).field
@@ -99,13 +103,13 @@ def first_seconds(recording: Recording, seconds: float = SECONDS) -> tuple[Recor
     return recording.part(begin, begin + seconds), begin + seconds
 
 
-def take_off(field: Any, normal: list[Flight]) -> Any:
+def take_off(field: Any, normal: list[RecordedFlight]) -> Any:
     """Fit each rotor to normal flights in the seconds after take-off."""
     parts = [first_seconds(each.recording)[0] for each in normal]
     return identify(changed(field, np.zeros(VEHICLE.rotors)), parts, SHORT, MEASURED, free=("efficiency",)).field
 
 
-def damage(fresh: Any, flight: Flight) -> tuple[np.ndarray, Float[np.ndarray, " n"], float]:
+def damage(fresh: Any, flight: RecordedFlight) -> tuple[np.ndarray, Float[np.ndarray, " n"], float]:
     """Return each rotor's lost share of thrust in the first seconds, with intervals; log efficiencies; their end.
 
     All four are estimated from thrust and trim; then only the worst one is fitted to the accelerometer.

@@ -24,7 +24,7 @@ from hybrid_jax.adaptation.ridge import defects
 from hybrid_jax.cli.compared import inputs_of
 from hybrid_jax.dynamics import FrozenRates, HoldState, Terms
 from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.flights.checks.airborne import airborne, within
@@ -102,7 +102,7 @@ def predicted(field, tests: hj.Trajectories, observed: bool) -> Float[Array, "n 
     lacked = defects(field, past).reshape(len(x), PAST, -1).mean(axis=1)[:, VELOCITY.start :]
 
     def predict(x0, u, value):
-        return hj.rollout(disturbed(field, observed * value), x0, u, dt)
+        return hj.rollout(hj.Hybrid(field, ConstantDisturbance(observed * value)), x0, u, dt)
 
     return jax.vmap(predict)(x[:, PAST - 1], u[:, PAST:], lacked)
 

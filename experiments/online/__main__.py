@@ -7,7 +7,7 @@ from rich.console import Console
 from experiments.online.config import PRESETS, OnlineConfig
 from experiments.online.figures import draw
 from experiments.online.flights import fly_all
-from experiments.online.results import Evidence, claims, conclusion, results_of, tables
+from experiments.online.results import GoalEvidence, claims, conclusion, results_of, tables
 from experiments.online.timing import step_time
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.plots import save_figures
@@ -44,7 +44,7 @@ def experiment(config: OnlineConfig, console: Console) -> None:
     stages = stages_of(config, console)
     run = fly_all(config, stages)
     rows, step = results_of(run), step_time(config.hardware(), config.controller().period)
-    evidence = Evidence(rows, step, run.seconds, run.processor_seconds, len(rows))
+    evidence = GoalEvidence(rows, step, run.seconds, run.processor_seconds, len(rows))
     verdicts = evaluate(claims(list(config.changes)), evidence)
     out = config.out / NAME
     report = Report(

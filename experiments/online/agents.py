@@ -15,7 +15,8 @@ from experiments.flying.plant import wind_force
 from hybrid_jax.control import Hardware, Observer, advance
 from hybrid_jax.control.observer import MOTION
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
-from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
+from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, with_disturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
 from hybrid_jax.dynamics.terms import Terms, units_of
@@ -114,7 +115,7 @@ class FixedModel(AbstractEstimator):
     def model(self, state):
         force = wind_force(self.clock + state[1])
         known = self.share * jnp.concatenate([force, jnp.zeros(3)]) / IRIS.mass
-        return disturbed(self.observer.field, state[0].disturbance + known)
+        return Hybrid(self.observer.field, ConstantDisturbance(state[0].disturbance + known))
 
 
 class L1(AbstractEstimator):

@@ -22,7 +22,7 @@ TAGS = ("change", "reference", "agent", "seed")
 
 
 @dataclass(frozen=True)
-class Evidence:
+class GoalEvidence:
     rows: Results
     step_ms: float  # processor time of one step of the filter on one core
     seconds: float  # of all flights, on the clock, without compiling
@@ -117,7 +117,7 @@ def _coverage(rows: Results) -> list[Table]:
     return [Table(title, ("change", *NAMES), lines)] if lines else []
 
 
-def _compared(e: Evidence, change: str, other: str, factor: float) -> Iterator[Part]:
+def _compared(e: GoalEvidence, change: str, other: str, factor: float) -> Iterator[Part]:
     """On each reference, whether online adaptation's error is at most a factor times another agent's."""
     for reference in e.rows.unique("reference"):
         own, others = (e.rows.where(change=change, agent=name, reference=reference) for name in ("online", other))
@@ -129,7 +129,7 @@ def _compared(e: Evidence, change: str, other: str, factor: float) -> Iterator[P
         yield excess.below(0), f"{REFERENCES[reference]}: {text}"
 
 
-def _no_crash(e: Evidence) -> Part:
+def _no_crash(e: GoalEvidence) -> Part:
     own, oracle = (e.rows.where(agent=agent).group("change", "reference", "seed") for agent in ("online", "oracle"))
     if not oracle or not own:
         raise Undecided("the oracle or the online adaptation did not fly")
@@ -138,7 +138,7 @@ def _no_crash(e: Evidence) -> Part:
     return crashes == 0, f"{crashes} of {len(own)} flights, the oracle {len(lost)}"
 
 
-def _holds_truth(e: Evidence) -> Iterator[Part]:
+def _holds_truth(e: GoalEvidence) -> Iterator[Part]:
     for change, own in e.rows.where(agent="online").group("change").items():
         shares = np.array([list(row["inside"].values()) for row in own], float).mean(axis=1)
         if not np.isfinite(shares).all():
@@ -148,11 +148,11 @@ def _holds_truth(e: Evidence) -> Iterator[Part]:
         yield holds, f"{CHANGE_NAMES[change]}: {shares.mean():.2f}"
 
 
-def _fast_step(e: Evidence) -> Part:
+def _fast_step(e: GoalEvidence) -> Part:
     return e.step_ms <= STEP_MS, f"{e.step_ms:.3f} ms"
 
 
-def _fast_table(e: Evidence) -> Part:
+def _fast_table(e: GoalEvidence) -> Part:
     minutes, alone = (FLIGHTS / e.flights * taken / 60 for taken in (e.seconds, e.processor_seconds))
     words = f"{minutes:.1f} minutes on the clock, {alone:.1f} of one core's time (from {e.flights} flights)"
     return minutes <= MINUTES, words
@@ -169,8 +169,8 @@ _COVERS = (
 )
 
 
-def claims(changes: list[str]) -> list[Claim[Evidence]]:
-    def near(letter: str, change: str) -> Claim[Evidence]:
+def claims(changes: list[str]) -> list[Claim[GoalEvidence]]:
+    def near(letter: str, change: str) -> Claim[GoalEvidence]:
         text = f"{CHANGE_NAMES[change]}: {_NEAR}"
         return Claim(f"O1{letter}", text, lambda e: all_of(_compared(e, change, "oracle", FACTOR)))
 

@@ -23,7 +23,7 @@ THETA_TOLERANCE = 0.05  # C10
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PaperEvidence:
     """The rows of one domain, by cell, and the target vehicle's true Ix, Iy [kg m²] and k [N/(rad/s)²]."""
 
     domain: str
@@ -55,25 +55,25 @@ class Evidence:
             raise Undecided(f"{label(first[0])} at N = {first[1]}: {why}") from None
 
 
-Predicate = Callable[[Evidence], Iterator[Part]]
+Predicate = Callable[[PaperEvidence], Iterator[Part]]
 
 
 def claims(rows: Results, experiment: str, truth: Mapping[str, float] | None, quick: bool = False) -> list[Verdict]:
     """Evaluate the claims about one of DOMAINS_OF, for a quick preset only `QUICK`; errors not finite are infinite."""
-    evidence = [Evidence(domain, cells(rows.where(domain=domain)), truth) for domain in DOMAINS_OF[experiment]]
+    evidence = [PaperEvidence(domain, cells(rows.where(domain=domain)), truth) for domain in DOMAINS_OF[experiment]]
     own = [id for id in CLAIMS if experiment in ONLY.get(id, ("param_shift", "external_force"))]
     judge = {id: _too_few if quick and id not in QUICK else partial(_in_each_domain, CLAIMS[id][1]) for id in own}
     return evaluate([Claim(id, CLAIMS[id][0], judge[id]) for id in own], evidence)
 
 
-def _too_few(evidence: Sequence[Evidence]) -> Part:
+def _too_few(evidence: Sequence[PaperEvidence]) -> Part:
     raise Undecided("a quick run has too few seeds and sizes to judge this; --preset paper has enough")
 
 
-def _in_each_domain(predicate: Predicate, evidence: Sequence[Evidence]) -> Part:
+def _in_each_domain(predicate: Predicate, evidence: Sequence[PaperEvidence]) -> Part:
     """Whether a claim is true in each domain; it is not judged if one lacks data."""
 
-    def part(e: Evidence) -> Part:
+    def part(e: PaperEvidence) -> Part:
         place = f"{label(e.domain)}: " if len(evidence) > 1 else ""
         try:
             holds, measured = all_of(predicate(e))
@@ -84,21 +84,21 @@ def _in_each_domain(predicate: Predicate, evidence: Sequence[Evidence]) -> Part:
     return all_of(map(part, evidence))
 
 
-def _lower_error(e: Evidence) -> Iterator[Part]:
+def _lower_error(e: PaperEvidence) -> Iterator[Part]:
     for n in e.sizes():
         hybrid, plain = (e.mse(model, n).mean for model in (HYBRID, NO_PHYSICS))
         difference = e.difference((HYBRID, n), (NO_PHYSICS, n))
         yield difference.below(0), f"N = {n}: hybrid {hybrid:.3g}, no-physics {plain:.3g}, {_minus(difference)}"
 
 
-def _higher_rho(e: Evidence) -> Iterator[Part]:
+def _higher_rho(e: PaperEvidence) -> Iterator[Part]:
     for n in e.sizes():
         hybrid, plain = (e.rows(model, n).spread(gain).mean for model in (HYBRID, NO_PHYSICS))
         difference = e.difference((HYBRID, n), (NO_PHYSICS, n), column=gain)
         yield difference.above(0), f"N = {n}: hybrid {hybrid:.3g}, no-physics {plain:.3g}, {_minus(difference)}"
 
 
-def _less_spread(e: Evidence) -> Iterator[Part]:
+def _less_spread(e: PaperEvidence) -> Iterator[Part]:
     for n in e.sizes():
         hybrid, plain = (_by_seed(e.rows(model, n)) for model in (HYBRID, NO_PHYSICS))
         if hybrid.keys() != plain.keys():
@@ -111,7 +111,7 @@ def _by_seed(rows: Results) -> dict[int, float]:
     return {seed: own.spread("test_mse").mean for seed, own in rows.group("seed").items()}
 
 
-def _only_hybrid_adapts(e: Evidence) -> Iterator[Part]:
+def _only_hybrid_adapts(e: PaperEvidence) -> Iterator[Part]:
     n = e.sizes()[0]
     hybrid, group = e.rows(HYBRID, n).interval(gain), e.rows(NO_PHYSICS, n)
     plain, failed = group.interval(gain), sum(row["status"] == "diverged" or row["test_mse"] is None for row in group)
@@ -121,7 +121,7 @@ def _only_hybrid_adapts(e: Evidence) -> Iterator[Part]:
     yield diverges or plain.below(0), words
 
 
-def _falls_with_n(e: Evidence) -> Iterator[Part]:
+def _falls_with_n(e: PaperEvidence) -> Iterator[Part]:
     sizes = e.sizes()
     if len(sizes) < 2:
         raise Undecided("needs two sizes N")
@@ -131,12 +131,12 @@ def _falls_with_n(e: Evidence) -> Iterator[Part]:
         yield every(change.below(0) for change in steps.values()), f"{label(model)} from {shown}"
 
 
-def _beats_source_only(e: Evidence) -> Iterator[Part]:
+def _beats_source_only(e: PaperEvidence) -> Iterator[Part]:
     means = {n: e.rows(HYBRID, n).interval(gain) for n in e.sizes()}
     return ((mean.above(0), f"N = {n}: ρ = {mean.text()}") for n, mean in means.items())
 
 
-def pretraining_helps(e: Evidence, few: int, large: Sequence[int], equally: bool = True) -> Iterator[Part]:
+def pretraining_helps(e: PaperEvidence, few: int, large: Sequence[int], equally: bool = True) -> Iterator[Part]:
     """Significantly with few windows, and not with a large number; `equally`: nor the other way round."""
     for n in (few, *large):
         alone, tuned = (HYBRID, n, TARGET_ONLY), (HYBRID, n)
@@ -145,14 +145,14 @@ def pretraining_helps(e: Evidence, few: int, large: Sequence[int], equally: bool
         yield holds, f"N = {n}: ratio {ratio(e.mse(*alone), e.mse(*tuned)):.3g}, {_minus(most, CLEARLY)}"
 
 
-def _pretraining_helps_when_small(e: Evidence) -> Iterator[Part]:
+def _pretraining_helps_when_small(e: PaperEvidence) -> Iterator[Part]:
     smallest, large = e.sizes()[0], [n for n in e.sizes() if n >= EQUAL_FROM]
     if smallest >= EQUAL_FROM or not large:
         raise Undecided(f"needs a size N below {EQUAL_FROM} and one from {EQUAL_FROM} on")
     return pretraining_helps(e, smallest, large)
 
 
-def few_are_enough(e: Evidence, few: int = FEW, many: int = MANY) -> Iterator[Part]:
+def few_are_enough(e: PaperEvidence, few: int = FEW, many: int = MANY) -> Iterator[Part]:
     excess = e.difference((HYBRID, few), (HYBRID, many), CLEARLY)
     yield excess.below(0), f"ratio {ratio(e.mse(HYBRID, few), e.mse(HYBRID, many)):.3g}, {_minus(excess, CLEARLY)}"
 
@@ -168,7 +168,7 @@ def _minus(difference: Estimate, times: float = 1.0) -> str:
     return f"difference {difference.text()}" if times == 1 else f"first − {times} × second {difference.text()}"
 
 
-def _leads_the_baselines(e: Evidence) -> Iterator[Part]:
+def _leads_the_baselines(e: PaperEvidence) -> Iterator[Part]:
     expert = names.EXPERT_AUGMENTATION, 0, names.SOURCE_ONLY
     groups = e.rows(HYBRID, FEW), e.rows(*expert), e.rows(names.PHYSICS_ONLY, FEW)
     seeds = sorted({seed for rows in groups for seed in rows["seed"]})
@@ -186,7 +186,7 @@ def _leads_the_baselines(e: Evidence) -> Iterator[Part]:
         yield found == {True}, words
 
 
-def _theta_recovered(e: Evidence) -> Iterator[Part]:
+def _theta_recovered(e: PaperEvidence) -> Iterator[Part]:
     if e.truth is None:
         raise Undecided("the true θ_p is not given")
     for n in e.sizes():

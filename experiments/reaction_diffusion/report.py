@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping
 
-from experiments.paper.claims import CLAIMS, CLEARLY, Evidence, few_are_enough, pretraining_helps
+from experiments.paper.claims import CLAIMS, CLEARLY, PaperEvidence, few_are_enough, pretraining_helps
 from experiments.paper.lanes import cells
 from experiments.reaction_diffusion import forecast, gray_scott, shifted
 from experiments.reaction_diffusion.config import LOCAL, POINTWISE
@@ -116,13 +116,13 @@ def claims(rows: Results) -> list[Claim[Results]]:
     return found
 
 
-def _under(shift: str, parts: Callable[[Evidence], Iterable[Part]]) -> Callable[[Results], Part]:
+def _under(shift: str, parts: Callable[[PaperEvidence], Iterable[Part]]) -> Callable[[Results], Part]:
     """Return a claim about one change, of the paper's models and modes, by the columns of the paper's rows."""
 
     def judged(rows: Results) -> Part:
         own = rows.where(shift=shift, model=(HYBRID, NO_PHYSICS), mode=(FINE_TUNED, TARGET_ONLY))
         named = Results([{**row, "n_train": row["n"], "test_mse": row["mse"], "status": ""} for row in own])
-        return all_of(parts(Evidence(shift, cells(named), None)))
+        return all_of(parts(PaperEvidence(shift, cells(named), None)))
 
     return judged
 
@@ -143,7 +143,7 @@ def _scott(rows: Results) -> Part:
     return mean < SCOTT_PUBLISHED["Neural Context Flows, best"], f"mean {mean:.2e}"
 
 
-def _ends(e: Evidence) -> tuple[int, int]:
+def _ends(e: PaperEvidence) -> tuple[int, int]:
     if len(sizes := e.sizes()) < 2:
         raise Undecided("needs two sizes N")
     return sizes[0], sizes[-1]

@@ -77,11 +77,11 @@ def run(options: Options) -> int:
     model = load(options.model)
     dt, field = model.about.get("dt", 0.01), with_disturbance(without_past(model.field))
     box = FlightBounds(options.low, options.high, options.speed, options.tilt, options.yaw, options.rotor_speed)
-    search = {name: getattr(options, name) for name in ("seconds", "bandwidth", "starts", "steps", "seed")}
+    search = {name: getattr(options, name) for name in ("seconds", "bandwidth", "starts", "steps")}
     search |= {"noise": options.noise or None, "window": WINDOW * dt, "dt": dt}
     with step("searching for the flight, a minute or two"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = excitation(field, options.learn or None, box, **search)
+        found = excitation(field, options.learn or None, box, jax.random.key(options.seed), **search)
     place, yaw = jax.vmap(found.reference)(found.t)
     points = np.column_stack([found.t, place, yaw, found.states[:, VELOCITY]])
     lines = [HEADER, *(",".join(f"{number:.5g}" for number in row) for row in points)]

@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 from hybrid_jax.control.cost import Scalar
 from hybrid_jax.control.sensitivities import advance
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.rotation import canonicalize_quaternion
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, State
@@ -53,4 +54,4 @@ class Observer(AbstractEstimator):
         return Watched(state.disturbance - jnp.expm1(-self.bandwidth * self.period) * error, x)
 
     def model(self, state):
-        return disturbed(self.field, state.disturbance)
+        return Hybrid(self.field, ConstantDisturbance(state.disturbance))

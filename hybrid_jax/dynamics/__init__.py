@@ -4,7 +4,7 @@ from hybrid_jax.dynamics.actuators import Actuated, Actuator, actuated, rotor_sp
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.composition import Frozen, Hybrid, unfreeze
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, with_disturbance
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, with_disturbance
 from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.grids import Diffusion, Grid, check_grid, diffusion
@@ -16,7 +16,7 @@ from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 
 __all__ = ["AbstractVectorField", "Frozen", "FrozenRates", "HoldState", "Hybrid", "trainable", "unfreeze"]
 __all__ += ["Actuated", "Actuator", "Diffusion", "Grid", "actuated", "check_grid", "diffusion", "rotor_speeds"]
-__all__ += ["AbstractEstimator", "ConstantDisturbance", "DisturbanceModel", "disturbed", "with_disturbance"]
+__all__ += ["AbstractEstimator", "ConstantDisturbance", "DisturbanceModel", "with_disturbance"]
 __all__ += ["RigidBody", "Terms", "VehicleModel", "load_vehicle_model", "rigid_body"]
 __all__ += ["Delay", "Lag", "LinearDynamics", "Oscillator", "RandomWalk", "with_hidden"]
 __all__ += ["StateSpaceModel"]

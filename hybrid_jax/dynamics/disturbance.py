@@ -57,17 +57,6 @@ class ConstantDisturbance(AbstractVectorField):
         return jnp.stack([entries.get(i, zero) for i in range(d)])
 
 
-def disturbed(field: AbstractVectorField, value: Float[Array, " k"], indices: tuple[int, ...] | None = None) -> Hybrid:
-    """ẋ = f(x, u) + d.
-
-    Args:
-        field: f, the undisturbed field.
-        value: d (k), one number for each disturbed state in its unit per second, or a scalar for every state.
-        indices: the disturbed states; by default the last k.
-    """
-    return Hybrid(field, ConstantDisturbance(value, indices))
-
-
 def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None = None) -> AbstractVectorField:
     """The field with a constant disturbance in its physics, zero unless it already has one.
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
@@ -79,6 +79,7 @@ def excitation(
     model: AbstractVectorField,
     parameters: Sequence[str] | None,
     bounds: FlightBounds | InputBounds,
+    key: PRNGKeyArray,
     *,
     seconds: float = 10.0,
     noise: Sequence[float] | None = None,
@@ -87,7 +88,6 @@ def excitation(
     bandwidth: float = 2.0,
     starts: int = 4,
     steps: int = 200,
-    seed: int = 0,
 ) -> Excitation:
     """Design the most informative flight, or inputs, for estimating parameters.
 
@@ -101,6 +101,7 @@ def excitation(
         model: a multirotor with `FlightBounds`, else any field with `InputBounds`, with a guess of its parameters.
         parameters: names as in `intervals`; by default all but a disturbance.
         bounds: limits of the plan.
+        key: random key of the series that the search starts from.
         seconds: duration of the plan [s].
         noise: standard deviation of each state's white noise; by default typical of motion capture for a multirotor.
         window: length of the windows [s], a multiple of `dt`.
@@ -108,7 +109,6 @@ def excitation(
         bandwidth: highest frequency of the series [Hz].
         starts: number of random series to start from; the best result is returned.
         steps: of Adam.
-        seed: of the random series.
 
     Raises:
         ValueError: an unknown parameter, bounds of the wrong kind, limits that rest violates, or parameters that
@@ -117,14 +117,14 @@ def excitation(
     design = _design(model, bounds, seconds, window, dt, bandwidth)
     for name, value in (("starts", starts), ("steps", steps)):
         checks.count(name, value, least=int(name == "starts"))
-    checks.count("seed", seed, least=0)
+    checks.key("key", key)
     states = STATE_SIZE if isinstance(design, FlatOutputs) else len(bounds.start)  # pyright: ignore
     model = sized(model, states)
     wanted = _wanted(model, parameters)
     search = coarse = _Search(design, model, jnp.asarray(_noise(noise, states)), round(window / dt))
     if search.window % 2 == 0:
         coarse = _Search(replace(design, dt=2 * dt), model, search.noise, search.window // 2)
-    begun = _begun(search, starts, seed)
+    begun = _begun(search, starts, key)
     asked, seen = _excited(search, begun, wanted)
     found = jnp.concatenate([begun, coarse.improved(begun, asked, seen, steps)])
     found = jnp.where(jnp.isfinite(found), found, 0.0)
@@ -241,13 +241,13 @@ def _wanted(model: AbstractVectorField, parameters: Sequence[str] | None) -> tup
     return tuple(dict.fromkeys(parameters))
 
 
-def _begun(search: _Search, starts: int, seed: int) -> Starts:
+def _begun(search: _Search, starts: int, key: PRNGKeyArray) -> Starts:
     rest = jnp.zeros(search.design.shape)
     uses = np.asarray(search.design.uses(*search.planned(rest))).max(axis=0, initial=0.0)
     for name, use in zip(search.design.names, uses, strict=True):
         if not use <= SPARE:
             raise ValueError(f"bounds: {name} leaves its limits even at rest, with inputs in the middle of theirs")
-    draws = jax.random.normal(jax.random.key(seed), (starts, *search.design.shape))
+    draws = jax.random.normal(key, (starts, *search.design.shape))
     return jax.lax.map(search.kept, draws / math.sqrt(search.design.harmonics))
 
 

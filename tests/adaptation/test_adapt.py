@@ -19,7 +19,7 @@ from pendulum import LENGTH, pendulum, swings
 import hybrid_jax as hj
 from hybrid_jax.adaptation import METHODS, Adaptation, FineTune, LeastSquares, Method, Solution, adapt
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import disturbance_of, disturbed, physics_of
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, physics_of
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.status import Status
 
@@ -45,7 +45,7 @@ def flown(truth, count=40, seed=0):
 
 
 def test_a_disturbance_of_the_pendulum_is_found_with_the_length():
-    truth = hj.Hybrid(disturbed(pendulum(LENGTH), PUSH), network())
+    truth = hj.Hybrid(hj.Hybrid(pendulum(LENGTH), ConstantDisturbance(PUSH)), network())
     result = adapt(hj.Hybrid(pendulum(0.7), network()), noisy(flown(truth)))
     np.testing.assert_allclose(result.disturbance, PUSH, atol=0.2)
     assert list(result.parameters) == ["log_length", "disturbance[0]", "disturbance[1]"]
@@ -172,7 +172,7 @@ def test_a_disturbance_that_is_not_zero_is_moved_to_no_other_states():
     still = hj.with_disturbance(hj.with_disturbance(pendulum(), (0,)), (1,))
     assert disturbance_of(still).indices == (1,)
     with pytest.raises(ValueError, match="indices: the field already has a disturbance of other states"):
-        hj.with_disturbance(disturbed(pendulum(), PUSH[1:], (1,)), (0,))
+        hj.with_disturbance(hj.Hybrid(pendulum(), ConstantDisturbance(PUSH[1:], (1,))), (0,))
 
 
 class Shaped(AbstractVectorField):

@@ -16,7 +16,7 @@ from hybrid_jax.adaptation import FineTune, adapt
 from hybrid_jax.adaptation.anchored import fit_anchored, with_change
 from hybrid_jax.adaptation.auto import CANDIDATES, extended, free_parameters
 from hybrid_jax.adaptation.selection import STRONG, blocks_of, correlated, fit_each, posterior
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.metrics import rollout_mse
@@ -126,7 +126,12 @@ def test_a_change_is_believed_if_the_evidence_is_strong_and_the_source_does_not_
     [
         (lambda: hybrid(), "source"),
         (lambda: hybrid(LENGTH), "theta"),
-        (lambda: hj.Hybrid(disturbed(pendulum(LENGTH), jnp.array([0.0, 1.5])), hybrid().residual), "disturbance"),
+        (
+            lambda: hj.Hybrid(
+                hj.Hybrid(pendulum(LENGTH), ConstantDisturbance(jnp.array([0.0, 1.5]))), hybrid().residual
+            ),
+            "disturbance",
+        ),
     ],
 )
 def test_windows_choose_what_changed(truth, chosen):

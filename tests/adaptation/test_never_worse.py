@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.terms import Terms
 
 DRAG = np.array([0.4, 0.3, 0.1])
@@ -26,7 +26,7 @@ def flown(seed, size, noise=1.0, count=100, steps=10, force=None):
     x0[:, 7:10], x0[:, 10:13] = 2 * size * rng.normal(size=(count, 3)), 1.2 * size * rng.normal(size=(count, 3))
     shakes = 0.12 * rng.normal(size=(count, 1, 4)) + 0.05 * rng.normal(size=(count, steps, 4))
     u = (hj.IRIS.hover_speed * (1 + size * shakes)).astype(np.float32)
-    truth = body(1.0) if force is None else disturbed(body(1.0), jnp.array([force, *[0.0] * 5]))
+    truth = body(1.0) if force is None else hj.Hybrid(body(1.0), ConstantDisturbance(jnp.array([force, *[0.0] * 5])))
     x = np.asarray(hj.rollout_batch(truth, x0.astype(np.float32), u, 0.01))
     x0, x = (a + noise * NOISE * rng.normal(size=a.shape) for a in (x0, x))
     for states in (x0, x):

@@ -8,14 +8,14 @@ from recorded import LOGS
 import hybrid_jax as hj
 from hybrid_jax.cli.errors import errors_of
 from hybrid_jax.cli.learning import STEPS, with_past, without_past
-from hybrid_jax.dynamics import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.vehicle import IRIS
 
 BODY = hj.rigid_body(IRIS)
 
 
 def test_a_push_that_the_model_lacks_is_predicted_from_the_errors_before():
-    lacking = disturbed(BODY, jnp.array([0, 0, -1.0, 0, 0, 0]))  # these flights have no such force
+    lacking = hj.Hybrid(BODY, ConstantDisturbance(jnp.array([0, 0, -1.0, 0, 0, 0])))  # these flights have no such force
     model = with_past(lacking, LOGS[:6])
     assert eqx.tree_equal(without_past(model), lacking)
     before, after = (errors_of(field, LOGS[7], STEPS)[2:, -1, 1].mean() for field in (lacking, model))

@@ -12,7 +12,7 @@ from smoke import ROOT
 import hybrid_jax as hj
 from hybrid_jax import control
 from hybrid_jax.control.cost import deviations
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 
 CONTROLLER = control.Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)
@@ -27,7 +27,7 @@ def simulate(wind, reference, x0, bandwidth, kick):
     """A flight whose body rates jump at the time `kick`."""
 
     def kicked(x, u, t):
-        x = plant(disturbed(BODY, wind))(x, u, t)
+        x = plant(hj.Hybrid(BODY, ConstantDisturbance(wind)))(x, u, t)
         return jnp.where(jnp.abs(t - kick) < 0.5 * CONTROLLER.period, control.add_body_rates(x), x)
 
     flight = control.fly(kicked, BODY, reference, x0, CONTROLLER, bandwidth)
@@ -100,7 +100,9 @@ def test_actual_cost_equals_the_predicted_one_only_for_the_true_model():
     """Predictions have steps of 0.05 s, the plant 0.01 s."""
     reference, calls = reference_of("eight"), range(50, 200, 25)
     costs = jax.jit(
-        lambda flight, wind: control.open_loop_costs(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, calls)
+        lambda flight, wind: control.open_loop_costs(
+            plant(hj.Hybrid(BODY, ConstantDisturbance(wind))), flight, reference, CONTROLLER, calls
+        )
     )
     exact, windy = (costs(alone(wind, reference, reference[0], 0.0, NEVER)[0], wind) for wind in (np.zeros(6), WIND))
     np.testing.assert_allclose(exact[1], exact[0], rtol=0.01)

@@ -7,7 +7,7 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.control import Observer, advance
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.networks.mlp import InputScaling
 
 DT = 0.01
@@ -39,14 +39,14 @@ def fields():
 
 @pytest.mark.parametrize("name", ["physics", "hybrid", "network"])
 def test_estimate_converges_at_the_bandwidth(fields, name):
-    found = watch(fields[name], disturbed(fields[name], TRUE), 5.0)
+    found = watch(fields[name], hj.Hybrid(fields[name], ConstantDisturbance(TRUE)), 5.0)
     share = -np.expm1(-5.0 * DT * np.arange(100))[:, None]
     # Rounding of v and ω over DT: 1e-6 / 0.01, more where a network's speeds are large.
     np.testing.assert_allclose(found, share * TRUE, rtol=0, atol=2e-2)
 
 
 def test_zero_bandwidth_estimates_zero(fields):
-    np.testing.assert_array_equal(watch(BODY, disturbed(BODY, TRUE), 0.0), 0.0)
+    np.testing.assert_array_equal(watch(BODY, hj.Hybrid(BODY, ConstantDisturbance(TRUE)), 0.0), 0.0)
 
 
 def test_exact_model_has_no_disturbance():
@@ -55,5 +55,5 @@ def test_exact_model_has_no_disturbance():
 
 def test_quaternion_sign_does_not_matter(fields):
     hybrid = fields["hybrid"]
-    plant = disturbed(hybrid, TRUE)
+    plant = hj.Hybrid(hybrid, ConstantDisturbance(TRUE))
     np.testing.assert_array_equal(watch(hybrid, plant, 5.0), watch(hybrid, plant, 5.0, sign=-1.0))

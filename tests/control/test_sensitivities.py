@@ -18,7 +18,7 @@ from hybrid_jax.control.sensitivities import (
     step_of,
 )
 from hybrid_jax.dynamics.composition import Frozen
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
 from hybrid_jax.networks.views import multirotor_network
 
@@ -56,7 +56,7 @@ FIELDS = {
     "layer norm": lambda: hj.Hybrid(body(), network(norm="layer")),
     "no x, y": lambda: hj.Hybrid(body(), network("no_xy", norm="none")),
     "body frame": lambda: hj.Hybrid(body(), network("body", "motion")),
-    "invariant, disturbed": lambda: disturbed(invariant(), jnp.ones(6)),
+    "invariant, disturbed": lambda: hj.Hybrid(invariant(), ConstantDisturbance(jnp.ones(6))),
     "frozen": lambda: hj.Hybrid(body(), Frozen(LinearResidual(jnp.ones((13, 17)) / 50, jnp.ones(13)))),
     "user": Spun,
 }

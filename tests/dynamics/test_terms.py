@@ -15,7 +15,7 @@ from hybrid_jax import Hybrid, load, rotation, save
 from hybrid_jax.dynamics.base import state_space, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.composition import Frozen
-from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
 from hybrid_jax.estimation.least_squares import fit_least_squares
@@ -143,7 +143,7 @@ def test_position_moves_with_the_true_velocity_where_the_log_s_lags(around):
         estimator = known + (velocity - state[VELOCITY]) / lag
         push = jnp.concatenate([estimator - field(state, inputs)[VELOCITY], jnp.zeros(3)])
         for evaluate in evaluations:
-            found = evaluate(disturbed(field, push), state[:, None], inputs[:, None])[:, 0]
+            found = evaluate(Hybrid(field, ConstantDisturbance(push)), state[:, None], inputs[:, None])[:, 0]
             np.testing.assert_allclose(found[POSITION], velocity, rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(found[VELOCITY], estimator, rtol=1e-12, atol=1e-12)
 

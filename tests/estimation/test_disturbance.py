@@ -13,7 +13,7 @@ from pushes import Push, pushes
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, with_disturbance
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.normal_equations import left_out, normal_equations
 from hybrid_jax.estimation.uncertainty import select_disturbance
@@ -54,7 +54,7 @@ def hybrid(**ratios):
 
 
 def disturbed_by(push):
-    return hj.Hybrid(disturbed(body(**RATIOS), push), network())
+    return hj.Hybrid(hj.Hybrid(body(**RATIOS), ConstantDisturbance(push)), network())
 
 
 def test_parameters_and_push_are_found_together_and_the_network_stays():
@@ -113,5 +113,5 @@ def test_noise_is_seldom_taken_for_a_push_and_hides_none_that_is_felt():
 
 def test_one_window_cannot_tell():
     windows, push = swings(1), jnp.array([0.0, 1.5])
-    pushed = rollout_batch(disturbed(pendulum(), push), windows.x0, windows.u, windows.dt)
+    pushed = rollout_batch(hj.Hybrid(pendulum(), ConstantDisturbance(push)), windows.x0, windows.u, windows.dt)
     assert not select_disturbance(pendulum(0.7), replace(windows, x=pushed)).needed

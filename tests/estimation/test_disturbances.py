@@ -6,6 +6,7 @@ import pytest
 from surface import refusal
 
 import hybrid_jax as hj
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 
 DT, STEPS = 0.05, 10
@@ -63,7 +64,7 @@ def test_weights_of_zero_predict_as_the_field_does():
 def test_attitudes_are_corrected_in_their_tangent_space():
     """A constant torque that the model lacks, as an angular acceleration of 0.3 rad/s²."""
     body, random = hj.rigid_body(hj.IRIS), np.random.default_rng(5)
-    pushed = hj.dynamics.disturbed(body, jnp.array([0, 0, 0, 0.3, 0, 0]))
+    pushed = hj.Hybrid(body, ConstantDisturbance(jnp.array([0, 0, 0, 0.3, 0, 0])))
     u = (hj.IRIS.hover_speed * (1 + 0.02 * random.normal(size=(3, 12, 4)))).repeat(10, axis=1).astype("f4")
     x0 = np.tile(np.eye(13, dtype="f4")[3], (3, 1))
     windows = hj.Trajectories(x0, u, np.asarray(hj.rollout_batch(pushed, x0, u, 0.01)), 0.01)

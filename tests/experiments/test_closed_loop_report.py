@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 import pytest
 
-from experiments.closed_loop.claims import Evidence, Speed, claims
+from experiments.closed_loop.claims import FlightEvidence, Speed, claims
 from experiments.closed_loop.results import ERROR, TAGS, Agent, gaps
 from experiments.flying.scenario import REFERENCES
 from experiments.reporting.claims import evaluate
@@ -53,7 +53,7 @@ def changed(rows, agent, domain="external_force", reference="hover", **values):
 
 
 def verdicts(rows, speed=SPEED):
-    return {verdict.id: verdict for verdict in evaluate(claims(FEW), Evidence(rows, speed))}
+    return {verdict.id: verdict for verdict in evaluate(claims(FEW), FlightEvidence(rows, speed))}
 
 
 def holds(*evidence):

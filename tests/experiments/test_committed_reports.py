@@ -29,17 +29,17 @@ def paper(rows, record):
 
 
 def of_flights(rows, _):
-    verdicts = evaluate(flown.claims(100), flown.Evidence(rows, flown.Speed(*[1.0] * 6)))
+    verdicts = evaluate(flown.claims(100), flown.FlightEvidence(rows, flown.Speed(*[1.0] * 6)))
     return verdicts, [*closed_loop.tables(rows), *closed_loop.gap_tables(rows)], closed_loop.conclusion(rows, 100)
 
 
 def of_filters(rows, record):
-    evidence = online.Evidence(rows, *[1.0] * 4)
+    evidence = online.GoalEvidence(rows, *[1.0] * 4)
     return evaluate(online.claims(record["config"]["changes"]), evidence), online.tables(rows), online.conclusion(rows)
 
 
 def of_designs(rows, _):
-    verdicts = evaluate(excitation.CLAIMS[:1], excitation.Evidence(rows, {}))  # the other needs the flown states
+    verdicts = evaluate(excitation.CLAIMS[:1], excitation.DesignEvidence(rows, {}))  # the other needs the flown states
     return verdicts, excitation.tables(rows), excitation.conclusion(rows)
 
 

@@ -10,7 +10,7 @@ from experiments.excitation.results import (
     DESIGNED,
     FLIGHTS,
     RANDOM,
-    Evidence,
+    DesignEvidence,
     margins,
     ratio,
 )
@@ -36,13 +36,13 @@ def rows(share, seeds=5):
 @pytest.mark.parametrize(("share", "holds"), [(0.3, True), (0.52, None), (0.8, False)])
 def test_the_worst_parameter_decides(share, holds):
     assert ratio(rows(share), RANDOM).value == pytest.approx(share, rel=0.1)
-    halves, inside = evaluate(CLAIMS, Evidence(rows(share), INSIDE))
+    halves, inside = evaluate(CLAIMS, DesignEvidence(rows(share), INSIDE))
     assert halves.holds is holds
     assert inside.holds
 
 
 def test_a_flight_that_leaves_a_limit_is_said_to():
-    _, inside = evaluate(CLAIMS, Evidence(rows(0.3), INSIDE | {"z [m]": (1.3, 1.25)}))
+    _, inside = evaluate(CLAIMS, DesignEvidence(rows(0.3), INSIDE | {"z [m]": (1.3, 1.25)}))
     assert inside.holds is False
     assert "z [m] 1.30 of 1.2" in inside.measured
 

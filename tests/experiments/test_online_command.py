@@ -11,7 +11,7 @@ from smoke import experiments
 
 from experiments.online.agents import CHANGES, L1, NAMES, fixed_model, nominal, online, true_theta, with_theta
 from experiments.online.hover import WORLDS, Hovered, adaptation_of, hover
-from experiments.online.results import TAGS, Evidence, claims, tables
+from experiments.online.results import TAGS, GoalEvidence, claims, tables
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 from hybrid_jax.control import Hardware
@@ -83,7 +83,7 @@ def rows(online=1.1, unchanged=1.0, inside=0.95, crash=False):
     ],
 )
 def test_each_claim_fails_where_it_should(change, fails):
-    evidence = Evidence(rows(**change), step_ms=0.1, seconds=1.0, processor_seconds=1.0, flights=18)
+    evidence = GoalEvidence(rows(**change), step_ms=0.1, seconds=1.0, processor_seconds=1.0, flights=18)
     found = {each.id: each.holds for each in evaluate(claims(["wind", "nothing"]), evidence)}
     assert [id for id, holds in found.items() if not holds] == fails
     assert {each.header[0] for each in tables(rows(**change))} >= {"change"}
@@ -92,12 +92,12 @@ def test_each_claim_fails_where_it_should(change, fails):
 def test_a_flight_that_ends_early_has_no_coverage():
     short = rows(inside=None)
     assert {*tables(short)[-1].lines[0][1:]} == {"nan"}
-    evidence = Evidence(short, step_ms=0.1, seconds=1.0, processor_seconds=1.0, flights=18)
+    evidence = GoalEvidence(short, step_ms=0.1, seconds=1.0, processor_seconds=1.0, flights=18)
     assert {each.id: each.holds for each in evaluate(claims(["wind", "nothing"]), evidence)}["O4"] is None
 
 
 def test_slow_is_said():
-    evidence = Evidence(rows(), step_ms=0.3, seconds=600.0, processor_seconds=100.0, flights=18)
+    evidence = GoalEvidence(rows(), step_ms=0.3, seconds=600.0, processor_seconds=100.0, flights=18)
     found = {each.id: each.holds for each in evaluate(claims(["wind", "nothing"]), evidence)}
     assert (found["O5"], found["O6"]) == (False, False)
 

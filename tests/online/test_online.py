@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.disturbance import disturbance_of, disturbed, with_disturbance
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, with_disturbance
 from hybrid_jax.integrate import rk4_step
 from hybrid_jax.online import OnlineAdaptation, Tuning
 
@@ -175,7 +175,7 @@ def test_what_the_model_cannot_explain_is_not_believed():
 
 
 def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
-    pushed = disturbed(SLIDE, jnp.array([0.5]), (0,))
+    pushed = hj.Hybrid(SLIDE, ConstantDisturbance(jnp.array([0.5]), (0,)))
     samples, u = run(pushed, 100)
     held = watch(OnlineAdaptation(pushed, DT, NOISE), samples, u)
     assert OnlineAdaptation(pushed, DT, NOISE).names[-1] == "disturbance[0]"

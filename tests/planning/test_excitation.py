@@ -37,7 +37,7 @@ class Doubled(hj.AbstractVectorField):
 
 def search(model, bounds, parameters=None, **options):
     given = {"seconds": 2.0, "noise": [NOISE], "window": 0.1, "dt": DT, "bandwidth": 2.0, "starts": 2}
-    return hj.excitation(model, parameters, bounds, **given | options)
+    return hj.excitation(model, parameters, bounds, jax.random.key(0), **given | options)
 
 
 FREE = hj.InputBounds(low=(-2.0,), high=(1.0,), start=(0.0,))
@@ -137,7 +137,8 @@ def flights():
     """A flight after no step of the search, the best of its starts, and after a few."""
     model = hj.with_disturbance(hj.rigid_body(hj.IRIS))
     given = {"seconds": 3.0, "bandwidth": 1.0, "starts": 2, "dt": DT}
-    return [hj.excitation(model, ("Ix", "k"), hj.FlightBounds(), **given, steps=steps) for steps in (0, 40)]
+    asked = model, ("Ix", "k"), hj.FlightBounds(), jax.random.key(0)
+    return [hj.excitation(*asked, **given, steps=steps) for steps in (0, 40)]
 
 
 @pytest.mark.slow
