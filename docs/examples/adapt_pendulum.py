@@ -42,6 +42,7 @@ print(result.report())
 
 start, push = jnp.array([1.5, 0.0]), jnp.zeros((100, 1))
 time = 0.05 * jnp.arange(1, 101)
+plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
 shown = {
     "true": (damped(0.8), {"color": "0.75", "lw": 5}),
@@ -53,5 +54,5 @@ for label, (field, style) in shown.items():
     plt.plot(time, angle, label=label, **style)
 plt.xlabel("time [s]")
 plt.ylabel("angle [rad]")
-plt.legend(ncols=3, fontsize=7, loc="upper right")
+plt.legend(ncols=3, fontsize=7, loc="upper right", frameon=False)
 plt.savefig("adapt_pendulum.png", dpi=110)

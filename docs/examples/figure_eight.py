@@ -44,17 +44,17 @@ print(result.report())
 second, _ = flown(result.field)
 
 time = controller.period * np.arange(401)
+plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
-for name, states, colour in (
-    ("not adapted", first, "0.45"),
-    ("adapted", second, "#CC79A7"),
+for name, states, style in (
+    ("not adapted", first, {"color": "0.45", "ls": "--"}),
+    ("adapted", second, {"color": "#CC79A7"}),
 ):
-    error = 100 * np.linalg.norm(
-        (states - np.array(reference)[:401])[:, :3], axis=1
-    )
+    wanted = np.array(reference)[:401, :3]
+    error = 100 * np.linalg.norm(states[:, :3] - wanted, axis=1)
     print(f"{name}: {error.max():.2f} cm off at most")
-    plt.plot(time, error, color=colour, label=name)
+    plt.plot(time, error, label=name, **style)
 plt.xlabel("time [s]")
 plt.ylabel("distance from the figure-8 [cm]")
-plt.legend()
+plt.legend(fontsize=7, frameon=False)
 plt.savefig("figure_eight.png", dpi=110)

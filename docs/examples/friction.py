@@ -49,10 +49,11 @@ speed = jnp.linspace(-2, 2, 200)
 learned = jax.vmap(
     lambda v: fitted.residual(jnp.stack([0.0, v]), jnp.zeros(1))[1]
 )(speed)
+plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
 plt.plot(speed, friction(speed), color="0.6", lw=4, label="true friction")
 plt.plot(speed, learned, color="#0072B2", label="learned by the network")
 plt.xlabel("speed [m/s]")
 plt.ylabel("acceleration [m/s²]")
-plt.legend()
+plt.legend(fontsize=7, loc="upper right", frameon=False)
 plt.savefig("friction.png", dpi=110)

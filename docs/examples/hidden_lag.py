@@ -48,11 +48,12 @@ print(f"mass {mass:.2f} kg, true 0.50; lag {lag:.2f} s, true 0.25")
 
 fitted = hj.simulate(result.model, empty, dt=0.02)[0]["place"][:, 0]
 without = hj.simulate(model(0.5, 1e-3), empty, dt=0.001)[0]["place"][:, 0]
+plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
 plt.plot(times, place, ".", ms=3, color="0.7", label="measured")
 plt.plot(times, without, color="0.45", ls="--", label="without a lag")
 plt.plot(times, fitted, color="#CC79A7", label="with the lag that was found")
 plt.xlabel("time [s]")
 plt.ylabel("place [m]")
-plt.legend(fontsize=7)
+plt.legend(fontsize=7, frameon=False)
 plt.savefig("hidden_lag.png", dpi=110)

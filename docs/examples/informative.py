@@ -40,6 +40,7 @@ print(
 
 time = 0.02 * np.arange(len(plan.inputs))
 states = hj.rollout(cart, jnp.zeros(2), plan.inputs, 0.02)
+plt.rc("axes.spines", top=False, right=False)
 figure, (above, below) = plt.subplots(
     2, 1, figsize=(4.2, 2.8), layout="constrained", sharex=True
 )

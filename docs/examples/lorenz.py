@@ -52,5 +52,5 @@ axes.plot(
     color="#CC79A7",
     label="fitted model, 5 s",
 )
-axes.legend(fontsize=7)
+axes.legend(fontsize=7, frameon=False)
 plt.savefig("lorenz.png", dpi=110)

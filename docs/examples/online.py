@@ -43,6 +43,7 @@ value, low, high = (
 print(f"mass {value[299]:.2f} before, {value[-1]:.2f} kg after")
 
 time = dt * np.arange(len(samples))
+plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
 plt.step(
     [0, 6, 12], [1, 2, 2], where="post", color="0.75", lw=5, label="true"
@@ -54,5 +55,5 @@ plt.fill_between(
 plt.xlabel("time [s]")
 plt.ylabel("mass [kg]")
 plt.ylim(0.5, 3)
-plt.legend(fontsize=7, loc="upper left")
+plt.legend(fontsize=7, loc="upper left", frameon=False)
 plt.savefig("online.png", dpi=110)

@@ -45,12 +45,13 @@ for name, one in result.intervals.items():
     print(f"{name}: {one.value:.3f} ({one.low:.3f} to {one.high:.3f})")
 
 fitted = hj.simulate(result.model, empty, dt=0.02)[0]["angle"][:, 0]
+plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
 plt.axvspan(4, 6, color="0.93", label="no samples")
 plt.plot(times, true, color="0.75", lw=5, label="true")
-plt.plot(times, angle, ".", color="#D55E00", ms=4, label="measured")
+plt.plot(times, angle, ".", color="0.2", ms=4, label="measured")
 plt.plot(times, fitted, color="#CC79A7", label="model")
 plt.xlabel("time [s]")
 plt.ylabel("angle [rad]")
-plt.legend(ncols=2, fontsize=7)
+plt.legend(ncols=2, fontsize=7, frameon=False)
 plt.savefig("partly_measured.png", dpi=110)

@@ -46,6 +46,7 @@ found = [one.parameters["friction"] for one in results]
 shown = {f"hybrid {i}": one for i, one in enumerate(found, 1)}
 shown |= {"hybrids, pooled": pooled, "complete physics": complete}
 colours = 4 * ["#0072B2"] + ["#CC79A7", "#009E73"]
+plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
 for y, one in enumerate(shown.values()):
     plt.plot([one.low, one.high], [y, y], color=colours[y], lw=3)
@@ -53,5 +54,5 @@ for y, one in enumerate(shown.values()):
 plt.yticks(range(len(shown)), shown)
 plt.axvline(0.5, color="0.4", ls=":", label="true value")
 plt.xlabel("friction, 95 % interval [1/s]")
-plt.legend(fontsize=7)
+plt.legend(fontsize=7, frameon=False)
 plt.savefig("pooled.png", dpi=110)

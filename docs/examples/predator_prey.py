@@ -40,16 +40,16 @@ model = hj.with_scaling(
 fitted = hj.fit_gauss_newton(model, data, max_steps=60).field
 
 time, long = 0.1 * np.arange(1, 201), np.zeros((200, 0), "f4")
+plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
-plt.axvspan(0, 6, color="0.93", label="length of the data")
+plt.axvspan(0, 6, color="0.93", label="data")
 exact, found = (hj.rollout(f, starts[0], long, 0.1) for f in (true, fitted))
-for i, colour in enumerate(("#009E73", "#D55E00")):
-    label = f"{('prey', 'predators')[i]}, model"
-    plt.plot(time, exact[:, i], color="0.75", lw=5)
-    plt.plot(time, found[:, i], color=colour, label=label)
+for i, (name, dash) in enumerate({"prey": "-", "predators": "--"}.items()):
+    plt.plot(time, exact[:, i], color="0.75", lw=5, label="true" if i else "")
+    plt.plot(time, found[:, i], dash, color="#0072B2", label=f"{name}, model")
 plt.xlabel("time")
-plt.ylabel("population (grey: true)")
-plt.legend(fontsize=7, ncols=3, loc="upper center")
+plt.ylabel("population")
+plt.legend(fontsize=7, ncols=4, loc="upper center", frameon=False)
 plt.ylim(top=9)
 plt.savefig("predator_prey.png", dpi=110)
 error = jnp.abs(found - exact).max()

@@ -47,7 +47,8 @@ shown = {
 figure, panels = plt.subplots(1, 3, figsize=(4.6, 2.1), layout="constrained")
 for axes, (title, image) in zip(panels, shown.items(), strict=True):
     bar = figure.colorbar(axes.imshow(image), ax=axes, location="bottom")
-    bar.ax.tick_params(labelsize=5, rotation=30)
+    bar.locator = plt.MaxNLocator(3)
+    bar.ax.tick_params(labelsize=5)
     axes.set_title(title, fontsize=8)
     axes.set_axis_off()
 figure.suptitle("concentration u after 1 s", fontsize=8)

@@ -40,6 +40,7 @@ result = hj.adapt(model, windows)
 print(result.report())
 
 found = [result.parameters[f"efficiency[{i}]"] for i in range(4)]
+plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
 plt.bar(range(4), 100 * share, color="0.85", label="true")
 for i, one in enumerate(found):
@@ -54,5 +55,5 @@ for i, one in enumerate(found):
 plt.xticks(range(4), [f"rotor {i}" for i in range(4)])
 plt.ylabel("thrust [% of nominal]")
 plt.ylim(70, 115)
-plt.legend(fontsize=7, ncols=2)
+plt.legend(fontsize=7, ncols=2, frameon=False)
 plt.savefig("weak_rotor.png", dpi=110)
