@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pendulum import pendulum, swings
-from surface import SPOILED, cases, is_finite, odd, outcome, spoiled
+from surface import cases, is_finite, odd, outcome, spoiled
 
 import hybrid_jax as hj
 from hybrid_jax import metrics
@@ -224,14 +224,6 @@ def test_the_simulator_refuses_what_makes_no_domain_split_or_flight(
     spec = outcome(SplitSpec, windows, steps)
     assert spec is None or spec.windows * spec.steps > 0
     assert outcome(random_flights, SOURCE, flights, seconds, "no key") is None
-
-
-@cases(0.04)
-@given(flights(shapes=((2,),)), odd(0.01), odd(1), st.sampled_from(sorted(set(SPOILED) - {"itself", "jax", "list"})))
-def test_the_simulator_refuses_states_that_cannot_fly(flight, dt, chunk, name):
-    _, _, u = flight
-    x0 = SPOILED["nan" if name in ("f8", "f2", "1e+25", "-100000.0", "i4", "u1") else name](np.zeros((2, 13)), 3)
-    assert outcome(SOURCE.quadrotor().rollouts, x0, u, jnp.zeros(2), dt, chunk) is None
 
 
 @pytest.fixture(scope="module")

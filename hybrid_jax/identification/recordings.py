@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.measurement import MEASURED
@@ -119,7 +119,11 @@ def _starts(recording: Recording, layout: Layout, told: str, names) -> Float[np.
     signals, length, before = recording.signals, layout.dt * layout.steps, max(layout.span, WARM)
     first, last = (limit(signals[name].t[end] for name in (told, *names)) for limit, end in ((max, 0), (min, -1)))
     starts = np.arange(first + before, last - length, length)
-    return starts[_clear(recording, told, names, starts - before, starts + length)]
+    begin, end, flown = starts - before, starts + length, airborne(recording, told)
+    clear = np.any([(begin >= off) & (end <= landed) for off, landed in flown] or [np.zeros(len(begin))], axis=0)
+    for left, right in (gap for name in (told, *names) for gap in signals[name].gaps()):
+        clear &= (end < left) | (begin > right)
+    return starts[clear]
 
 
 def _windows(recording: Recording, layout: Layout, told: str, names, starts, most: int, volts: bool) -> Windows:
@@ -139,15 +143,6 @@ def _windows(recording: Recording, layout: Layout, told: str, names, starts, mos
     start, spread = initial_states(recording, starts, layout)
     start = np.concatenate([start, np.zeros((n, 6))], axis=1)
     return Windows(segments, start, np.concatenate([spread, np.tile(layout.disturbance, (n, 1))], axis=1), between)
-
-
-def _clear(recording: Recording, told: str, names, begin, end) -> Bool[np.ndarray, " n"]:
-    flights = airborne(recording, told)
-    clear = np.any([(begin >= first) & (end <= last) for first, last in flights] or [np.zeros(len(begin))], axis=0)
-    for name in (told, *names):
-        for left, right in recording.signals[name].gaps():
-            clear &= (end < left) | (begin > right)
-    return clear
 
 
 def _at(signal: Signal, t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n k"]:

@@ -142,7 +142,9 @@ class FlatOutputs(eqx.Module):
         amplitudes = coefficients * self.unit()
 
         def path(t: Scalar) -> tuple[Float[Array, "3"], Scalar]:
-            ramp = _smooth(jnp.minimum(t, self.seconds - t) / RAMP)
+            ramp = jnp.polyval(
+                jnp.asarray(SMOOTH.coef[::-1]), jnp.clip(jnp.minimum(t, self.seconds - t) / RAMP, 0.0, 1.0)
+            )
             flat = jnp.asarray(centre, amplitudes.dtype) + ramp * _series(amplitudes, t, self.seconds)
             return flat[:3], flat[3]
 
@@ -154,7 +156,11 @@ class FlatOutputs(eqx.Module):
         place, q, velocity, rates = self._moving(coefficients, times)[:4]
         states = jnp.concatenate([place[:, :3], q, velocity[:, :3], rates], axis=1)
         _, _, _, rates, lift, turning = self._moving(coefficients, times[:-1] + self.dt / 2)
-        squares = self._squares(rates, lift, turning)
+        vehicle, inertia = self.vehicle, np.array(self.vehicle.inertia, np.float32)
+        torque = inertia * turning + jnp.cross(rates, inertia * rates)
+        thrust = vehicle.mass * jnp.linalg.norm(lift, axis=1, keepdims=True)
+        mixing = jnp.asarray(np.linalg.pinv(vehicle.mixer).T, lift.dtype)
+        squares = jnp.concatenate([thrust, torque], axis=1) @ mixing
         # Negative beyond the limits, so that a search finds back; and no infinite slope.
         return states, jnp.where(squares < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(jnp.abs(squares), 1.0))
 
@@ -182,15 +188,6 @@ class FlatOutputs(eqx.Module):
         yaw = jnp.stack([flat[:, 3], slope[:, 3], others[0][:, 3]], axis=1)
         q, rates, turning = jax.vmap(turned)(lift, others[1][:, :3], others[2][:, :3], yaw)
         return [flat, q, slope, rates, lift, turning]
-
-    def _squares(
-        self, rates: Float[Array, "n 3"], lift: Float[Array, "n 3"], turning: Float[Array, "n 3"]
-    ) -> Float[Array, "n rotors"]:
-        """Return squared rotor speeds for a specific force and a slope of the body rates; negative if infeasible."""
-        vehicle, inertia = self.vehicle, np.array(self.vehicle.inertia, np.float32)
-        torque = inertia * turning + jnp.cross(rates, inertia * rates)
-        thrust = vehicle.mass * jnp.linalg.norm(lift, axis=1, keepdims=True)
-        return jnp.concatenate([thrust, torque], axis=1) @ jnp.asarray(np.linalg.pinv(vehicle.mixer).T, lift.dtype)
 
     def uses(self, x: Float[Array, "n+1 13"], u: Float[Array, "n rotors"]) -> Float[Array, "n limits"]:
         """Return the used fraction of each limit of `names` over time."""
@@ -270,7 +267,3 @@ def _derivatives(times: Float[np.ndarray, " n"], seconds: float, harmonics: int)
         return math.comb(order, i) * ramps[i][:, None] * wave(order - i)
 
     return [np.sum([term(order, i) for i in range(order + 1)], axis=0) for order in range(5)]
-
-
-def _smooth(s: Scalar) -> Scalar:
-    return jnp.polyval(jnp.asarray(SMOOTH.coef[::-1]), jnp.clip(s, 0.0, 1.0))

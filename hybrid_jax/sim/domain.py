@@ -9,14 +9,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.rotation import derivative as quaternion_derivative
 from hybrid_jax.rotation import normalise
 from hybrid_jax.sim.forces import DRAG_COEFFICIENT, Force, Parameters, Scalar, drag, ground_effect, parameters_of, wind
 from hybrid_jax.sim.pilot import scale_of
-from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, VELOCITY, Input, State
+from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, Input, State
 from hybrid_jax.vehicle import IRIS, Vehicle
 
 CHUNK = 64  # flights per vmap: the most that fit into the cache of one core
@@ -69,43 +68,6 @@ class Quadrotor(eqx.Module):
         k1, k2, k3, k4 = jax.lax.scan(stage, x, jnp.array([0.0, 0.5, 0.5, 1.0], x.dtype))[1]
         end = x + dt / 6 * (k1 + 2 * (k2 + k3) + k4)
         return end.at[QUATERNION].set(normalise(end[QUATERNION]))
-
-    def rollouts(
-        self,
-        x0: Float[Array, "n 13"],
-        u: Float[Array, "n t rotors"],
-        t0: Float[Array, " n"],
-        dt: float,
-        chunk: int = CHUNK,
-    ) -> Float[Array, "n t 13"]:
-        """The states of n flights at the end of each interval, with u[:, i] constant over interval i.
-
-        Args:
-            x0: initial states (n, 13).
-            u: rotor speeds (n, t, rotors) [rad/s].
-            t0: time at the start of each flight (n,) [s].
-            dt: length of an interval [s].
-            chunk: flights that are vectorised together.
-
-        Raises:
-            ValueError: shapes do not agree; or, outside of compiled code, a number is not finite, dt is not positive,
-                or a quaternion in x0 is not of norm 1.
-        """
-        x0, u, n = checks.floating("x0", x0), checks.floating("u", u), jnp.shape(t0)
-        m = len(self.parameters.spin)
-        if len(n) != 1 or x0.shape != (*n, STATE_SIZE) or u.ndim != 3 or u.shape != (*n, u.shape[1], m):
-            raise ValueError(f"x0 (n, 13), u (n, t, {m}) and t0 (n,) expected, got {x0.shape}, {u.shape} and {n}")
-        checks.positive("dt", dt, "a positive number of seconds")
-        checks.unit_quaternions("x0", x0)
-        checks.count("chunk", chunk)
-
-        def advance(carry, held):
-            x, t = carry
-            x = self.step(x, held, t, dt)
-            return (x, t + dt), x
-
-        flown = jax.lax.map(lambda each: jax.lax.scan(advance, each[0], each[1]), ((x0, t0), u), batch_size=chunk)
-        return flown[1]
 
 
 # Traced once for all calls of a program, not once for each; the compiler inlines it again.

@@ -93,18 +93,6 @@ def test_order_of_convergence_is_four(step):
     assert errors[-1] < 1e-7  # 0.4 s at dt = 0.01
 
 
-def test_a_rollout_is_its_steps_and_forces_are_recomputed_at_its_own_time(step):
-    body, dt = quadrotor(IRIS, *ALL), 0.01
-    u = jnp.asarray(np.random.default_rng(0).uniform(600, 700, (2, 5, 4)))
-    x0, t0 = jnp.stack([at_rest(), at_rest(0.2)]), jnp.array([0.0, 1.1])
-    together = jax.jit(lambda q, *flight: q.rollouts(*flight, dt, chunk=1))(body, x0, u, t0)
-    for n in range(2):
-        x, t = x0[n], t0[n]
-        for i in range(5):
-            x, t = step(body, x, u[n, i], t, dt), t + dt
-            np.testing.assert_allclose(together[n, i], x, rtol=0, atol=1e-13)
-
-
 def test_single_precision_stays_single():
     with jax.enable_x64(False):
         shape = jax.eval_shape(quadrotor(IRIS, *ALL).step, at_rest(), jnp.zeros(4), jnp.asarray(0.0), 0.01)
