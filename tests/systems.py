@@ -216,13 +216,6 @@ def _flights(truth, changed, model) -> System:
     return _system(truth, changed, model, start, inputs, 0.01)
 
 
-def _iris() -> System:
-    true = Terms(drag=(0.3, 0.3, 0.1))
-    heavy = jax.tree.map(lambda leaf: leaf + 0.2, rigid_body(hj.IRIS, terms=true))
-    residual = hj.residual_network(13, 4, jax.random.key(1), hidden=16)
-    return _flights(rigid_body(hj.IRIS, terms=true), heavy, hj.Hybrid(hj.rigid_body(hj.IRIS), residual))
-
-
 def _multirotor() -> System:
     def real(shift, learn=("Ix", "Iy", "k_rotors", "drag", "centre_of_mass"), drag=0.3):
         return jax.tree.map(lambda leaf: leaf + shift, rigid_body(hj.IRIS, learn, Terms(drag=(drag, drag, 0.1))))
@@ -260,7 +253,6 @@ SYSTEMS: dict[str, Callable[[], System]] = {
     "pendulum": cache(_pendulum),
     "circle": cache(_circle),
     "car": cache(_car),
-    "iris": cache(_iris),
     "multirotor": cache(_multirotor),
     "ring_dense": cache(_dense),
     "ring_convolution": cache(_convolution),

@@ -7,6 +7,6 @@ from any_system import adapted_by_all
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module", params=["car", "iris", "multirotor"])
+@pytest.fixture(scope="module", params=["car", "multirotor"])
 def adapted(request):
     return adapted_by_all(request.param)

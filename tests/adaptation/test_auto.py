@@ -81,10 +81,6 @@ def test_windows_of_one_flight_are_correlated_whether_they_touch_overlap_or_not(
     assert correlated(windows) == -(-len(windows) // 5)
 
 
-def test_windows_of_many_flights_are_not():
-    assert correlated(swings(100)) == 1
-
-
 def test_windows_that_overlap_are_adapted_to_with_a_warning():
     with pytest.warns(UserWarning, match="windows overlap: left-out blocks share samples"):
         adapt(pendulum(0.7), flight(5, 2)[:40], method="source")

@@ -171,14 +171,6 @@ def test_finished_parts_are_kept(tmp_path):
     assert done == [2, 3]
 
 
-@pytest.mark.parametrize("inputs", [(2,), (DATA,)])
-def test_parts_of_other_inputs_run(tmp_path, inputs):
-    parts(tmp_path, [])
-    done = []
-    parts(tmp_path, done, inputs)
-    assert done == [0, 1, 2, 3]
-
-
 def test_stages_run_in_order_on_what_they_need_and_compile_ahead(tmp_path):
     compiled = []
     one = Stage(("one",), lambda: 1)
