@@ -26,7 +26,7 @@ from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
 from hybrid_jax.identification import slow_commands
-from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, prediction_errors
+from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, window_errors
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
@@ -247,7 +247,7 @@ def _unit(name: str) -> str:
 
 
 def predicted(field: Any, recordings: Sequence[Recording], layout: Layout, what: str) -> page.Table:
-    errors = prediction_errors(field, recordings, layout)
+    errors = window_errors(field, recordings, layout)
     asked = max(1, layout.steps // 4), layout.steps
     lines = [(name, _unit(name), *(_nearest(part, each, layout.dt) for each in asked)) for name, part in errors.items()]
     ends = [f"after {layout.dt * each:.3g} s" for each in asked]
@@ -273,7 +273,7 @@ def _nearest(part: Float[np.ndarray, "n t k"], asked: int, dt: float) -> str:
 @mpl.rc_context(page.STYLE)
 def figure(field: Any, logs: Sequence[Recording], layout: Layout) -> Figure:
     """Plot prediction errors against time."""
-    errors = prediction_errors(field, logs, layout)
+    errors = window_errors(field, logs, layout)
     rows = -(-len(errors) // 2)
     picture = Figure(figsize=(6.0, 2.6 * rows), layout="constrained")
     for i, (name, part) in enumerate(errors.items(), 1):

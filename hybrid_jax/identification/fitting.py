@@ -188,7 +188,7 @@ def identify_in_turn(
 
 
 @entry
-def prediction_errors(
+def window_errors(
     field: AbstractVectorField,
     recordings: Sequence[Recording],
     layout: Layout | None = None,

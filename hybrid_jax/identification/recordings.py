@@ -136,7 +136,7 @@ def _windows(recording: Recording, layout: Layout, told: str, names, starts, mos
         u = np.concatenate([u, _at(signals["voltage"], (edges[:, 1:] + edges[:, :-1]) / 2)], axis=2)
     y, there = {}, {}
     for name in names:
-        values, known = on_grid(signals[name], edges[:, layout.ahead + 1 :], layout.dt)
+        values, known = resampled(signals[name], edges[:, layout.ahead + 1 :], layout.dt)
         y[name], there[name] = values[:, None], known[:, None]
     index: Any = {name: np.tile(np.arange(layout.steps), (n, 1, 1)) for name in names}
     segments = Segments(u[:, None], np.ones((n, 1, layout.steps), bool), y, there, index, None)
@@ -149,7 +149,7 @@ def _at(signal: Signal, t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n k"]
     return np.stack([np.interp(t, signal.t, column) for column in np.asarray(signal.values).T], axis=-1)
 
 
-def on_grid(signal: Signal, t: Float[np.ndarray, "n t"], dt: float):
+def resampled(signal: Signal, t: Float[np.ndarray, "n t"], dt: float):
     """Resample a signal at times dt apart, and return where it exists: a slow signal only at the nearest times.
 
     A signal with more than two samples in dt is averaged over dt, without delay; attitudes are never averaged.

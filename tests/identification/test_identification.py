@@ -16,7 +16,7 @@ from hybrid_jax.dynamics.measurement import difference, measure
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.identification.fitting import identify, identify_in_turn
-from hybrid_jax.identification.recordings import Layout, initial_states, on_grid
+from hybrid_jax.identification.recordings import Layout, initial_states, resampled
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.vehicle import IRIS
 
@@ -146,10 +146,10 @@ def test_an_initial_state_has_the_errors_that_it_says(twin):
 def test_a_fast_signal_is_averaged_without_delay_and_a_slow_one_is_there_at_its_own_times_only():
     fine = np.arange(0, 2, 0.001)
     grid = 0.01 * np.arange(10, 110)[None]
-    values, there = on_grid(Signal(fine, np.sin(5 * fine)[:, None], ("x",), "fast"), grid, 0.01)
+    values, there = resampled(Signal(fine, np.sin(5 * fine)[:, None], ("x",), "fast"), grid, 0.01)
     np.testing.assert_allclose(values[0, :, 0], np.sin(5 * grid[0]), atol=2e-3)
     assert there.all()
-    _, there = on_grid(Signal(fine[::100], np.sin(5 * fine[::100])[:, None], ("x",), "slow"), grid, 0.01)
+    _, there = resampled(Signal(fine[::100], np.sin(5 * fine[::100])[:, None], ("x",), "slow"), grid, 0.01)
     assert 9 <= there.sum() <= 11
 
 
