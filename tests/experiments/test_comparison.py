@@ -1,12 +1,9 @@
 """The comparison from its command line, in the smallest preset: what each method leaves alone, and the report."""
 
-import json
-
 import equinox as eqx
 import numpy as np
 import pytest
 from smoke import experiments
-from test_experiments import ROW
 
 import hybrid_jax
 
@@ -33,21 +30,6 @@ def folder(tmp_path_factory):
 
 def field(folder, domain, model, mode="fine_tuned", n=20):
     return hybrid_jax.load(folder / "models" / domain / f"{model}-{mode}-{n}-seed0.npz").field
-
-
-def test_the_report_keeps_its_contract(folder):
-    report = json.loads((folder / "report.json").read_text())
-    rows = [row for row in report["rows"] if row["model"] in METHODS]
-    assert {(row["domain"], row["model"], row["mode"]) for row in rows} == {
-        (domain, model, "source_only" if model == "expert_augmentation" else "fine_tuned")
-        for domain in DOMAINS
-        for model in METHODS
-    } | {(domain, "hybrid", "source_only") for domain in DOMAINS}
-    for row in rows:
-        assert set(row) == set(ROW)
-        assert all(isinstance(row[key], kind) for key, kind in ROW.items()), row
-    assert [claim["id"] for claim in report["claims"] + report["not_judged"]] == ["C9"]
-    assert (folder / "standings.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("domain", DOMAINS)

@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from experiments.reaction_diffusion.config import POINTWISE
 from experiments.reaction_diffusion.models import pieces
-from experiments.reaction_diffusion.report import claims, tables
 from experiments.reaction_diffusion.systems import (
     COARSE,
     DT,
@@ -18,8 +16,6 @@ from experiments.reaction_diffusion.systems import (
     reacting,
     trajectories,
 )
-from experiments.reporting.claims import evaluate
-from experiments.reporting.results import Results
 
 
 def smooth(points):
@@ -70,32 +66,3 @@ def test_training_and_test_data_are_disjoint_and_pieces_touch():
     np.testing.assert_array_equal(windows.x0[8], one.x0[1])
     noisy = reacting(field, 2, (10, 0), noise=0.01)
     assert np.std(noisy.x - one.x) == pytest.approx(0.01, rel=0.1)
-
-
-def row(model, mode, n, seed, mse, rho):
-    return {"part": "shifted", "shift": "new_term", "model": model, "mode": mode, "n": n, "seed": seed, "draw": 0} | {
-        "mse": mse, "rho": rho, "chosen": None,
-    }  # fmt: skip
-
-
-def test_claims_are_decided_by_the_rows():
-    rows = []
-    for seed in range(3):
-        for n in (1, 2):
-            noise = 1 + 0.01 * seed
-            rows += [
-                row("hybrid", "fine_tuned", n, seed, 1e-3 * noise / n, 0.9),
-                row("hybrid", "auto", n, seed, 1e-3, 0.9),
-            ]
-            rows += [row("hybrid", "target_only", n, seed, 3e-3 * noise / n**2, 0.5)]
-            rows += [row("no_physics", "fine_tuned", n, seed, 5e-2 * (1 + 0.1 * seed) / n, -0.5)]
-    forecast = [
-        {"part": "forecast", "case": POINTWISE, "seed": s, "draw": 0, "mse": 10**-7.2, "a": 1e-3, "parameter_error": e}
-        for s, e in enumerate((0.1, 0.3))
-    ]
-    results = Results([*forecast, *rows])
-    verdicts = {each.id.split()[0]: each.holds for each in evaluate(claims(results), results)}
-    assert all(verdicts[name] for name in ("C1", "C2", "C3", "C6"))
-    assert verdicts["G2"] is False  # one seed is off by 0.3 %
-    assert verdicts["C8"] is False  # twice the error
-    assert len(tables(results)) == 3

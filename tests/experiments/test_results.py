@@ -54,18 +54,6 @@ def test_rows_that_are_not_finite_count_as_infinitely_bad():
     assert all(each["test_mse"] is None and each["rho"] is None for each in cell)
 
 
-def test_select_group_and_sort():
-    rows = make_rows()
-    few = rows.where(lambda each: each["seed"] > 0, n_train=(100, 500), model="hybrid")
-    assert {(each["n_train"], each["seed"]) for each in few} == {(100, 1), (100, 2), (500, 1), (500, 2)}
-    groups = rows.group("model", "mode", "n_train")
-    assert sum(map(len, groups.values())) == len(rows)
-    assert all({*group["model"]} == {key[0]} for key, group in groups.items())
-    assert rows.sort(seed=None, model=("no_physics", "hybrid"))[0]["model"] == "no_physics"
-    assert rows.tagged(choice="norm").where(choice="norm").tags == ("choice", *TAGS)
-    np.testing.assert_allclose(rows.where(model="hybrid").numbers("theta.Ix"), 0.04)
-
-
 def test_pairs_are_of_the_same_seed():
     rows = Results(
         [{"model": m, "seed": s, "error": 10 * s + (m == "b")} for m in "ab" for s in (2, 0, 1)], ("model", "seed")
