@@ -61,10 +61,10 @@ that was taken over that of the best one in hindsight. ρ: the share of the sour
 error that is gone. Test error: L^T_MSE over 1 s of other flights.
 
 - **source**: not adapted. **theta**: Ix, Iy and k by least squares
-- **force**, **torque**, **drag**, **efficiency**, and several of these: fitted with Ix, Iy, k; efficiency is that of
+- **force**, **torque**, **drag**, **efficiency**, and several of these: fitted with Ix, Iy, k; efficiency is one for
   each rotor, and k stays as it is
 - **network**: from the candidate that was taken, also the network's weights,
-  by a ridge Gauss–Newton step of low rank that holds them at the source's
+  by a ridge Gauss–Newton step of low rank that keeps them near the source's
 - For comparison, no candidates: **fine_tune**, as in the paper; **fine_tune_offset**, its output bias at a rate of 0.3;
   **l2_sp**, fine-tuning with a penalty on the distance from the source's parameters (L2-SP)
 """
@@ -241,9 +241,7 @@ def _share_inside(ends: np.ndarray, flown: np.ndarray) -> float | None:
     return float(np.mean(inside)) if inside else None
 
 
-ABOUT = (
-    "One flight of ten seconds after a change of the vehicle: which method does it ask for, and is it the right one?"
-)
+ABOUT = "One flight of ten seconds after a change of the vehicle: which method is chosen, and is it the right one?"
 main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ prediction model; nothing else differs between the flights of a column. {knows}
 - **nominal physics**: the rigid body of the data sheet, not trained
 - **physics**: the same with Ix, Iy, k fitted to N target trajectories of 0.1 s
 - **hybrid**: physics plus the paper's network, trained on source flights (source), then on N target trajectories
-- **no-physics**: the paper's network alone
+- **no-physics**: the paper's network without physics
 - **invariant hybrid**: a hybrid with a translation- and yaw-invariant residual. Its network reads neither p_x, p_y nor
   yaw, but by default the distance of each rotor from the ground (--invariant-inputs). It adds a force and a torque,
   with a linear skip connection (--invariant-linear); a smaller network, shared by all rotors, adds to the thrust of

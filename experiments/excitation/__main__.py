@@ -57,8 +57,8 @@ BLOCKS = 10  # clusters of the covariance: a second each, as windows of one flig
 Parameter = Literal["Ix", "Iy", "k"]
 HEAD = """# excitation
 
-Which ten seconds of flight tell the parameters best? `hj.excitation` designs a reference for the vehicle as the data
-sheet has it, inside a box, D-optimal for Ix, Iy and k while an unknown constant force and torque are fitted too. The
+Which ten seconds of flight determine the parameters best? `hj.excitation` designs a reference for the vehicle of the
+data sheet, inside a box, D-optimal for Ix, Iy and k while an unknown constant force and torque are fitted too. The
 changed vehicle then flies it, a hover and a figure-8 in the simulator with a model predictive controller that knows the
 data sheet only, and the random flights of the paper with their own pilot. Sensor noise is added to each log; least
 squares fits Ix, Iy, k and the force and torque to its windows of 0.1 s.
@@ -227,9 +227,7 @@ def _fit(parameters: tuple[str, ...], noise: Noise, states: Array, inputs: Array
     return {name: (*every[name], stds[i]) for i, name in enumerate(every) if name in parameters}
 
 
-ABOUT = (
-    "Design the flight that tells the vehicle's parameters best, and compare it with hover, figure-8 and random flight."
-)
+ABOUT = "Design the flight that determines the parameters best, and compare it with hover, figure-8 and random flight."
 main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":

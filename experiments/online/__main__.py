@@ -63,7 +63,7 @@ def experiment(config: OnlineConfig, console: Console) -> None:
     write_report(out, report, Console())
 
 
-ABOUT = "The vehicle changes in the air. How soon does the controller fly as well as one that was told the change?"
+ABOUT = "The vehicle changes in the air. How soon does the controller fly as well as one that knows the change?"
 main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":

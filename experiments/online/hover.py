@@ -128,7 +128,7 @@ def main() -> None:
     blocks = round(float(sys.argv[1] if sys.argv[1:] else 600) / DT / BLOCK)
     gusts, keys = jnp.array([0.0, 1.0]), jax.random.split(jax.random.key(7))
     print("filter, noise, world, gusts | error of v, ω over the first model's | v after a wind | found after [s] |")
-    print("largest change of Ix, Iy, k [%] | their intervals hold the truth [%] | inconsistent [%]")
+    print("largest change of Ix, Iy, k [%] | their intervals contain the truth [%] | inconsistent [%]")
     for named, noise, world in product((False, True), (0.1, 1.0), WORLDS):
         found = Hovered(*map(np.asarray, hover(adaptation_of(world, noise, named), world, noise, blocks, gusts, keys)))
         for i, gust in enumerate(gusts.tolist()):

@@ -164,8 +164,8 @@ _NEAR = (
 )
 _WORSE = f"Without a change its RMSE is at most {WORSE - 1:.0%} above that of the unadapted model {_PAIRED}."
 _COVERS = (
-    f"From {LEARNED:g} s after the change on, at least {COVERED:.0%} of the 95 % intervals of its parameters hold the "
-    "truth, after each change (fails: significantly fewer)."
+    f"From {LEARNED:g} s after the change on, at least {COVERED:.0%} of the 95 % intervals of its parameters contain "
+    "the truth, after each change (fails: significantly fewer)."
 )
 
 

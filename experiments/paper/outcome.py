@@ -43,8 +43,8 @@ RATE_NOTE = (
 )
 ABOUT = {
     names.HYBRID: "rigid-body physics f_p(x, u; θ_p) plus a small network f_d(x, u; θ_d), both trained",
-    names.NO_PHYSICS: "the same network alone",
-    names.PHYSICS_ONLY: "the rigid-body physics alone, its θ_p trained",
+    names.NO_PHYSICS: "the same network without physics",
+    names.PHYSICS_ONLY: "the rigid-body physics without a network, its θ_p trained",
     names.EXPERT_AUGMENTATION: "the source's hybrid; an encoder estimates its θ_p from the flight's last states and "
     "inputs, trained on rollouts with random θ_p (Wehenkel et al., 2023)",
     names.THETA_P_ONLY: "the source's hybrid, of which only θ_p is trained on, by Adam",

@@ -84,14 +84,14 @@ def _expects_its_error(rows: Results) -> Part:
 
 
 CLAIMS: Sequence[Claim[Results]] = (
-    Claim("A1", f"The candidate that is taken errs at most {NEAR - 1:.0%} more than the best one in {SHARE:.0%} of all "
-          "cases.", _near_the_best),
-    Claim("A2", f"It never errs more than {WORSE - 1:.0%} more than the source.", _never_worse),
+    Claim("A1", f"The error of the candidate that is taken is at most {NEAR - 1:.0%} above the least one "
+          f"in {SHARE:.0%} of all cases.", _near_the_best),
+    Claim("A2", f"Its error is never more than {WORSE - 1:.0%} above the source's.", _never_worse),
     Claim("A3", f"In both experiments of the paper its mean ρ is at least {MEAN_RHO} and its worst at least "
           f"{WORST_RHO}.", _gains),
-    Claim("A4", "It errs less than fine-tuning by Adam in every case.", _beats_fine_tuning),
-    Claim("A5", f"The 80 % intervals of its RMSE hold that of another flight in {HELD[0]:.0%} to {HELD[1]:.0%} of "
-          "cases.", _expects_its_error),
+    Claim("A4", "Its error is smaller than after fine-tuning by Adam in every case.", _beats_fine_tuning),
+    Claim("A5", f"The 80 % intervals of its RMSE contain the RMSE of another flight in {HELD[0]:.0%} to "
+          f"{HELD[1]:.0%} of cases.", _expects_its_error),
 )  # fmt: skip
 
 

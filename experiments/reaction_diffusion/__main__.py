@@ -34,16 +34,16 @@ Partial differential equations on a periodic grid of 32 × 32 points, 2048 state
   a stronger prior than least action, λ‖f_d‖², with which the errors of a and b stay large here. A reaction and
   diffusion may cancel, so that a small f_d need not be the true one; the reason was not looked for.
 - Several random networks begin (`--starts`, by default three) and the one with the least training loss after ten steps
-  goes on, since some end in a poor local minimum. That was decided after one network alone had failed in one of the
-  default's seeds; that ten steps tell them apart, on seeds from 100 on, which are not reported.
+  goes on, since some end in a poor local minimum. That was decided after a single network had failed in one of the
+  default's seeds; that ten steps distinguish them, on seeds from 100 on, which are not reported.
 - **Shifted**: the equations change, and models adapt to N trajectories. *fine-tuned*: all parameters, by Gauss–Newton
-  from the source; *target-only*: the same from random weights; *least squares*: a and b alone; *auto*: as `hj.adapt`.
+  from the source; *target-only*: the same from random weights; *least squares*: only a and b; *auto*: as `hj.adapt`.
   These two see eight windows of three intervals, whatever N is, spread over the time of the trajectories. In a run
-  before, those of eight trajectories were all beginnings, and *auto* erred 70 times as much with N = 8 as with N = 4.
+  before, those of eight trajectories were all beginnings, and *auto* had 70 times the error with N = 8 as with N = 4.
 - **Gray–Scott** in the protocol of Neural Context Flows (Nzoyem et al. 2025): one trajectory in each of four
   environments, then one in each of four new ones. Physics knows D_u, D_v, feed and kill terms, with F and k unknown in
   each environment, and that v gains what u loses by the reaction; its rate r(u, v) at a point is a network that all
-  environments share. F and k alone are adapted. What differs: Neural Context Flows know none of that; their Laplacian
+  environments share. Only F and k are adapted. What differs: Neural Context Flows know none of that; their Laplacian
   has nine points, ours five; trajectories are our own. The recipe was chosen by an environment between the four, which
   is none of the new ones; errors in the new ones had been seen with an earlier network, of two outputs.
 """

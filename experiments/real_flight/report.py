@@ -30,7 +30,7 @@ LABELS = names.LABELS | {
     LEARNED: "hybrid-jax fit",
     ADAPTED: "hybrid-jax adapt",
     names.SCRATCH: "physics adapted from nominal",
-    names.PHYSICS_ONLY: "its physics alone",
+    names.PHYSICS_ONLY: "its physics, no network",
     names.LINEAR_RESIDUAL: "rigid body + linear residual",
 }
 SHOWN = (None, names.NOMINAL, names.FINE_TUNED, names.SOURCE_ONLY)  # modes, in reports of an earlier program
@@ -42,7 +42,7 @@ Flights held out are predicted open loop with the recorded motors, by models tha
 
 - **hybrid-jax fit**: physics, or physics with a network, each with its past errors or without, whichever predicts
   flights left out best
-- **its physics alone**: the multirotor in it, without a network
+- **its physics, no network**: the multirotor in it
 - **hybrid-jax adapt**: the same adapted to N windows of ten intervals after the change
 - **physics adapted from nominal**: the vehicle file's multirotor adapted to the same windows, without flights before
 - **rigid body + linear residual**: a linear map of state and input that is fitted to the residuals of a rigid body
@@ -124,7 +124,7 @@ def conclusion(found: Mapping[Cell, Results], best: Cell, dt: float) -> list[str
     horizon = max(found[best][0]["scores"], key=int)
     errs = {cell: pooled(rows, horizon, "velocity").mean() for cell, rows in found.items()}
     simple = min((cell for cell in errs if cell[0] in BASELINES), key=errs.__getitem__)
-    told = f"{label(*best)} errs by {errs[best]:.3g} m/s after {int(horizon) * dt:.3g} s of a flight held out"
+    told = f"{label(*best)} has an error of {errs[best]:.3g} m/s after {int(horizon) * dt:.3g} s of a flight held out"
     return [f"{told}, {errs[best] / errs[simple]:.2f} times as much as the best baseline ({label(*simple)})."]
 
 
@@ -203,7 +203,7 @@ def verdicts(found: Mapping[Cell, Results], best: Cell) -> list[Verdict]:
     baselines = [cell for cell in found if cell[0] in BASELINES]
     claims = [
         _better("F1", best, baselines, "every simple baseline"),
-        _better("F2", best, [(names.PHYSICS_ONLY, 0)], "the physics alone that was learned before"),
+        _better("F2", best, [(names.PHYSICS_ONLY, 0)], "the physics that was learned before"),
     ]
     if best[0] == ADAPTED:
         few = min(n for model, n in found if model == ADAPTED)

@@ -66,7 +66,7 @@ QUESTIONS = {
     "reaction_diffusion": Asked(
         "Can a hybrid learn a partial differential equation from one trajectory?",
         (
-            "Yes, if you can say what is missing: for a reaction use a network that reads each point alone.",
+            "Yes, if you can say what is missing: for a reaction use a network that reads one point at a time.",
             "Train several random networks and keep the one with the least loss.",
         ),
         "Forecasts",

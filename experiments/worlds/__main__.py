@@ -35,9 +35,9 @@ and is tested over 1 s of usual flights after it. Ratio: its test error L^T_MSE 
 sources, draws of flights to adapt to. For some changes other methods adapt to the same ten seconds:
 
 - **fine_tune**, **l2_sp**: Adam, and Adam with a penalty on the distance from the source's parameters
-- **fine_tune_paper**: Adam on 1000 windows of five flights without noise, another flight tells when to stop
-- **white_box**, **kalman_filter**: physics alone with Ix, Iy, k, drag and a steady force and torque from nominal
-  values, by least squares, and by an extended Kalman filter; they need no source
+- **fine_tune_paper**: Adam on 1000 windows of five flights without noise, another flight says when to stop
+- **white_box**, **kalman_filter**: physics without a network, with Ix, Iy, k, drag and a steady force and torque from
+  nominal values, by least squares, and by an extended Kalman filter; they need no source
 """
 
 NOISY: dict[str, Any] = ONE_FLIGHT | {"noise_on": "all"}

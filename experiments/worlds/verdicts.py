@@ -121,7 +121,7 @@ def _expecting(rows: Results) -> dict[tuple, Results]:
 def _never_worse(rows: Results) -> Part:
     def of(case: tuple, own: Results) -> Part:
         ratio = own.numbers("ratio")
-        return _sound(own), f"{' '.join(map(str, case))} {ratio.mean():.3g}, worst {ratio.max():.3g}"
+        return _sound(own), f"{label(*case)} {ratio.mean():.3g}, worst {ratio.max():.3g}"
 
     return all_of(of(case, own) for case, own in _cases(rows).items())
 
@@ -157,20 +157,20 @@ def _expects_its_errors(rows: Results) -> Part:
 CLAIMS = (
     Claim(
         "W1",
-        f"In every case the adapted model errs at most {MEAN} times as much as its source in the mean, and at most "
+        f"In every case the error of the adapted model is at most {MEAN} times its source's in the mean, and at most "
         f"{EACH} times in each adaptation.",
         _never_worse,
     ),
     Claim(
         "W2",
-        f"In each world {HELD[0]:.0%} to {HELD[1]:.0%} of the 95 % intervals of Ix, Iy and k hold the truth, where "
+        f"In each world {HELD[0]:.0%} to {HELD[1]:.0%} of the 95 % intervals of Ix, Iy and k contain the truth, where "
         "these are called physical (fails: significantly fewer or more).",
         _intervals_hold,
     ),
     Claim(
         "W3",
-        f"In each world the 80 % intervals of the errors to expect hold those of other flights in {EXPECTED[0]:.0%} to "
-        f"{EXPECTED[1]:.0%} of cases, after 0.1 s and after 1 s.",
+        f"In each world the 80 % intervals of the errors to expect contain the errors of other flights in "
+        f"{EXPECTED[0]:.0%} to {EXPECTED[1]:.0%} of cases, after 0.1 s and after 1 s.",
         _expects_its_errors,
     ),
 )

@@ -122,7 +122,7 @@ class Adaptation:
         if self.alone:
             yield "Physics without the network predicts the source's own motion better and replaces the source."
         if self.refused:
-            yield f"Refused: {', '.join(self.refused)}: the source's own errors may be as large without any change."
+            yield f"Rejected: {', '.join(self.refused)}: the source's own errors may be as large without any change."
         if self.expected:
             yield "Expected RMSE on an unseen flight (80% intervals, from left-out blocks of these windows):"
             yield from lines_of(self.expected, self.units)

@@ -28,7 +28,7 @@ from hybrid_jax.vehicle import Vehicle
 __all__ = ["LISTS", "Options", "run"]
 PICTURED, POINTS = 6, 3000  # logs that get a picture; samples of each line at most
 LINES = 5  # of what is not folded
-# Checks that a log may fail and still tell of its vehicle: it needs no position, and is cut at gaps.
+# Checks that a log may fail and still say something of its vehicle: it needs no position, and is cut at gaps.
 BORNE = ("quantities", "slowest signal", "gaps", "repeated samples")
 SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
 NOT_RUN = f"not checked for want of --vehicle: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"

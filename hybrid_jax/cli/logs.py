@@ -138,7 +138,7 @@ def raw_logs(folder: Path, read: Callable[[Path], Any]) -> tuple[list[tuple[Path
     paths, others = find_logs(folder) if folder.is_dir() else ([folder], {})
     left = [f"{path.name}: left: {why}" for path, why in others.items()]
     if not paths:
-        raise ValueError(f"{folder}: holds no logs, only {'; '.join(left) or 'nothing'}")
+        raise ValueError(f"{folder}: contains no logs, only {'; '.join(left) or 'nothing'}")
     return [(path, read(path)) for path in paths], left
 
 

@@ -53,7 +53,7 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
     """
     checks.positive("dt", dt, "a positive number of seconds")
     if missing := missing_states(recording):
-        raise ValueError(f"{recording.name}: holds no {' and no '.join(missing)}; {what_to_log(recording)}")
+        raise ValueError(f"{recording.name}: contains no {' and no '.join(missing)}; {what_to_log(recording)}")
     signals = recording.signals
     motors = motors_of(recording, bool(len(polynomial)))
     used = [signals[name] for name in (*STATES, "body_velocity") if name in signals] + [motors]
@@ -64,7 +64,7 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
         raise ValueError(f"{recording.name}: {apart}")
     if motors.values.shape[1] > MOST_ROTORS:
         order = "name those of the rotors: motor_order=(0, 1, 2, 3)"
-        raise ValueError(f"{recording.name}: {motors.source} holds {motors.values.shape[1]} motors; {order}")
+        raise ValueError(f"{recording.name}: {motors.source} has {motors.values.shape[1]} motors; {order}")
     first, last = max(signal.t[0] for signal in used), min(signal.t[-1] for signal in used)
     if last - first < dt:
         raise ValueError(f"{recording.name}: the signals share less than {dt} s; log them at the same time")
@@ -145,7 +145,7 @@ def motors_of(recording: Recording, convertible: bool = True) -> Signal:
     faster = speeds is None or (convertible and commands is not None and commands.interval < 0.9 * speeds.interval)
     chosen = commands if faster else speeds
     if chosen is None:
-        raise ValueError(f"{recording.name}: holds no motors; {what_to_log(recording)}")
+        raise ValueError(f"{recording.name}: contains no motors; {what_to_log(recording)}")
     return chosen
 
 

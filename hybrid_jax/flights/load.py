@@ -31,7 +31,7 @@ MAGICS |= {b"H Product:Blackbox": BLACKBOX}
 # Formats that are known and not read, by their first bytes or suffix: what they are, and the way out.
 CONVERT = (
     "an ArduPilot DataFlash log, not read: mavlogdump.py --format csv --types TYPE FILE > TYPE.csv for TYPE ATT, "
-    "IMU, XKF1 and RCOU; join them to one table by TimeUS, with empty cells, and say what it holds: "
+    "IMU, XKF1 and RCOU; join them to one table by TimeUS, with empty cells, and say what it contains: "
     'columns="MAP.toml" (docs/howto/logs.md has the program and the map)'
 )
 PX4LOG = "a log of PX4's sdlog2, not read: log .ulg, as PX4 does from 1.4 on"
@@ -103,8 +103,8 @@ def load_logs(
     paths, left = find_logs(folder)
     if not paths:
         others = "; ".join(f"{path.name}: {why}" for path, why in [*left.items()][:5])
-        found = f"; it holds {others}" if left else ""
-        raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
+        found = f"; it contains {others}" if left else ""
+        raise ValueError(f"{folder}: contains no flights ({', '.join(SUFFIXES)}){found}")
     raws = [read_recording(path, columns, topics, motor_order) for path in paths]
     intervals = [dt or getattr(own_rows(raw), "dt", DT) for raw in raws]
     found = [(raw.name, check_recording(raw, vehicle, own)) for raw, own in zip(raws, intervals, strict=True)]

@@ -75,7 +75,7 @@ class FitInterrupted(KeyboardInterrupt):
     """Ctrl-C during `fit`; `result` is the run up to the last complete block of epochs."""
 
     def __init__(self, result: FitResult):
-        super().__init__(f"training was interrupted after epoch {result.epochs}; `result` of this exception holds it")
+        super().__init__(f"training was interrupted after epoch {result.epochs}; it is in `result` of this exception")
         self.result = result
 
 

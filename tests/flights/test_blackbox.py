@@ -41,7 +41,7 @@ def test_events_and_armings_without_frames_are_no_damage(flight, written):
     assert len(recording.signals["rates"]) >= 199
     assert any("2 times the vehicle was armed" in note for note in recording.notes)
     two = read_recording(written(blackbox(flight[:90]) + whole, "two.bbl"))
-    assert any("holds 2 flights: the longest is read" in note for note in two.notes)
+    assert any("contains 2 flights: the longest is read" in note for note in two.notes)
     assert len(two.signals["rates"]) >= 199
     reasoned = blackbox(flight[:200], events=b"E\xffEnd of log (disarm reason:4)\0", ended=False)
     assert "damage" not in read_recording(written(reasoned, "reasoned.bbl")).facts

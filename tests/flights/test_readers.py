@@ -113,7 +113,7 @@ def test_a_bag_is_the_flight_it_holds(flight, tmp_path, plugin):
 
 def test_of_two_topics_one_is_chosen(flight, tmp_path):
     path = bag(tmp_path / "run", flight[:20], "SQLITE3", ("odom", "truth"))
-    refusal(lambda: read_recording(path), path, "/odom and /truth hold odometry", 'topics={"odometry": "/odom"}')
+    refusal(lambda: read_recording(path), path, "/odom and /truth have odometry", 'topics={"odometry": "/odom"}')
     assert "position" in read_recording(path, topics={"odometry": "/truth"}).signals
 
 
@@ -279,7 +279,7 @@ def test_a_folder_of_all_kinds_says_what_it_reads(flight, written, tmp_path):
         "more": "a folder; give it by itself",
         "notes.txt": "empty",
     }
-    refusal(lambda: load_logs(tmp_path / "more"), "holds no flights")
+    refusal(lambda: load_logs(tmp_path / "more"), "contains no flights")
 
 
 def test_logs_of_unequal_start_and_length_go_together(flight, written):

@@ -49,6 +49,6 @@ def test_invalid_arguments_are_refused(tmp_path, options, message):
 
 
 def test_a_folder_without_logs_is_refused(tmp_path):
-    refusal(lambda: load_logs(tmp_path), tmp_path, "holds no flights")
+    refusal(lambda: load_logs(tmp_path), tmp_path, "contains no flights")
     refusal(lambda: load_logs(tmp_path / "none"), "no such folder")
     assert len(cut_windows([*LOGS[:2], LOGS[2][:5]], 10)) == 2 * (SAMPLES - 10)

@@ -43,7 +43,7 @@ def read_blackbox(content: bytes) -> Parts:
         said = f" ({why[0]})" if why else ""
         raise ValueError(f"is not a blackbox log or is damaged; save it again{said}")
     if not len(rows):
-        raise ValueError("holds no frames; save the log again")
+        raise ValueError("contains no frames; save the log again")
     columns = dict(zip(parser.field_names, rows.T, strict=False))
     if "time" not in columns:
         raise ValueError("has no field time; save the log again")
@@ -53,7 +53,7 @@ def read_blackbox(content: bytes) -> Parts:
     facts |= {"damage": damage} if damage else {}
     notes = [] if "betaflight" in program.lower() else ["not of Betaflight: its units are assumed"]
     flown = sum(len(each[1]) > 1 for each in flights)
-    notes += [f"holds {flown} flights: the longest is read; save each by itself"] * (flown > 1)
+    notes += [f"contains {flown} flights: the longest is read; save each by itself"] * (flown > 1)
     empty = len(begins) - flown
     notes += [f"{empty} times the vehicle was armed and nothing was recorded: left out"] * (empty > 0)
     return dict(_parts(columns, headers)), 1e-6, notes, facts

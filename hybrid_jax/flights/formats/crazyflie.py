@@ -110,7 +110,7 @@ def read_crazyflie(content: bytes) -> Parts:
     whole = len(content) > at + 4 and zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
     columns, end = _columns(content, at, len(content) - 4 * whole, events)
     if not columns:
-        raise ValueError("holds no records; record the flight again, or copy the file again")
+        raise ValueError("contains no records; record the flight again, or copy the file again")
     facts, notes = {"format": "Crazyflie µSD", "vehicle": "multirotor of 4 rotors"}, []
     if not whole:
         last = max(ticks[-1] for ticks, _ in columns.values()) - min(ticks[0] for ticks, _ in columns.values())

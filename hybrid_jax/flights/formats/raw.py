@@ -107,7 +107,7 @@ def record(
     parts = {name: part for name, part in parts.items() if len(part.ticks)}
     if not parts:
         said = "".join(f" ({note})" for note in notes)
-        raise ValueError(f"holds no quantity of a flight{said}; see docs/howto/logs.md for what to log")
+        raise ValueError(f"contains no quantity of a flight{said}; see docs/howto/logs.md for what to log")
     said, signals, ordered = list(notes), {}, {}
     for name, part in parts.items():
         kept, lines = _in_order(part.source, part.ticks, tick)

@@ -161,7 +161,7 @@ def _chosen(types: Mapping[str, str], topics: Mapping[str, str]) -> dict[str, tu
         if len(fitting) > 1:
             first, *_ = names = sorted(fitting)
             choose = f'choose one: topics={{"{role}": "{first}"}}'
-            raise ValueError(f"topics {' and '.join(names)} hold {role}; {choose}")
+            raise ValueError(f"topics {' and '.join(names)} have {role}; {choose}")
         if fitting:
             found[role] = (fitting[0], "", "")
     if "motors" in topics:
@@ -215,5 +215,5 @@ def _motors(topic: str, field: str, messages) -> tuple[np.ndarray, str]:
     if len(counts) > 1 or min(counts) < FEWEST_ROTORS:
         known = ", ".join(each for each in vars(messages[0]) if not each.startswith("_"))
         found = f"{', '.join(map(str, sorted(counts)))} numbers, must be one for each motor; its fields are {known}"
-        raise ValueError(f"{topic}: field {name} holds {found}")
+        raise ValueError(f"{topic}: field {name} has {found}")
     return np.stack(rows), name
