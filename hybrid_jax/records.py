@@ -181,7 +181,7 @@ def _span(record: Record, inputs, outputs, between: Between) -> tuple[float, flo
     end = min((signal.t[-1] + more for signal, more in zip(acting, lasting, strict=True)), default=np.inf)
     measured = [record.signals[name] for name in outputs]
     first, last = min(signal.t[0] for signal in measured), max(signal.t[-1] for signal in measured)
-    return (max(begin, first), min(end, last)) if outputs else (begin, end)
+    return max(begin, first), min(end, last)
 
 
 def integral(signal: Signal, t: Float[np.ndarray, " n"], between: Between) -> Float[np.ndarray, "n k"]:

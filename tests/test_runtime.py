@@ -31,10 +31,9 @@ print(events.count("/jax/compilation_cache/cache_hits"), events.count("/jax/comp
 """
 LOOP = f"""{CONFIGURED}
 loop = jax.jit(lambda x: jax.lax.scan(lambda x, _: (x - x[::-1] ** 3, None), x, length=10)[0])
-print(loop.lower(jax.numpy.ones((13, 100))).compile().as_text().count("xla_cpu_small_call"))
-"""
-PRECISION = f"""{CONFIGURED}
-print(jax.jit(lambda x: x @ x.T).lower(jax.numpy.ones((5, 5))).as_text().count("precision = [HIGHEST, HIGHEST]"))
+product = jax.jit(lambda x: x @ x.T).lower(jax.numpy.ones((5, 5))).as_text()
+kernels = loop.lower(jax.numpy.ones((13, 100))).compile().as_text().count("xla_cpu_small_call")
+print(kernels, product.count("precision = [HIGHEST, HIGHEST]"))
 """
 LATE = """
 import warnings
@@ -94,13 +93,9 @@ def test_a_fork_of_a_process_that_used_jax_is_refused_where_it_would_wait_for_ev
     assert printed(FORK) == [7]
 
 
-def test_a_small_loop_is_one_kernel_unless_the_user_has_flags_of_his_own(tmp_path):
-    assert printed(LOOP, tmp_path) == [1]
-    assert printed(LOOP, tmp_path, **{FLAGS: f"{EXTRA}=xla_cpu_small_while_loop_byte_threshold=1"}) == [0]
-
-
-def test_products_are_in_single_precision_on_every_device(tmp_path):
-    assert printed(PRECISION, tmp_path) == [1]
+def test_a_small_loop_is_one_kernel_unless_the_user_has_flags_of_his_own_and_products_are_precise(tmp_path):
+    assert printed(LOOP, tmp_path) == [1, 1]
+    assert printed(LOOP, tmp_path, **{FLAGS: f"{EXTRA}=xla_cpu_small_while_loop_byte_threshold=1"}) == [0, 1]
 
 
 def test_programs_are_found_again_wherever_their_cache_was_moved(tmp_path):

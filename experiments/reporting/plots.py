@@ -89,18 +89,15 @@ def legend_below(
     return figure
 
 
-def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.0, beside: Sequence[Line] = ()) -> None:
-    """Draw the lines, the first on top, and the attainable error (`floor`), if it is not 0.
-
-    `beside`: the lines of panels above and below, which share the limits; notes are then inside the panel.
-    """
-    limits = _limits([line.errors for line in [*lines, *beside]], floor)
+def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.0) -> None:
+    """Draw the lines, the first on top, and the attainable error (`floor`), if it is not 0."""
+    limits = _limits([line.errors for line in lines], floor)
     axes.set(xscale="log", xlim=limits, title=title)
     axes.set_xlabel("test error $L^T_{MSE}$  (state in SI units, squared; log scale)")
     name_lines(axes, [line.name for line in lines])
     tick_errors(axes.xaxis, *limits)
     for y, line in enumerate(lines):
-        mean = _draw_line(axes, y, line.errors, line.colour, limits, inside=bool(beside))
+        mean = _draw_line(axes, y, line.errors, line.colour, limits)
         if line.marked and limits[0] < mean < limits[1]:
             axes.axvline(mean, color=line.colour, linestyle=":", linewidth=1, label=line.marked)
     if limits[0] < floor < limits[1]:
@@ -169,7 +166,7 @@ def _limits(errors: Iterable[np.ndarray], floor: float) -> tuple[float, float]:
     return near.min() / PADDING, near.max() * PADDING
 
 
-def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[float, float], inside: bool) -> float:
+def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[float, float]) -> float:
     """Draw a dot for each seed and a bar for the mean of the finite ones, which is returned; mark errors outside."""
     low, high = limits
     finite = values < DRAWABLE
@@ -189,7 +186,6 @@ def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[
     marks += [("<", low, f"{below} of {len(values)} below")] if below else []
     for marker, x, text in marks:
         axes.plot(x, y, marker, color=tint, markersize=7, clip_on=False, zorder=5)
-        # Right of the marker: outside the panel at its right edge, where they hide no seed, if there is room.
-        offset, align = ((-6, 5), "right") if inside and x == high else ((8, 0), "left")
-        note(axes, text, (x, y), offset, va="center", ha=align, fontsize=6 if inside else 7, color=tint)
+        # Right of the marker: outside the panel at its right edge, where they hide no seed.
+        note(axes, text, (x, y), (8, 0), va="center", ha="left", fontsize=7, color=tint)
     return mean

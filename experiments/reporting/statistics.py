@@ -95,7 +95,7 @@ def ratio_of_stds(first: Values, second: Values) -> Estimate:
     return Estimate(above / below, above / below / reach, above / below * reach)
 
 
-def share_of_gap(before: Values, after: Values, reachable: Values, level: float = LEVEL) -> Estimate:
+def share_of_gap(before: Values, after: Values, reachable: Values) -> Estimate:
     """(before − after) / (before − reachable), of the means over the seeds where all three are finite.
 
     The interval is Fieller's ("Some problems in interval estimation", 1954): all shares s for which a paired t test
@@ -109,7 +109,7 @@ def share_of_gap(before: Values, after: Values, reachable: Values, level: float 
     value = float(closed.mean() / gap.mean())
     if len(gap) < 2:
         return Estimate(value)
-    t = float(scipy.special.stdtrit(len(gap) - 1, (1 + level) / 2))
+    t = float(scipy.special.stdtrit(len(gap) - 1, (1 + LEVEL) / 2))
     covariance = np.cov(closed, gap) * t**2 / len(gap)
     a = gap.mean() ** 2 - covariance[1, 1]
     b = closed.mean() * gap.mean() - covariance[0, 1]

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
+from hybrid_jax.dynamics.hidden import RandomWalk, with_hidden
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.elimination import descend, reduced
 from hybrid_jax.estimation.least_squares import in_double
@@ -27,7 +28,7 @@ from hybrid_jax.estimation.shooting import Problem, effects
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification import slow_commands
-from hybrid_jax.identification.multirotor import TANGENT, Multirotor
+from hybrid_jax.identification.multirotor import PUSHED, TANGENT, Multirotor
 from hybrid_jax.identification.recordings import Layout, Windows, cut
 from hybrid_jax.integrate import RK4
 from hybrid_jax.runtime import entry
@@ -145,7 +146,7 @@ def _search(
                 raise ValueError(f"{recording.name}: has no battery voltage, which the actuator depends on; {mend}")
     told = "command" if commanded else "rotor_speed"
     windows, axes, root = cut(recordings, layout, told, measured, most, volts)
-    model = in_double(Multirotor.of(physics, axes, layout.ahead))
+    model = in_double(Multirotor(with_hidden(physics, RandomWalk(PUSHED)), axes, layout.ahead))
     scale = {}
     for name, there in windows.segments.there.items():  # the spread of each channel in time
         spread = np.nanstd(np.where(there[..., None], windows.segments.y[name], np.nan), axis=(0, 1, 2))
@@ -189,10 +190,7 @@ def identify_in_turn(
 
 @entry
 def window_errors(
-    field: AbstractVectorField,
-    recordings: Sequence[Recording],
-    layout: Layout | None = None,
-    measured: Sequence[str] = (),
+    field: AbstractVectorField, recordings: Sequence[Recording], layout: Layout | None = None
 ) -> dict[str, Float[np.ndarray, "n t k"]]:
     """Return y − ŷ of every window, from the state estimated from earlier samples; NaN where there is no y.
 
@@ -200,11 +198,10 @@ def window_errors(
         field: an `Actuated` field if the input is commands; any other field takes the measured rotor speeds.
         recordings: one or more, of one vehicle.
         layout: how they are cut into windows, by default `Layout()`.
-        measured: quantities to compare, by default all that every recording has.
     """
     layout = Layout() if layout is None else layout
     with jax.enable_x64(True):
-        search, *_ = _search(field, recordings, layout, measured, layout.most)
+        search, *_ = _search(field, recordings, layout, (), layout.most)
         found = search.predicted(search.theta, search.still).errors
     there = search.segments.there
     return {name: np.where(there[name][:, 0, :, None], -part[:, 0], np.nan) for name, part in found.items()}

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from hybrid_jax.dynamics.actuators import Actuated, held_means
-from hybrid_jax.dynamics.hidden import RandomWalk, with_hidden
 from hybrid_jax.dynamics.measurement import difference, measure
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.state import STATE_SIZE, VELOCITY
@@ -45,10 +44,6 @@ class Multirotor(eqx.Module):
     field: Any
     axes: dict[str, tuple[int, ...]] = eqx.field(static=True)
     ahead: int = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, body, axes: dict[str, tuple[int, ...]], ahead: int) -> "Multirotor":
-        return cls(with_hidden(body, RandomWalk(PUSHED)), axes, ahead)
 
     @property
     def rotor_states(self) -> int:

@@ -33,7 +33,7 @@ from hybrid_jax.planning.input_designs import (
     Trajectory,
 )
 from hybrid_jax.runtime import FAST_COMPILE, entry
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, STATE_SIZE, VELOCITY
+from hybrid_jax.state import SENSOR_NOISE, STATE_SIZE
 from hybrid_jax.trajectories import windows_of
 
 SPARE = 0.98  # share of each limit that is used at most, as limits are looked at between samples only
@@ -222,10 +222,7 @@ def _noise(noise: Sequence[float] | None, states: int) -> Float[np.ndarray, " d"
     if noise is None:
         if states != STATE_SIZE:
             raise ValueError(f"noise must be given: the standard deviation of each of {states} states")
-        sizes = np.zeros(STATE_SIZE, np.float32)
-        for part, size in zip((POSITION, QUATERNION, VELOCITY, BODY_RATES), SENSOR_NOISE, strict=True):
-            sizes[part] = size
-        return sizes
+        return np.repeat(np.array(SENSOR_NOISE, np.float32), (3, 4, 3, 3))
     sizes = np.asarray(checks.finite("noise", checks.real_array("noise", noise)), np.float32)
     if sizes.shape != (states,) or not (sizes > 0).all():
         raise ValueError(f"noise must be {states} positive numbers, got {checks.short_repr(noise)}")

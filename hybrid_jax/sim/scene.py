@@ -47,7 +47,8 @@ def traced_model(p: Parameters) -> mjx.Model:
     """The scene for MJX, in the current precision, with the parameters of a vehicle, which may be traced."""
     # Concrete even while tracing, so that MJX sees the model's structure as constants.
     with jax.ensure_compile_time_eval():
-        model = mjx.put_model(build_model(_placeholder(len(p.spin))))
+        places, spin = ((each * len(p.spin))[: len(p.spin)] for each in (IRIS.rotor_positions, IRIS.spin))
+        model = mjx.put_model(build_model(replace(IRIS, rotor_positions=places, spin=spin)))
     thrust, reaction = jnp.array([0.0, 0, 1, 0, 0, 0]), jnp.array([0.0, 0, 0, 0, 0, 1])
     ratio = p.spin * p.torque_coefficient / p.thrust_coefficient
     replaced: dict[str, Any] = {
@@ -60,12 +61,6 @@ def traced_model(p: Parameters) -> mjx.Model:
         "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(p.thrust_coefficient),
     }
     return cast(mjx.Model, model.tree_replace(replaced))
-
-
-def _placeholder(rotors: int) -> Vehicle:
-    """The Iris with another number of rotors, at arbitrary positions."""
-    places, spin = ((each * rotors)[:rotors] for each in (IRIS.rotor_positions, IRIS.spin))
-    return replace(IRIS, rotor_positions=places, spin=spin)
 
 
 def accelerations(p: Parameters, x: State, u: Input, applied: Float[Array, "6"]) -> Float[Array, "6"]:
