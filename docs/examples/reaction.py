@@ -44,12 +44,12 @@ shown = {
     "predicted": fields[1],
     "|error|": jnp.abs(fields[0] - fields[1]),
 }
-figure, panels = plt.subplots(1, 3, figsize=(4.6, 2.1), layout="constrained")
+figure, panels = plt.subplots(1, 3, figsize=(4.6, 2.4), layout="constrained")
 for axes, (title, image) in zip(panels, shown.items(), strict=True):
     bar = figure.colorbar(axes.imshow(image), ax=axes, location="bottom")
     bar.locator = plt.MaxNLocator(3)
     bar.ax.tick_params(labelsize=5)
     axes.set_title(title, fontsize=8)
     axes.set_axis_off()
-figure.suptitle("concentration u after 1 s", fontsize=8)
+figure.suptitle("concentration u after 1 s\n", fontsize=8)
 plt.savefig("reaction.png", dpi=110)
