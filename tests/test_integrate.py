@@ -89,19 +89,6 @@ def test_a_solver_for_other_equations_is_refused(name):
         path_of("rk4")
 
 
-@pytest.mark.parametrize("solver", [RK4(), diffrax.Tsit5(), diffrax.Heun()], ids=lambda value: type(value).__name__)
-def test_an_input_acts_from_its_own_interval_on(solver):
-    """A stage at the end of a step must not read the next input, nor a stage kept from the last step the one before."""
-    before = path_of(solver)
-    for i in range(len(TORQUES)):
-        changed = TORQUES.copy()
-        changed[i] += 1.0
-        after = path_of(solver, torques=changed)
-        np.testing.assert_array_equal(after[:i], before[:i])
-        # A constant torque of 1 over the interval: v + h, up to the pull of gravity on the way.
-        assert abs((after[i] - before[i])[1] - DT) < 0.3 * DT
-
-
 @pytest.mark.parametrize("solver", STEPPERS, ids=lambda value: type(value).__name__)
 def test_a_program_does_not_grow_with_its_substeps(solver):
     def size(substeps):

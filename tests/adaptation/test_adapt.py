@@ -44,17 +44,6 @@ def flown(truth, count=40, seed=0):
     return replace(start, x=eqx.filter_jit(hj.rollout_batch)(truth, start.x0, start.u, start.dt))
 
 
-def test_a_disturbance_of_the_pendulum_is_found_with_the_length():
-    truth = hj.Hybrid(hj.Hybrid(pendulum(LENGTH), ConstantDisturbance(PUSH)), network())
-    result = adapt(hj.Hybrid(pendulum(0.7), network()), noisy(flown(truth)))
-    np.testing.assert_allclose(result.disturbance, PUSH, atol=0.2)
-    assert list(result.parameters) == ["log_length", "disturbance[0]", "disturbance[1]"]
-    assert result.parameters["disturbance[1]"].low > 1
-    again = adapt(result.field, noisy(flown(truth)), method=LeastSquares(disturbance=False))
-    # It is part of the physics by then; starts count otherwise, within two standard errors.
-    np.testing.assert_allclose(again.disturbance, result.disturbance, atol=0.02)
-
-
 class Stretched(AbstractVectorField):
     """Another field with the unit of each state divided by a factor."""
 
