@@ -132,7 +132,7 @@ class ResidualNetwork(AbstractVectorField):
         return self.scaling.outputs(y)
 
     def update_running_stats(self, x, u):
-        norm = self.norm.observed(self.weight_in @ self.inputs(x, u))
+        norm = self.norm.observed(self.weight_in, self.inputs(x, u))
         return eqx.tree_at(lambda network: network.norm, self, norm)
 
     def parameter_columns(self, x, u):

@@ -90,8 +90,8 @@ class AbstractNorm(eqx.Module):
         """W₂ σ(normalised W₁ z) + b₂ on a minibatch z, a column for each sample, in training mode."""
         return affine(weight_out, bias_out, activation(self.infer(weight_in, z)))
 
-    def observed(self, hidden: Float[Array, "h b"]) -> Self:
-        """The normalisation with running statistics updated by a training batch W₁ z."""
+    def observed(self, weight: Float[Array, "h m"], z: Float[Array, "m b"]) -> Self:
+        """The normalisation with running statistics updated by a training batch z."""
         return self
 
 
@@ -127,9 +127,12 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
     def train_layers(self, activation, weight_in, weight_out, bias_out, z):
         return normalised_layer(self.epsilon, activation, weight_in, self.gain, self.shift, weight_out, bias_out, z)
 
-    def observed(self, hidden):
-        mean = row_means(hidden)
-        return self.moved(RunningStats(mean, row_means(jnp.square(hidden - mean[:, None]))))
+    def observed(self, weight, z):
+        # By those of z, a tenth of the time: h is larger than m.
+        mean = row_means(z)
+        centred = z - mean[:, None]
+        covariance = centred @ centred.T / z.shape[1]
+        return self.moved(RunningStats(weight @ mean, jnp.sum(weight @ covariance * weight, axis=1)))
 
     def training_mode(self, seen: Moments):
         return MinibatchNorm(self.gain, self.shift, seen, self.epsilon)

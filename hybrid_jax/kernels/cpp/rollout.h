@@ -90,64 +90,66 @@ struct Lane {
   float* q(Vec* point) const { return reinterpret_cast<float*>(h(point) + group * U); }
 };
 
-// The layer that couples all windows of a lane: z less its mean, n of a block of windows, and the derivatives.
+// The layer that couples all windows of a lane: z less its mean, n of a block of windows, and the derivatives. z and the
+// derivatives with respect to h wait for their products until a step's stages are done.
 struct Coupling {
   const Lane& lane;
   const int64_t blocks = lane.group;
-  Vec *z = lane.room(blocks * Z), *dz = lane.room(blocks * Z), *n = lane.room(U), *dn = lane.room(blocks * U);
-  float* scale = reinterpret_cast<float*>(lane.room(U));
+  Vec *zs = lane.room(STAGES * blocks * Z), *dns = lane.room(STAGES * blocks * U), *dz = lane.room(blocks * Z), *n = lane.room(U);
+  float *scale = reinterpret_cast<float*>(lane.room(U)), *through_q = reinterpret_cast<float*>(lane.room(U));
 
   void centre(Vec* z) const {
     const int64_t last = lane.b - (blocks - 1) * V;
-    for (int r = 0; r < Z; ++r) {
-      Vec all{}, &end = z[(blocks - 1) * Z + r];
-      end = first(end, last);
-      for (int64_t j = 0; j < blocks; ++j) all += z[j * Z + r];
-      const float mean = sum(all) / float(lane.b);
-      for (int64_t j = 0; j < blocks; ++j) z[j * Z + r] -= mean;
-      end = first(end, last);
-    }
+    in_tiles<Z, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
+      constexpr int R = decltype(rows)::value;
+      Vec all[R], *end = z + (blocks - 1) * Z + i;
+      UNROLL for (int r = 0; r < R; ++r) all[r] = end[r] = first(end[r], last);
+      for (int64_t j = 0; j < blocks - 1; ++j) UNROLL for (int r = 0; r < R; ++r) all[r] += z[j * Z + i + r];
+      UNROLL for (int r = 0; r < R; ++r) all[r] = wide(sum(all[r]) / float(lane.b)), end[r] = first(end[r] - all[r], last);
+      for (int64_t j = 0; j < blocks - 1; ++j) UNROLL for (int r = 0; r < R; ++r) z[j * Z + i + r] -= all[r];
+    });
   }
   // z, and unless these are known h and q, some units at a time, so that these stay in the first cache.
-  void evaluate(const Vec* x, const Vec* u, Vec* h, float* q, bool known) const {
+  void evaluate(int stage, const Vec* x, const Vec* u, Vec* h, float* q, bool known) const {
+    Vec* z = zs + stage * blocks * Z;
     for (int64_t j = 0; j < blocks; ++j) read(lane.w, x + j * D, u + j * M, z + j * Z);
     centre(z);
-    in_tiles<H, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
+    if (!known) in_tiles<H, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
       Vec squares[R] = {};
-      for (int64_t j = 0; j < blocks && !known; ++j) {
-        dense<R, Z>(lane.w + WEIGHT + i * Z, Z, 1, z + j * Z, h + j * U + i);
-        UNROLL for (int r = 0; r < R; ++r) squares[r] += h[j * U + i + r] * h[j * U + i + r];
-      }
-      for (int r = 0; r < R && !known; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(lane.b) + lane.epsilon);
+      by_blocks(blocks, [&](auto count, int64_t j) __attribute__((always_inline)) {
+        constexpr int B = decltype(count)::value;
+        dense<R, Z, B>(lane.w + WEIGHT + i * Z, Z, 1, z + j * Z, h + j * U + i, Z, U);
+        UNROLL for (int b = 0; b < B; ++b)
+          UNROLL for (int r = 0; r < R; ++r) squares[r] += h[(j + b) * U + i + r] * h[(j + b) * U + i + r];
+      });
+      UNROLL for (int r = 0; r < R; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(lane.b) + lane.epsilon);
     });
     for (int i = 0; i < H; ++i) scale[i] = lane.w[GAIN + i] * q[i];
   }
   void normalise(const Vec* h) const {
-    for (int i = 0; i < H; ++i) n[i] = scale[i] * h[i] + lane.w[SHIFT + i];
+    const float *factor = scale, *shift = lane.w + SHIFT;
+    UNROLL for (int i = 0; i < H; ++i) n[i] = factor[i] * h[i] + shift[i];
   }
-  // From dn to the derivative with respect to z; adds those with respect to weights.
-  void back(const Vec* h, const float* q, Vec* sums) const {
-    std::fill_n(dz, blocks * Z, Vec{});
+  // From dn to the derivatives with respect to h, in its place, and z; adds those with respect to γ and β.
+  void back(Vec* dn, const Vec* h, const float* q, Vec* sums) const {
     in_tiles<H, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
-      Vec by_scale[R] = {}, by_shift[R] = {}, through_q[R];
+      Vec by_scale[R] = {}, by_shift[R] = {};
       for (int64_t j = 0; j < blocks; ++j)
-        UNROLL for (int r = 0; r < R; ++r) {
-          const Vec d = dn[j * U + i + r];
-          by_scale[r] += d * h[j * U + i + r], by_shift[r] += d;
-        }
-      for (int r = 0; r < R; ++r) {
-        const float root = q[i + r];
-        sums[GAIN + i + r] += root * by_scale[r], sums[SHIFT + i + r] += by_shift[r];
-        through_q[r] = wide(-scale[i + r] * root * root * sum(by_scale[r]) / float(lane.b));
+        UNROLL for (int r = 0; r < R; ++r) by_scale[r] += dn[j * U + i + r] * h[j * U + i + r], by_shift[r] += dn[j * U + i + r];
+      UNROLL for (int r = 0; r < R; ++r) {
+        sums[GAIN + i + r] += q[i + r] * by_scale[r], sums[SHIFT + i + r] += by_shift[r];
+        through_q[i + r] = -scale[i + r] * q[i + r] * q[i + r] * sum(by_scale[r]) / float(lane.b);
       }
-      for (int64_t j = 0; j < blocks; ++j) {
-        Vec* d = dn + j * U + i;
-        UNROLL for (int r = 0; r < R; ++r) d[r] = scale[i + r] * d[r] + through_q[r] * h[j * U + i + r];
-        dense<Z, R, true>(lane.w + WEIGHT + i * Z, 1, Z, d, dz + j * Z);
-      }
-      add_products<R, Z>(sums + WEIGHT + i * Z, dn + i, U, z, Z, blocks);
+    });
+    by_blocks(blocks, [&](auto count, int64_t j) __attribute__((always_inline)) {
+      constexpr int B = decltype(count)::value;
+      const float *factor = scale, *through = through_q;
+      Vec* d = dn + j * U;
+      for (int i = 0; i < H; ++i)
+        UNROLL for (int b = 0; b < B * U; b += U) d[b + i] = factor[i] * d[b + i] + through[i] * h[j * U + b + i];
+      dense<Z, H, B>(lane.w + WEIGHT, 1, Z, d, dz + j * Z, U, Z);
     });
     centre(dz);
   }
@@ -167,7 +169,7 @@ void forward_lane(const Call& call) {
       for (int stage = 0; stage < STAGES; ++stage) {
         Vec *point = lane.kept ? lane.point(first, t, stage) : passing, *h = lane.h(point);
         for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + lane.ahead[stage - 1] * slopes[i] : x[i];
-        if (H) coupling.evaluate(point, u, h, lane.q(point), false);
+        if (H) coupling.evaluate(0, point, u, h, lane.q(point), false);
         for (int64_t j = 0; j < group; ++j) {
           coupling.normalise(h + j * U);
           slope(lane.w, point + j * D, u + j * M, coupling.n, slopes + j * D);
@@ -205,14 +207,15 @@ void backward_lane(const Call& call) {
       for (int stage = STAGES; stage--;) {
         Vec *point = lane.point(first, t, stage), *h = lane.h(point);
         for (int64_t i = 0; i < n; ++i) d_slope[i] = lane.share[stage] * next[i] + (stage < STAGES - 1 ? lane.ahead[stage] * d_point[i] : Vec{});
-        if (H) c.evaluate(point, u, h, lane.q(point), true);
+        if (H) c.evaluate(stage, point, u, h, lane.q(point), true);
+        Vec* dn = c.dns + stage * group * U;
         for (int64_t j = 0; j < group; ++j) {
           if (used == SLOTS) products(sums, factors, used), used = 0;
           c.normalise(h + j * U);
-          slope_back(back, point + j * D, u + j * M, c.n, d_slope + j * D, d_point + j * D, more_u, c.dn + j * U, {sums}, factors + F * used++);
+          slope_back(back, point + j * D, u + j * M, c.n, d_slope + j * D, d_point + j * D, more_u, dn + j * U, {sums}, factors + F * used++);
           for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
         }
-        if (H) c.back(h, lane.q(point), sums);
+        if (H) c.back(dn, h, lane.q(point), sums);
         for (int64_t j = 0; j < group && H; ++j) {
           read_back(back, point + j * D, u + j * M, c.dz + j * Z, more, more_u, {sums});
           for (int i = 0; i < D; ++i) d_point[j * D + i] += more[i];
@@ -220,6 +223,7 @@ void backward_lane(const Call& call) {
         }
         for (int64_t i = 0; i < n; ++i) dx[i] += d_point[i];
       }
+      if (H) add_products<H, Z>(sums + WEIGHT, c.dns, U, c.zs, Z, STAGES * group);
       for (int64_t j = 0; j < group; ++j) d_u.scatter(du + j * M, t, (first + j) * V);
     }
     for (int64_t j = 0; j < group; ++j) d_x0.scatter(dx + j * D, 0, (first + j) * V);

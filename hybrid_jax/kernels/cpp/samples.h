@@ -19,9 +19,15 @@ INLINE Vec choose(Mask which, A a, B b) {
 }
 template <class Mask> INLINE Vec number(Mask which) { return choose(which, 1.0f, 0.0f); }
 
-// NaN, if one is NaN.
-template <class A, class B> INLINE Vec larger(A a, B b) { const Vec l = wide(a), r = wide(b); return (l > r) | (l != l) ? l : r; }
-template <class A, class B> INLINE Vec smaller(A a, B b) { const Vec l = wide(a), r = wide(b); return (l < r) | (l != l) ? l : r; }
+// NaN, if one is NaN; beside a number that the compiler knows, as in ReLU, one comparison is enough.
+template <class B> INLINE bool is_known(B b) { return __builtin_constant_p(b) && b == b; }
+INLINE bool is_known(Vec) { return false; }
+#define EXTREME(NAME, BEYOND)                                             \
+  template <class A, class B> INLINE Vec NAME(A a, B b) {                 \
+    const Vec l = wide(a), r = wide(b);                                   \
+    return is_known(b) ? (r BEYOND l ? r : l) : (l BEYOND r) | (l != l) ? l : r; \
+  }
+EXTREME(larger, >) EXTREME(smaller, <)
 
 // Of glibc's library of vectors, within four units in the last place; and number by number.
 #if defined(__AVX512F__)
