@@ -111,12 +111,12 @@ def _page(
     ]
     header = ("after", "of", "RMSE", "from", "to")
     return page.Page(
-        f"What changed, by {page.counted(flights.logs, 'flight')} of {options.after}, {flights.seconds:.0f} s?",
+        f"What changed in {page.counted(flights.logs, 'flight')} of {options.after} ({flights.seconds:.0f} s)?",
         answer,
         page.Table(f"{title} (95 % intervals)", ("parameter", "before", "after"), rows) if rows else None,
         [("RMSE on these flights, to which the model was adapted", errors.figure(curves, known.dt))],
         [
-            f"Velocity after {seconds:g} s was off by {old[1]}, and is by {new[1]}, on these flights.",
+            f"On these flights the error of velocity after {seconds:g} s was {old[1]}; it is now {new[1]}.",
             *([f"Of the model before, {ALONE}"] if found.alone else []),
             *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
             *errors.unknown(found),

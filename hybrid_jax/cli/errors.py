@@ -21,6 +21,16 @@ from hybrid_jax.flights.windows import sequences
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
 BASELINE = "Frozen rates are a baseline: the thrust of the motors acts, and body rates stay as they are."
 MOST = 500  # windows of a flight
+LINES = {  # colour and dashes of a model, the same on every page
+    "thrust, rates frozen": ("0.6", "--"),
+    "no forces": ("0.6", ":"),
+    "before": ("0.45", "--"),
+    "adapted": ("#CC79A7", "-"),
+    "physics": ("#009E73", "-"),
+    "physics with its past": ("#009E73", "--"),
+    "hybrid": ("#0072B2", "-"),
+    "hybrid with its past": ("#0072B2", "--"),
+}
 
 
 def rmse_by_flight(
@@ -63,7 +73,8 @@ def figure(errors: Mapping[str, Float[np.ndarray, "flights t 4"]], dt: float) ->
     for i, (panel, (name, unit)) in enumerate(zip(panels.flat, UNITS.items(), strict=True)):
         for label, found in errors.items():
             mean = np.sqrt(np.mean(np.square(found[..., i]), axis=0))
-            panel.plot(dt * np.arange(1, len(mean) + 1), mean, label=label)
+            colour, dashes = LINES.get(label, ("#0072B2", "-"))
+            panel.plot(dt * np.arange(1, len(mean) + 1), mean, dashes, color=colour, label=label)
         panel.set(title=name.replace("_", " "), ylabel=f"RMSE [{unit}]", ylim=(0, None))
     for panel in panels[-1]:
         panel.set_xlabel("time since the prediction began [s]")

@@ -57,7 +57,7 @@ def adapt(options: Any, model: Model) -> int:
     ]
     todo = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     shown = page.Page(
-        f"What changed, by {page.counted(logs, 'log')} of {options.after}, {found.seconds:.0f} s?",
+        f"What changed in {page.counted(logs, 'log')} of {options.after} ({found.seconds:.0f} s)?",
         f"Changed: {alone[0]}" if changed else "These logs show no change.",
         page.Table("Before, and after with 95 % intervals", HEADER, lines[:LINES]),
         [("Errors of predictions of the adapted model", figure(found.field, logs, layout))],

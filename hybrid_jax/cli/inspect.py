@@ -31,7 +31,7 @@ LINES = 5  # of what is not folded
 # Checks that a log may fail and still say something of its vehicle: it needs no position, and is cut at gaps.
 BORNE = ("quantities", "slowest signal", "gaps", "repeated samples")
 SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
-NOT_RUN = f"not checked for want of --vehicle: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
+NOT_RUN = f"Without --vehicle these are not checked: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
 EMPTY = "–"
 LESS = "Some logs have motors and lack states ({}): hybrid-jax identify learns what these determine."
 

@@ -73,4 +73,4 @@ def unlike(known: Known, flights: Flights) -> list[str]:
     shares = shares_outside(learned, asked)
     told = ", ".join(f"{name.partition(' [')[0]} {share:.0%}" for name, share in shares.items() if share > WARN)
     more = "of the time; errors there may be larger than expected."
-    return [f"These flights are outside of those that the model was trained on: {told} {more}"] if told else []
+    return [f"These flights have motion that the training flights did not have: {told} {more}"] if told else []

@@ -15,16 +15,20 @@ from hybrid_jax.io.files import json_text, json_value, write_atomic
 
 FORMAT = 1  # of report.json
 STYLE: dict[Any, Any] = {"axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.3}
+# Okabe and Ito's colours, which colour-blind readers can distinguish.
+CYCLE = "cycler('color', ['#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '0.3'])"
+STYLE |= {"legend.frameon": False, "font.size": 9, "axes.titlesize": 9, "axes.prop_cycle": CYCLE}
 CSS = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 56rem; margin: 0 auto; padding: 1rem; color: #1a1a1a }
 h1 { font-size: 1.3rem } h2 { font-size: 1.1rem } .answer { font-size: 1.2rem; font-weight: 600 }
+h1, p { overflow-wrap: anywhere }
 .scroll { overflow-x: auto } table { border-collapse: collapse; font-size: .9rem }
 td, th { padding: .25rem .6rem; text-align: left; border-bottom: 1px solid #ddd; vertical-align: top }
 @media (max-width: 30rem) { body { padding: .5rem } table { font-size: .8rem } td, th { padding: .25rem .3rem } }
 figure { margin: 1rem 0 } img { max-width: 100% } figcaption { font-size: .9rem; color: #555 }
 details { margin: .5rem 0 } summary { cursor: pointer } li { overflow-wrap: anywhere }
 @media (prefers-color-scheme: dark) { body { background: #161616; color: #e6e6e6 } td, th { border-color: #444 }
-img { background: #fff } figcaption { color: #aaa } }
+img { filter: invert(1) hue-rotate(180deg); mix-blend-mode: screen } figcaption { color: #aaa } }
 """
 
 

@@ -27,7 +27,7 @@ from hybrid_jax.trajectories import Trajectories
 
 __all__ = ["LISTS", "Options", "run"]
 SHOWN = 10  # pictures a second
-TRUE, COLOURS = "tab:blue", ("tab:orange", "tab:green")
+TRUE, COLOURS = "0.3", ("#0072B2", "#CC79A7")
 Forecasts = Mapping[str, Float[np.ndarray, "n t 3"]]
 
 

@@ -111,7 +111,7 @@ def test_without_a_vehicle_a_log_is_checked_against_itself(tmp_path, called):
     _, said, _ = called("inspect", write(tmp_path / "flights", [LOGS[0], *in_mm]), "--out", tmp_path)
     assert "chirp_run1.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
     assert "FAILS dp/dt against v: position is in mm" in said
-    assert "not checked for want of --vehicle: number of motors, largest speed; specific force" in said
+    assert "Without --vehicle these are not checked: number of motors, largest speed; specific force" in said
 
 
 def test_a_log_of_other_motors_hides_no_other(tmp_path, called):
