@@ -17,7 +17,8 @@ from hybrid_jax.online.samples import HUGE, Sample
 from hybrid_jax.online.state import OnlineState
 from hybrid_jax.online.tuning import TRIAL, WINDOW, Tuning
 
-AT_BOUND = 5.0  # alarms as which a parameter at its bound counts in a second
+NEAR = 0.95  # share of its bound from which a parameter counts as at it
+AT_BOUND = 5.0  # alarms as which one at its bound counts in a second
 SETTLED = 0.5  # count of alarms below which an estimate is kept
 
 
@@ -27,7 +28,7 @@ def believed(
     """Compute the consistency fields of the next state: mean NIS, alarms, and θ in use and before the alarms."""
     share = jnp.sum(verdict.squares) / jnp.maximum(jnp.sum(jnp.where(sample.seen, 1.0, 0.0)), 1.0)
     nis = state.nis + jnp.where(sample.measured, -jnp.expm1(-periods / WINDOW), 0.0) * (share - state.nis)
-    at_bound = sample.measured & (jnp.max(jnp.abs(verdict.theta)) >= tuning.bound)
+    at_bound = sample.measured & (jnp.max(jnp.abs(verdict.theta)) >= NEAR * tuning.bound)
     added = jnp.where(verdict.changed, 1.0, 0.0) + jnp.where(at_bound, AT_BOUND * periods, 0.0)
     counted = state.doubt * jnp.exp(-periods * sample.elapsed / TRIAL) + added
     # Once it is too large it is doubled, and so takes time to fall.

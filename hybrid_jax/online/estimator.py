@@ -3,7 +3,7 @@
 The filter state is z = [x, θ]: the state x of the system, because one-step predictions need it without noise, and θ,
 all parameters of the physics and the disturbance.
 
-- A test of the innovations detects a change (`change_test`) and an alarm resets the covariance.
+- A test of the innovations detects a change (`change_test`); an alarm resets the variance of what takes part in it.
 - θ follows a slow random walk. The process noise of the disturbance (of all parameters if there is none) grows while
   the innovations are biased, for example in a gust.
 - Filters of a few parameters may compete with the filter of all (`multiple_model`).
@@ -28,7 +28,7 @@ from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import Interval, intervals
 from hybrid_jax.integrate import check_callable, check_field
 from hybrid_jax.online import consistency, excitation, kalman, multiple_model
-from hybrid_jax.online.change_test import ChangeTest
+from hybrid_jax.online.change_test import EAGER, ChangeTest
 from hybrid_jax.online.excitation import Excitation
 from hybrid_jax.online.hypotheses import Hypothesis, ModelSet, Subspace, model_set, subspace_of
 from hybrid_jax.online.kalman import Belief, Correction, Each, FilterModel
@@ -38,7 +38,6 @@ from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, fl
 from hybrid_jax.online.tuning import HOLD, PAUSE, Tuning
 from hybrid_jax.runtime import entry
 
-EAGER = 6.0  # squared test, χ² of one degree, from which a disturbance walks faster
 RISE, FALL = 10.0, 0.2  # of the logarithm of how much faster [1/s]
 BREEZE = 0.15  # random walk of a disturbance, in its prior [1/√s], whose effects a parameter's must exceed
 TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a parameter explains
@@ -146,6 +145,7 @@ class OnlineAdaptation(AbstractEstimator):
             trusted=theta,
             settled=theta,
             doubt=zero,
+            opened=theta,
             haste=theta,
             nis=zero + 1,
             history=SampleHistory(x, none, zero, none),
@@ -180,22 +180,24 @@ class OnlineAdaptation(AbstractEstimator):
         model = self._filter_model(sample, each)
         d, variances, tuning, periods = len(x), model.variances, self.tuning, self.dt / self.tuning.pace
         belief, told, correction, gains = self._filtered(state, model, sample)
-        test, opens = state.test.after(correction.white, gains, sample, periods, tuning, PAUSE)
+        test, opened = state.test.after(correction.white, gains, sample, periods, tuning, PAUSE)
+        opens = jnp.max(opened) > 0
         verdict = Verdict(None, belief.z[d:], jnp.square(correction.white), opens, opens)
         if state.mixture is not None:
             verdict = multiple_model.update(state.mixture, self._models(), model, sample, belief, correction, gains)
             unexplained = verdict.unexplained & (test.quiet > HOLD)
             test, opens = test.reset(unexplained, 0.0), opens | unexplained
-        # After a change θ opens to its prior. The state, too, has followed the wrong model since then.
+            opened = jnp.where(unexplained, 1.0, opened)
+        # What changed opens to its prior. The state, too, has followed the wrong model since then.
         belief = kalman.reset_state(belief, sample, opens, variances)
-        fresh = kalman.diagonal_root(variances, jnp.ones_like(state.theta))
         new = OnlineState(
             x=belief.z[:d],
             theta=belief.z[d:],
-            root=jnp.concatenate([belief.root[:d], jnp.where(opens, fresh, belief.root)[d:]]),
+            root=belief.root,
             excitation=told,
             test=test,
             mixture=verdict.mixture,
+            opened=opened,
             haste=self._haste(state, sample, opens),
             history=history,
             changes=state.changes + jnp.where(verdict.changed, 1.0, 0.0),
@@ -271,6 +273,7 @@ class OnlineAdaptation(AbstractEstimator):
         d, tuning, ones = len(state.x), self.tuning, jnp.ones_like(state.theta)
         walk = tuning.drift * jnp.exp(state.haste)
         diffusion = self.dt / tuning.pace * sample.elapsed * jnp.square(walk)
+        diffusion = diffusion + state.opened * jnp.maximum(1 - jnp.sum(jnp.square(state.root[d:]), axis=1), 0.0)
         belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted)
         belief = kalman.limit_covariance(belief, ones)
         predicted = kalman.reset_state(belief, sample, sample.restart, model.variances)

@@ -4,8 +4,10 @@ In hover, a thrust coefficient and a disturbance along z are distinguishable onl
 That noise is correlated with the input, so the filter becomes certain of a wrong value, with a bias of about 0.04 / √I
 of the prior, where I is the information of a sample in units of the prior. Directions with little information are
 therefore considered, not estimated: they keep their value and variance, and add to the uncertainty of the others
-(Schmidt, "Application of state-space methods to navigation problems", 1966). The information is computed from the
-innovations' sensitivity to θ (Friedland, "Treatment of bias in recursive filtering", 1969).
+(Schmidt, "Application of state-space methods to navigation problems", 1966). The others are corrected on the condition
+that these keep their value, so what the samples tie together, for example thrust over inertia, stays together. The
+information is computed from the innovations' sensitivity to θ (Friedland, "Treatment of bias in recursive filtering",
+1969).
 """
 
 import equinox as eqx
@@ -18,6 +20,7 @@ from hybrid_jax.online.tuning import MEMORY, Tuning
 
 LARGEST = 1e5  # information of a number beyond which its last digits would count for some
 SHARPER = 5  # passes that make shares zero or one
+LOOSE, LEAST = 1e-4, 1e-9  # variance of a condition over what it is about; share of a parameter
 TAKES_PART = 0.1  # share above which a parameter is part of a direction that is not excited
 
 
@@ -77,10 +80,22 @@ def after_sample(
 def consider(
     before: Belief, after: Belief, correction: Correction, told: Excitation, share: Float[Array, " p"]
 ) -> tuple[Belief, Float[Array, "d p"]]:
-    """Undo the correction of θ along considered directions; also return the gains of θ."""
-    d, considered = len(correction.white), told.considered() * share[:, None] / share
-    gains = correction.gains[:, d:]
-    held = gains @ considered.T
-    z = jnp.concatenate([after.z[:d], after.z[d:] + considered @ (before.z[d:] - after.z[d:])])
+    """Correct θ on the condition that it stays along considered directions; also return the gains of θ."""
+    d, considered = len(correction.white), told.considered()
+    gains, root = correction.gains[:, d:], before.root[d:]
+    moves = jnp.eye(len(share), dtype=root.dtype)
+    sizes = jnp.sum(jnp.square(root), axis=1)
+    # Conditions enter one by one, as samples do in `kalman.correct`: nothing is seen to change along `row`.
+    for i, row in enumerate(considered / share):
+        parts = jnp.maximum(considered[i, i], LEAST)
+        held = jnp.sum(jnp.square(considered[i])) / parts
+        noise = (1 + LOOSE - jnp.minimum(held, 1.0)) / parts * jnp.sum(jnp.square(row) * sizes)
+        seen = row @ root
+        variance = jnp.maximum(jnp.sum(jnp.square(seen)) + noise, 1e-30)
+        column = root @ seen
+        moves = moves - column[:, None] * (row @ moves) / variance
+        root = root - column[:, None] * seen / (variance + jnp.sqrt(noise * variance))
+    held = gains - gains @ moves.T
+    z = jnp.concatenate([after.z[:d], before.z[d:] + moves @ (after.z[d:] - before.z[d:])])
     added = jnp.concatenate([jnp.zeros((d, d), z.dtype), held.T])
     return Belief(z, jnp.concatenate([after.root, added], axis=1)), gains - held

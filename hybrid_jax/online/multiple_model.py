@@ -124,7 +124,8 @@ def update(
     shares, periods = weights(mixture), model.dt / model.tuning.pace
     mixture, white, likelihoods = filtered(mixture, models, model, sample)
     white = jnp.concatenate([white, correction.white[None]])
-    test, changed = mixture.test.after(shares @ white, gains, sample, periods, model.tuning, SETTLE)
+    test, concerned = mixture.test.after(shares @ white, gains, sample, periods, model.tuning, SETTLE)
+    changed = jnp.max(concerned) > 0
     # Bayes' rule; what is at the floor stays there, but for the filter of all parameters.
     before = mixture.log_weights
     likelihoods = jnp.concatenate([likelihoods, correction.log_likelihood[None]])

@@ -37,6 +37,7 @@ class OnlineState(eqx.Module):
         trusted: the last consistent θ, which the model uses.
         settled: the last of these before alarms began, restored if they persist.
         doubt: number of recent alarms.
+        opened: 1 for each parameter whose variance rises to its prior before the next sample, after an alarm; else 0.
         haste: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.
         nis: mean normalised innovation squared, 1 if noise and model are correct.
         history: statistics of the past samples.
@@ -53,6 +54,7 @@ class OnlineState(eqx.Module):
     trusted: Float[Array, "*n p"]
     settled: Float[Array, "*n p"]
     doubt: Float[Array, "*n"]
+    opened: Float[Array, "*n p"]
     haste: Float[Array, "*n p"]
     nis: Float[Array, "*n"]
     history: SampleHistory

@@ -103,10 +103,10 @@ def test_slow_is_said():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("world", WORLDS)
-def test_hover_is_never_worse_than_without_adapting_and_a_wind_is_found(world):
-    keys = jax.random.split(jax.random.key(0))
-    found = Hovered(*map(np.asarray, hover(adaptation_of(world, 1.0), world, 1.0, 300, jnp.array([0.0, 1.0]), keys)))
+@pytest.mark.parametrize(("world", "noise"), [*((world, 1.0) for world in WORLDS), ("iris", 0.1)])
+def test_hover_is_never_worse_than_without_adapting_and_a_wind_is_found(world, noise):
+    keys, gusts = jax.random.split(jax.random.key(0)), jnp.array([0.0, 1.0])
+    found = Hovered(*map(np.asarray, hover(adaptation_of(world, noise), world, noise, 300, gusts, keys)))
     assert found.ratios(10, 300).max() < 1.05
     assert np.abs(found.theta[:, :300, :3]).max() < 0.1
     assert found.ratios(310, 330)[0, 0] < 0.8  # the calm flight, from a second after the wind on
