@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 from filelock import FileLock, Timeout
 from rich.console import Console
 
+from experiments import interruptible
 from experiments.runner.cache import source_digest
 from experiments.runner.options import COMMON, Run
 from experiments.runner.run_record import recorded
@@ -39,6 +40,7 @@ def run(
         about: first paragraph of --help.
         presets: the choices of --preset by name, all of the class that `experiment` takes.
     """
+    interruptible()
     given = sys.argv[1:] if arguments is None else arguments
     fresh = " without --fresh" if "--fresh" in given else ""
     with exit_codes(name, name, f"interrupted; the same command{fresh} goes on from here"):
@@ -87,6 +89,7 @@ def call(
     name: str, kind: type[Options], command: Callable[[Options], None], arguments: Sequence[str] | None = None
 ) -> None:
     """Read the options, a dataclass with the command's description, and run a command. Errors as in `run`."""
+    interruptible()
     with exit_codes(name, name, "interrupted, nothing was written"):
         command(parsed(kind, _program(name), arguments))
 
