@@ -31,7 +31,7 @@ class RK4(diffrax.AbstractSolver):
 
     Attributes:
         scanned: whether its stages are a loop, which compiles faster (see `compact`). The result is the same.
-        substeps: steps that functions of this library take in each interval, for systems where one is not accurate.
+        substeps: steps in each interval; you should take more than one if one is not accurate, for example if stiff.
     """
 
     scanned: bool = False

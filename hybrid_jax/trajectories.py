@@ -23,7 +23,7 @@ class Trajectories(eqx.Module):
     """n windows of t equal intervals.
 
     Attributes:
-        x0: initial state of each window (n, d).
+        x0: initial state of each window (n, d), in SI units; you should not scale it.
         u: input during each interval (n, t, m), constant over it.
         x: state at the end of each interval (n, t, d): x[:, i] is (i + 1) dt after x0.
         dt: length of an interval [s].

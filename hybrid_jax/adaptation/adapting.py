@@ -53,7 +53,7 @@ NOT_FINITE = "the fit diverged; check dt and all units"
 NOT_FITTED = "no parameter was fitted"
 NO_MOTION = "field: its training windows are unknown, so all its errors count as changes; pass learned_from="
 FEW = "windows: {} do not determine {} parameters; the others stay at the source's values"
-BY_NETWORK = "the network of the source expresses a part of this; hj.pool of several sources includes that"
+BY_NETWORK = "the source's network can express a part of such a change; hj.pool of several sources gives intervals"
 BY_ROTORS = "it is relative to the rotors' efficiencies, which were fitted too"
 OVERLAP = "windows overlap: left-out blocks share samples with the others, so the expected errors are too small"
 
@@ -86,12 +86,12 @@ def adapt(
 
     Args:
         field: a trained `Hybrid`, or any other field.
-        windows: in the order of time and without overlap. Least squares needs more windows than parameters. If the
+        windows: you should pass them in the order of time and without overlap, more windows than parameters. If the
             windows follow each other, for example in one flight, the intervals allow for errors that are correlated
             within a fifth of the windows.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` to write your own.
-        validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out if
-            the method needs validation.
+        validation: windows for early stopping and penalties, which should be of another flight. By default
+            the last fifth of `windows` is held out if the method needs validation.
         learned_from: windows that the source was trained on, by default those that `hj.fit` stores in its networks.
             "auto" uses them to estimate the source's own error, and the report warns if `windows` are unlike them.
         settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, which is

@@ -124,7 +124,7 @@ class Adaptation:
         if self.refused:
             yield f"Rejected: {', '.join(self.refused)}: the source's own errors may be as large without any change."
         if self.expected:
-            yield "Expected RMSE on an unseen flight (80% intervals, from left-out blocks of these windows):"
+            yield "RMSE to expect on a new recording (80% intervals, from blocks of windows that were left out):"
             yield from lines_of(self.expected, self.units)
         for name, share in self.outside.items():
             if share > WARN:
@@ -141,10 +141,10 @@ class Adaptation:
             rest = [name for name in self.parameters if name not in told and name not in effective]
             if rest and self.chosen is not None:
                 names = f"{', '.join(told + effective) or 'no parameter'}, and not {', '.join(rest)}"
-                yield f"These windows identify {names}; hj.excitation plans a flight for all of them."
+                yield f"These windows identify {names}; hj.excitation plans an experiment for all of them."
             for reason in dict.fromkeys(self.parameters[name].effective for name in effective):
                 names = ", ".join(name for name in effective if self.parameters[name].effective == reason)
-                yield f"Effective, and therefore without an interval: {names}: {reason}."
+                yield f"Effective, so without an interval: {names}: {reason}."
             if unseen := [name for name, one in self.parameters.items() if one.high == np.inf]:
                 yield f"Warning: these windows do not determine {', '.join(unseen)}: other values fit them as well."
         yield f"Constant disturbance: {'none' if self.disturbance is None else 'see parameters'}."

@@ -31,7 +31,7 @@ class DisturbanceModel(AbstractVectorField):
 
     @property
     def filters(self) -> int:
-        """How many numbers follow those of the field in a state."""
+        """How many numbers a state has after the states of the field."""
         return len(self.time_constants) * len(self.weights)
 
     @property

@@ -181,7 +181,7 @@ class LinearDynamics(AbstractHidden):
 
 
 class WithHidden(AbstractVectorField):
-    """A field with hidden parts; the states of the parts follow those of the field."""
+    """A field with hidden parts, whose states follow the states of the field."""
 
     field: AbstractVectorField
     parts: tuple[AbstractHidden, ...]
@@ -198,7 +198,7 @@ class WithHidden(AbstractVectorField):
 
 
 def with_hidden(field: AbstractVectorField, *parts: AbstractHidden) -> WithHidden:
-    """A field with hidden parts, any number of each kind; the states of the parts follow those of the field.
+    """A field with hidden parts, any number of each kind, whose states follow the states of the field.
 
     Args:
         field: the field that the parts act on.

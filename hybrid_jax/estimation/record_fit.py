@@ -37,7 +37,7 @@ class RecordFit(eqx.Module):
     """The result of `fit_records`.
 
     Attributes:
-        model: with the fitted numbers; the start state is that of the first record.
+        model: with the fitted numbers; it starts like the first record.
         starts: the state at the start of each record (r, d).
         starts_error: its standard error (r, d); three rotation angles [rad] for an attitude.
         ends: the state at the end of each record (r, d).

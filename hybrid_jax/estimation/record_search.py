@@ -118,7 +118,7 @@ class Search(NamedTuple):
         return {name: np.asarray(each)[self.segments.there[name]] for name, each in found.items()}
 
     def weighted(self, errors: dict[str, Float[np.ndarray, "n k"]], robust: float = np.inf) -> "Search":
-        """Weight outputs by their errors; those of more than `robust` times the usual error count less."""
+        """Weight outputs by their errors; errors above `robust` times the usual one count less."""
         sizes = {name: jnp.asarray(size_of(each, robust)) for name, each in errors.items()}
         return self._replace(problem=dataclasses.replace(self.problem, scale=sizes, robust=robust))
 

@@ -189,7 +189,7 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
 
     If the class has a method `theta() -> dict[str, Array]`, such as `RigidBody`, it gives names and values in physical
     units; each entry must be a monotonic function of one parameter. Otherwise the names are the class's fields.
-    Entries of arrays are k_rotors[0], aerodynamic_moment[0,2], …; those of a constant disturbance use the state
+    Entries of arrays are k_rotors[0], aerodynamic_moment[0,2], …; a constant disturbance uses the state
     space's names of states, or indices: disturbance[vx], disturbance[0].
     """
     physics, disturbance = physics_of(field), disturbance_of(field)

@@ -18,7 +18,7 @@ BODIES = {"FLU": np.eye(3), "FRD": np.diag([1.0, -1, -1])}
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of a log: a world of `WORLDS`, a body of `BODIES`, and that of velocities ("world" or "body")."""
+    """The frames of a log: a world of `WORLDS`, a body of `BODIES`, and the frame of velocities, "world" or "body"."""
 
     world: str
     body: str

@@ -265,7 +265,7 @@ def _names(field) -> list[tuple[str, str]]:
 
 
 def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which numbers of θ are fitted; those of velocity are not if no recording measures one."""
+    """Return which numbers of θ are fitted: no effect of velocity if no recording measures one."""
     own = _names(field)
     for name in free or ():
         if name.partition("[")[0] not in dict(own):

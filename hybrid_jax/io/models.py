@@ -72,7 +72,7 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
 
     Args:
         path: of the file to write; an existing file is replaced.
-        field: the model.
+        field: the model. You should define its classes in a module that you can import.
         about: JSON values, which `load` returns with the field.
 
     Raises:

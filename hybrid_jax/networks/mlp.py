@@ -213,11 +213,11 @@ def residual_network(
     Args:
         state_size: d, the size of x.
         input_size: m, the size of u; may be 0.
-        hidden: number of hidden units.
+        hidden: number of hidden units; with little data you should choose few, for example 16.
         scaling: by default set from the training windows by `hybrid_jax.fit`; see `standardise.with_scaling`.
         norm: normalisation of the hidden units: "batch", "layer" or "none".
         outputs: size of the output, by default `state_size`.
-        activation: of the hidden units: "relu" (paper), "softplus", "tanh" or "silu"; see `smoothed`.
+        activation: "relu" (paper), or for solvers that need derivatives you should choose "softplus", "tanh" or "silu".
 
     Raises:
         ValueError: an unknown norm or activation, sizes that are not positive integers, or no random key.

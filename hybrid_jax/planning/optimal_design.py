@@ -100,7 +100,7 @@ def excitation(
     Args:
         model: a multirotor with `FlightBounds`, else any field with `InputBounds`, with a guess of its parameters.
         parameters: names as in `intervals`; by default all but a disturbance.
-        bounds: limits of the plan.
+        bounds: limits of the plan; you should leave room, since the vehicle follows it with an error.
         key: random key of the series that the search starts from.
         seconds: duration of the plan [s].
         noise: standard deviation of each state's white noise; by default typical of motion capture for a multirotor.

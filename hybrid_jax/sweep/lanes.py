@@ -69,7 +69,7 @@ def schedule(costs: Numbers, active: Numbers, devices: int, width: int, capacity
 
 
 def load_balance(shards: Sequence[np.ndarray], costs: Numbers, width: int) -> Float[np.ndarray, " n"]:
-    """For each scheduled lane, the work of the busiest device over that of its own device; 0 for other lanes."""
+    """For each scheduled lane, the work of the busiest device over the work of its own device; 0 for other lanes."""
     # A chunk takes as long as its most expensive lane, which is its first.
     loads, ratios = [sum(float(costs[i]) for i in shard[::width]) for shard in shards], np.zeros(len(costs))
     for shard, load in zip(shards, loads, strict=True):

@@ -102,14 +102,14 @@ def fit(
     Args:
         field: the initial field, or another module that the objective of `settings` can evaluate.
         train: training windows.
-        validation: windows that determine the best epoch and early stopping.
+        validation: windows that determine the best epoch and early stopping; you should take other recordings.
         key: random key for shuffling minibatches.
         rates: learning rates of Adam, a tree prefix of the field: a number, by default 1e-2, or e.g.
             `Hybrid(1e-2, 1e-3)` for physics and residual.
         optimiser: any Optax optimiser instead of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
             and are 1 by default.
         min_epochs: no early stop before.
-        patience: stop after this many epochs without a better validation loss.
+        patience: stop after this many epochs without a better validation loss; noisy data should have more.
         max_epochs: stop after this many epochs.
         regulariser_weight: λ, by default 1e-3.
         settings: by default minibatches of 100 windows, or of all if there are fewer, and no regulariser. For the

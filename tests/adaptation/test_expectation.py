@@ -72,7 +72,7 @@ def test_errors_after_windows_that_touch_are_those_of_one_long_prediction():
 
 def test_a_report_says_what_to_expect():
     found = hj.adapt(hybrid(), flown(hybrid(LENGTH)))
-    assert "Expected RMSE on an unseen flight (80% intervals" in found.report()
+    assert "RMSE to expect on a new recording (80% intervals" in found.report()
     rmse, _, _ = found.expected["0.4 s"]["x[0]"]
     other = flown(hybrid(LENGTH), seed=5)
     errors = hj.rollout_batch(found.field, other.x0, other.u, other.dt)[:, -1] - other.x[:, -1]
