@@ -20,12 +20,14 @@ class DisturbanceModel(AbstractVectorField):
     Attributes:
         field: f, of d states with e numbers in their tangent space.
         weights: W (e, k e + n + 1), in the units of ẋ, z and x.
+        sizes: of z, x and 1 where W was first learned (k e + n + 1), in their units.
         time_constants: τ₁, …, τ_k of the filters [s].
         states: indices of the n states that W reads.
     """
 
     field: AbstractVectorField
     weights: Float[Array, "e f"]
+    sizes: Float[Array, " f"]
     time_constants: tuple[float, ...] = eqx.field(static=True)
     states: tuple[int, ...] = eqx.field(static=True)
 

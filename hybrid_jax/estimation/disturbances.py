@@ -18,7 +18,7 @@ from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.trajectories import Trajectories, windows_of
 
 FILTERS = 5, 20, 60  # time constants, in intervals
-PENALTIES = 0.03, 0.1, 0.3, 1.0, np.inf  # of the weights, over the variance of what they explain
+PENALTIES = 0.03, 0.1, 0.3, 1.0, np.inf  # of a change of weights, over the variance of what it explains; the last: none
 CHUNK = 512  # intervals that are compared at once
 PARTS, WINDOWS = 3, 200  # parts that are left out in turn, and windows of each part that judge a penalty
 
@@ -30,6 +30,8 @@ def fit_disturbance(
 
     Use it when the errors of a model last, because the system has states that you do not measure. Parts of the
     sequences that are left out in turn choose the penalty; an infinite one leaves the field's predictions unchanged.
+    If you learn again after a change, weights must explain more than twice as much of the errors in each part left out
+    as they would alter where the model was learned (Mallows, 1973): otherwise noise in a hover would teach them.
 
     Example:
         model = hj.fit_disturbance(result.field, flights)
@@ -37,7 +39,7 @@ def fit_disturbance(
         x = hj.rollout_batch(model, state, u, dt)[..., :d]
 
     Args:
-        field: the field, or a `DisturbanceModel` whose weights the new ones are drawn to.
+        field: the field, or a `DisturbanceModel` whose weights the new ones start from, see above.
         sequences: long windows, each without a gap; for one or two, parts of them are left out.
         steps: intervals after which predictions are compared.
         solver: of diffrax, by default `RK4`.
@@ -51,22 +53,25 @@ def fit_disturbance(
     places = _states(field, flights[0])
     taus = tuple(k * flights[0].dt for k in FILTERS) if before is None else before.time_constants
     e = state_space(field, flights[0].x0.shape[-1]).tangent_size
-    empty = DisturbanceModel(field, jnp.zeros((e, e * len(taus) + len(places) + 1)), taus, places)
-    start = empty if before is None else before
-    seen = [observe(empty, one, solver)[0] for one in flights]
+    features = e * len(taus) + len(places) + 1
+    start = before or DisturbanceModel(field, jnp.zeros((e, features)), jnp.ones(features), taus, places)
+    seen = [observe(start, one, solver)[0] for one in flights]
     errors = [errors_after_one(field, one, solver)[0] for one in flights]
-    groups = [range(i, len(flights), PARTS) for i in range(PARTS)]
+    if before is None:
+        start = eqx.tree_at(lambda model: model.sizes, start, _sizes(start, np.concatenate(seen)))
 
-    def solved(of: Sequence[int]) -> Float[Array, "penalties e f"]:
-        states, goals = (np.concatenate([each[i] for i in of]) for each in ([one[:-1] for one in seen], errors))
-        return jnp.stack([_ridge(start, states, goals, penalty) for penalty in PENALTIES])
+    def joined(of: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        return np.concatenate([seen[i][:-1] for i in of]), np.concatenate([errors[i] for i in of])
 
-    scores = []
-    for group in groups:
-        weights = solved([i for i in range(len(flights)) if i not in group])
+    scores, supports = [], []
+    for group in (range(i, len(flights), PARTS) for i in range(PARTS)):
+        weights = _solved(start, *joined([i for i in range(len(flights)) if i not in group]))
         scores.append(_scores(start, weights, [(seen[i], flights[i]) for i in group], steps, solver))
-    best = int(np.argmin(np.mean(scores, axis=0)))
-    return eqx.tree_at(lambda model: model.weights, start, solved(range(len(flights)))[best])
+        supports.append(_support(start, weights, *joined(group)))
+    allowed = np.min(supports, axis=0) >= 0 if before else True
+    best = int(np.argmin(np.where(allowed, np.mean(scores, axis=0), np.inf)))
+    chosen = jnp.asarray(_solved(start, *joined(range(len(flights))))[best])
+    return eqx.tree_at(lambda model: model.weights, start, chosen)
 
 
 def observe(model: DisturbanceModel, past: Trajectories, solver: Solver = None) -> Float[np.ndarray, "n t+1 d+f"]:
@@ -137,20 +142,40 @@ def _states(field: AbstractVectorField, windows: Trajectories) -> tuple[int, ...
     return tuple(np.flatnonzero(np.abs(np.asarray(slope)).max(axis=(0, 1)) > 0).tolist())
 
 
-def _ridge(start: DisturbanceModel, states: np.ndarray, errors: np.ndarray, penalty: float) -> Float[Array, "e f"]:
-    """Weights by ridge regression on scaled features, with the penalty on what differs from the start's weights."""
-    before = np.asarray(start.weights, float)
-    if not np.isfinite(penalty):
-        return jnp.asarray(before, start.weights.dtype)
-    d, e = states.shape[1] - start.filters, errors.shape[1]
-    features = np.concatenate([states[:, d:], states[:, list(start.states)], np.ones((len(states), 1))], axis=1)
-    scale = np.sqrt(np.mean(np.square(states[:, d : d + e]), axis=0)) + 1e-12
-    size = np.concatenate([*[scale] * len(start.time_constants), features[:, start.filters : -1].std(axis=0), [1.0]])
-    scaled = features / (size := np.where(size > 1e-9, size, np.inf))
-    goals = (errors - features @ before.T) / scale
-    gram = scaled.T @ scaled + penalty * len(scaled) * np.eye(scaled.shape[1])
-    change = np.linalg.solve(gram, scaled.T @ goals) / size[:, None] * scale
-    return jnp.asarray(before + change.T, start.weights.dtype)
+def _features(model: DisturbanceModel, states: np.ndarray) -> Float[np.ndarray, "n f"]:
+    own, filtered = np.split(states, [states.shape[1] - model.filters], axis=1)
+    return np.concatenate([filtered, own[:, list(model.states)], np.ones((len(states), 1))], axis=1)
+
+
+def _sizes(model: DisturbanceModel, states: np.ndarray) -> Float[Array, " f"]:
+    features, e = _features(model, states), len(model.weights)
+    fastest = np.sqrt(np.mean(np.square(features[:, :e]), axis=0)) + 1e-12
+    varied = features[:, model.filters : -1].std(axis=0)
+    sizes = [*[fastest] * len(model.time_constants), np.where(varied > 1e-9, varied, np.inf), [1.0]]
+    return jnp.asarray(np.concatenate(sizes), model.weights.dtype)
+
+
+def _solved(start: DisturbanceModel, states: np.ndarray, errors: np.ndarray) -> Float[np.ndarray, "penalties e f"]:
+    """Weights by ridge regression on scaled features, with each penalty on what differs from the start's weights."""
+    before, sizes = np.asarray(start.weights, float), np.asarray(start.sizes, float)
+    features, scale = _features(start, states), sizes[: len(before)]
+    scaled, goals = features / sizes, (errors - features @ before.T) / scale
+    gram, right, every = scaled.T @ scaled, scaled.T @ goals, np.eye(scaled.shape[1])
+    finite = (np.linalg.solve(gram + penalty * len(scaled) * every, right) for penalty in PENALTIES[:-1])
+    changes = [*(each / sizes[:, None] * scale for each in finite), np.zeros_like(right)]
+    return (before + np.swapaxes(changes, 1, 2)).astype(start.weights.dtype)
+
+
+def _support(
+    start: DisturbanceModel, weights: Float[np.ndarray, "penalties e f"], states: np.ndarray, errors: np.ndarray
+) -> Float[np.ndarray, " penalties"]:
+    """Mean square of errors that weights explain, less twice what they alter in the motion that was learned from."""
+    sizes = np.where(np.isinf(start.sizes), 0.0, start.sizes)
+    scale, features = sizes[: len(start.weights)], _features(start, states)
+    change = (weights - np.asarray(start.weights)) / scale[:, None]
+    off = (errors - features @ np.asarray(start.weights).T) / scale
+    explained = np.square(off) - np.square(off - features @ np.swapaxes(change, 1, 2))
+    return explained.sum(axis=-1).mean(axis=-1) - 2 * np.square(change * sizes).sum(axis=(1, 2))
 
 
 def _scores(start: DisturbanceModel, weights, flights: Sequence, steps: int, solver: Solver) -> np.ndarray:
