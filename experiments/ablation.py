@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,6 +20,7 @@ from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval
 from experiments.runner import command
+from experiments.runner.options import Target
 from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import nominal
@@ -56,7 +57,7 @@ class AblationConfig(Config):
     over: tuple[Choice, ...] = get_args(Choice)
     """Which choices to change. residual: what f_d sees and adds to. weight: λ. form: of the regulariser. norm: of f_d.
     start: θ_p off by 20, 50, 100 %. source: amount of source flight. noise: of the sensors. solver: the integrator."""
-    sizes: tuple[int, ...] = (100,)
+    sizes: Annotated[tuple[int, ...], Target] = (100,)
     """N, target trajectories to adapt to."""
     pool: int | None = 1000
     """Target trajectories from which a seed draws its N."""

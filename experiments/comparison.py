@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,7 +22,7 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.options import distinct, factors
+from experiments.runner.options import Target, distinct, factors
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation.expert_augmentation import Augmentation
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
@@ -41,7 +41,7 @@ DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 class ComparisonConfig(Config):
     """Adapt one pre-trained model by every method with N trajectories; test on 10 steps of 0.01 s after 10 of past."""
 
-    sizes: tuple[int, ...] = (100,)
+    sizes: Annotated[tuple[int, ...], Target] = (100,)
     """N, target trajectories to adapt to; rates and patience are those of the nearest size in the paper's table."""
     methods: tuple[Method, ...] = get_args(Method)
     """Which methods to compare."""
@@ -57,7 +57,7 @@ class ComparisonConfig(Config):
         Config.__post_init__(self)
         distinct("--methods", self.methods)
         if min(self.sizes) <= len(LEARNED):
-            raise ValueError(f"--sizes must each be more than the {len(LEARNED)} of θ_p, got {self.sizes}")
+            raise ValueError(f"--n-target must each be more than the {len(LEARNED)} of θ_p, got {self.sizes}")
         factors("--encoding.box", self.encoding.box)
         if LAST_LAYER in self.methods and (self.residual_inputs, self.residual_outputs) != ("all", "all"):
             raise ValueError("--methods last_layer needs a residual that sees and writes the whole state")

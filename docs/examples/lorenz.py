@@ -53,4 +53,4 @@ axes.plot(
     label="fitted model, 5 s",
 )
 axes.legend(fontsize=7, frameon=False)
-plt.savefig("lorenz.png", dpi=110)
+plt.savefig("lorenz.png", dpi=100)

@@ -17,7 +17,7 @@ class ClosedLoopConfig(Config):
     """Fly a model predictive controller with each model, before and after adaptation.
 
     Training is that of param_shift and external_force (their stages in --cache are reused). Models that adapt use the
-    smallest and the largest of --sizes; models that do not adapt also fly the unchanged vehicle.
+    smallest and the largest of --n-target; models that do not adapt also fly the unchanged vehicle.
     """
 
     seconds: Positive = 10.0
@@ -93,7 +93,7 @@ class ClosedLoopConfig(Config):
 
     @property
     def ends(self) -> tuple[int, ...]:
-        """The smallest and the largest of --sizes, if they differ."""
+        """The smallest and the largest of --n-target, if they differ."""
         return tuple(dict.fromkeys((min(self.sizes), max(self.sizes))))
 
     def invariant(self) -> Config:

@@ -2,11 +2,21 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from experiments.flying.changes import CHANGES
 from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
-from experiments.runner.options import Activation, Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
+from experiments.runner.options import (
+    Activation,
+    Count,
+    CountFromZero,
+    NotNegative,
+    Positive,
+    Run,
+    Target,
+    distinct,
+    factors,
+)
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.networks.mlp import NORMS
@@ -100,7 +110,7 @@ class Encoding:
 class Config(Run):
     """Shared options of all experiments in simulation. Defaults: the paper's full protocol."""
 
-    sizes: tuple[int, ...] = TABLE_SIZES
+    sizes: Annotated[tuple[int, ...], Target] = TABLE_SIZES
     """N, target trajectories to train on. Rates and patience are those of the nearest size in the paper's table."""
     pool: int | None = None
     """Target trajectories from which a seed draws its N; by default as many as the largest N."""
@@ -158,20 +168,20 @@ class Config(Run):
     def __post_init__(self):
         Run.__post_init__(self)
         factors("--guess", self.guess)
-        distinct("--sizes", self.sizes)
+        distinct("--n-target", self.sizes)
         batch = f"--batch-size {self.batch_size}"
         if min(self.sizes) < self.batch_size:
-            raise ValueError(f"--sizes must each be at least {batch}, got {self.sizes}")
+            raise ValueError(f"--n-target must each be at least {batch}, got {self.sizes}")
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
         self._check_draws()
         if self.pooled() + self.source_train + self.validating() + self.test > MOST:
-            options = "--sizes, --draws, --pool, --source-train, --validation and --test"
+            options = "--n-target, --draws, --pool, --source-train, --validation and --test"
             raise ValueError(f"{options} must request at most {MOST:,} trajectories together")
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
         if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
             needed = f"more than the {FITTED} parameters of {CONSTANT_DISTURBANCE}"
-            raise ValueError(f"--sizes must each be {needed}, got {self.sizes}")
+            raise ValueError(f"--n-target must each be {needed}, got {self.sizes}")
         if NO_PHYSICS in chosen and self.residual_outputs != "all":
             refused = f"--residual-outputs {self.residual_outputs}"
             raise ValueError(f"{refused}: no_physics must write all derivatives, leave it out")
@@ -179,7 +189,7 @@ class Config(Run):
         if self.norm == "batch" and self.batch_size < 2 and chosen != {PHYSICS_ONLY}:
             raise ValueError(f"--batch-size must be at least 2 with --norm batch, got {self.batch_size}")
         if self.pooled() < max(self.sizes):
-            raise ValueError(f"--pool must be at least the largest of --sizes {self.sizes}, got {self.pool}")
+            raise ValueError(f"--pool must be at least the largest of --n-target {self.sizes}, got {self.pool}")
         for name in ("rates.hybrid", "rates.no_physics", "patience.hybrid_minimum", "patience.hybrid_patience"):
             group, entry = name.split(".")
             if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
@@ -189,7 +199,7 @@ class Config(Run):
         if self.draw == "contiguous" and self.pool is not None:
             raise ValueError("--pool is for --draw random: leave it out")
         if self.validation == "own" and min(self.sizes) < HELD_BACK:
-            raise ValueError(f"--sizes must each be at least {HELD_BACK} with --validation own, got {self.sizes}")
+            raise ValueError(f"--n-target must each be at least {HELD_BACK} with --validation own, got {self.sizes}")
 
     def pooled(self) -> int:
         """Target trajectories to draw from; with contiguous for all draws."""
@@ -238,7 +248,7 @@ class AdaptationConfig(Config):
 class OneFlight(Config):
     """What you have after a change: one short flight with sensor noise, and no other data."""
 
-    sizes: tuple[int, ...] = (100,)
+    sizes: Annotated[tuple[int, ...], Target] = (100,)
     """N, windows of 0.1 s: one number."""
     draw: Literal["random", "contiguous"] = "contiguous"
     """Which N target trajectories. contiguous: from the start of one flight (ten seconds for 100
@@ -258,7 +268,7 @@ class OneFlight(Config):
         Config.__post_init__(self)
         distinct("--changes", self.changes)
         if len(self.sizes) != 1:
-            raise ValueError(f"--sizes must be one number, got {self.sizes}")
+            raise ValueError(f"--n-target must be one number, got {self.sizes}")
 
 
 # The same for every preset of these experiments.

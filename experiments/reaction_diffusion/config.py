@@ -1,9 +1,9 @@
 """Options and presets."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, get_args
 
-from experiments.runner.options import Count, Run, distinct
+from experiments.runner.options import Count, Run, Target, distinct
 
 
 class Case(NamedTuple):
@@ -51,7 +51,7 @@ class Config(Run):
     """Lines of the table of forecasts."""
     shifts: tuple[Shift, ...] = get_args(Shift)
     """parameter_shift: a × 2, b ÷ 2, k × 2. new_term: u_t has a term that is not in the source."""
-    sizes: tuple[Count, ...] = (1, 2, 4, 8)
+    sizes: Annotated[tuple[Count, ...], Target] = (1, 2, 4, 8)
     """Trajectories to adapt to."""
     points: Count = 32
     """Grid points along each axis."""
@@ -75,7 +75,7 @@ class Config(Run):
         for option in ("parts", "cases", "shifts", "sizes"):
             distinct(f"--{option}", getattr(self, option))
         if self.sizes != tuple(sorted(self.sizes)):
-            raise ValueError(f"--sizes must be in ascending order, got {self.sizes}")
+            raise ValueError(f"--n-target must be in ascending order, got {self.sizes}")
         if self.points < 8:
             raise ValueError(
                 f"--points must be at least 8, for a kernel and for fields with structure, got {self.points}"

@@ -31,7 +31,7 @@ real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--t
   Public flights: IMRCLab/crazyflie-data-collection (a Crazyflie with and without a load) and
   idsia-robotics/nanodrone-sysid-benchmark on GitHub. Both need a column map and have licences of their own."""
 # Options that take several values.
-LISTS = ("--horizon", "--n", "--polynomial", "--motor-order", "--topics", "--learn")
+LISTS = ("--horizon", "--n-target", "--polynomial", "--motor-order", "--topics", "--learn")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

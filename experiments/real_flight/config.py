@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from experiments.runner.options import Count, Positive, Run, distinct
+from experiments.runner.options import Count, Positive, Run, Target, distinct
 from hybrid_jax.cli.logs import FlightOptions
 from hybrid_jax.dynamics.vehicle_file import check_learned
 
@@ -19,7 +19,7 @@ class RealFlightConfig(FlightOptions, Run):
     Without --test, the target's flights are held out in turn (--folds). Without --target, nothing is adapted and the
     source's models are tested. No data? Try --simulated.
 
-    Example: python -m experiments.real_flight --vehicle v.toml --source before/ --target after/ --n 100,600
+    Example: python -m experiments.real_flight --vehicle v.toml --source before/ --target after/ --n-target 100,600
     """
 
     vehicle: Path | None = None
@@ -38,7 +38,7 @@ class RealFlightConfig(FlightOptions, Run):
     """Interval of the models [s]."""
     horizon: tuple[Count, ...] = (10, 50)
     """Numbers of intervals after which errors are measured."""
-    n: tuple[Count, ...] = (100, 600)
+    n: Annotated[tuple[Count, ...], Target] = (100, 600)
     """Numbers of target windows of ten intervals to adapt to, spread evenly over the training flights."""
     folds: Count = 3
     """Without --test: number of folds, or as many as there are names."""
@@ -51,8 +51,8 @@ class RealFlightConfig(FlightOptions, Run):
     def __post_init__(self):
         Run.__post_init__(self)
         _ = self.reading  # topics are checked before anything is read
-        for name in ("horizon", "n"):
-            distinct(f"--{name}", getattr(self, name))
+        distinct("--horizon", self.horizon)
+        distinct("--n-target", self.n)
         check_learned(self.learn)
         if self.simulated and any(getattr(self, name) for name in PATHS):
             raise ValueError(f"--simulated makes its own logs: leave out {', '.join(f'--{name}' for name in PATHS)}")

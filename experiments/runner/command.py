@@ -42,7 +42,7 @@ def run(
     """
     interruptible()
     given = sys.argv[1:] if arguments is None else arguments
-    fresh = " without --fresh" if "--fresh" in given else ""
+    fresh = " without --restart" if "--restart" in given else ""
     with exit_codes(name, name, f"interrupted; the same command{fresh} goes on from here"):
         config = read(name, about, given, presets)
         checks.writable_folder("--out", config.out)

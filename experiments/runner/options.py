@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 import platformdirs
+import tyro
 
 from hybrid_jax import checks
+from hybrid_jax.cli.help import option_of
 from hybrid_jax.networks.mlp import ACTIVATIONS
 
+Target = tyro.conf.arg(name="n-target")  # N, the same option of all commands
 # Numbers with a rule, which `check_numbers` applies wherever an option's type mentions them.
 Count = Annotated[int, checks.count]
 CountFromZero = Annotated[int, partial(checks.count, least=0)]
@@ -53,8 +56,8 @@ class Run:
     cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))
     """Folder for flights and finished stages. Compiled programs are kept in the user's cache folder, or in
     JAX_COMPILATION_CACHE_DIR."""
-    fresh: bool = False
-    """Restart, with earlier results in --out and unfinished sweeps moved to a backup. Nothing is deleted."""
+    fresh: Annotated[bool, tyro.conf.arg(name="restart")] = False
+    """Start again, with earlier results in --out and unfinished sweeps moved to a backup. Nothing is deleted."""
     saving: float = 0.02
     """Largest share of a sweep's time for checkpoints; with a smaller share you lose more work if the run is killed."""
     seeds: Count = 10
@@ -85,7 +88,8 @@ class Run:
 def check_numbers(prefix: str, options: Any) -> None:
     """Check every number of a dataclass whose type has a rule, such as `Count` or `tuple[Positive, ...] | None`."""
     for name, hint in get_type_hints(type(options), include_extras=True).items():
-        option, value = f"{prefix}{name.replace('_', '-')}", getattr(options, name)
+        option = f"{prefix}{option_of(name, getattr(hint, '__metadata__', ()))}"
+        value = getattr(options, name)
         if is_dataclass(value):
             check_numbers(f"{option}.", value)
         if value is None or isinstance(value, str):  # a word that stands for a number

@@ -18,7 +18,7 @@ from hybrid_jax.runtime import cores, hardware
 
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax")
 FILE = "run.json"
-HINT = "  --fresh starts anew and moves it aside; another --out leaves it as it is"
+HINT = "  --restart starts anew and moves it aside; another --out leaves it as it is"
 FIXED = ("config", "versions", "flights")  # a run resumes only if these are equal
 MACHINE = ("machine",)  # where these are not, it says so
 
@@ -51,7 +51,7 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
     known = path.exists()
     found = read_json(path) if known else {"state": None}
     if known and not (isinstance(found, dict) and {"state", "started", *FIXED} <= found.keys()):
-        raise ValueError(f"{path}: not the record of a run; --fresh starts anew and moves it aside")
+        raise ValueError(f"{path}: not the record of a run; --restart starts anew and moves it aside")
     if found["state"] == "unfinished":
         require_same(f"{folder}: holds an unfinished run, begun {found['started']}", found, record)
         say(f"{folder}: goes on with the run begun {found['started']}")

@@ -35,7 +35,7 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
             told, values = f"{told}: {values.replace('|', ', ')}", "NAME"
         elif not (value is None or isinstance(value, bool) or value in ((), MISSING)):
             told += f" [{shown}]"
-        named = f"--{'no-' * (value is True)}{each.name.replace('_', '-')} {values}{more}".rstrip()
+        named = f"--{'no-' * (value is True)}{option_of(each.name, marks)} {values}{more}".rstrip()
         aliases = [alias for mark in marks for alias in getattr(mark, "aliases", None) or ()]
         needed = value is MISSING and each.default_factory is MISSING
         place = 0 if tyro.conf.Positional in marks else 1 if needed else 2 + (each.name not in kind.__annotations__)
@@ -51,6 +51,11 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
         text += textwrap.wrap(told, width, initial_indent=first, subsequent_indent=" " * INDENT)
     left = len(every) - len(options)
     return "\n".join([*text, "", "--help-all explains more" + f", and lists {left} more options" * (left > 0) + "."])
+
+
+def option_of(name: str, marks: Collection[Any]) -> str:
+    """Return the name of a field's option without dashes, which an annotation may set."""
+    return next(filter(None, (getattr(mark, "name", None) for mark in marks)), name.replace("_", "-"))
 
 
 def _documented(kind: type) -> dict[str, str]:

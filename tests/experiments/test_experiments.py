@@ -120,11 +120,11 @@ def test_a_signal_saves_the_state_and_a_second_run_is_refused(sent, code, folder
     shutil.rmtree(begun)
 
 
-WITH_THREE = ("--sizes", "20", "3", "--batch-size", "3")
+WITH_THREE = ("--n-target", "20", "3", "--batch-size", "3")
 REFUSED = {
     "param_shift": [
         (("--preset", "nonsense"), "--preset must be one of paper, quick, smoke, got 'nonsense'"),
-        (("--sizes", "10"), "--sizes must each be at least --batch-size 20"),
+        (("--n-target", "10"), "--n-target must each be at least --batch-size 20"),
         (("--seeds", "many"), "--seeds: invalid literal"),
         (("--no-such-option", "1"), "--no-such-option"),
     ],
@@ -132,8 +132,8 @@ REFUSED = {
         (("--methods", "hybrid", "hybrid"), "--methods must be at least one, each different"),
         (("--residual-inputs", "no_xy"), "--methods last_layer needs a residual that sees"),
         (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
-        (WITH_THREE, "--sizes must each be more than the 9 parameters of constant"),
-        ((*WITH_THREE, "--methods", "hybrid"), "--sizes must each be more than the 3 of θ_p"),
+        (WITH_THREE, "--n-target must each be more than the 9 parameters of constant"),
+        ((*WITH_THREE, "--methods", "hybrid"), "--n-target must each be more than the 3 of θ_p"),
         (("--encoding.box", "2", "0.5"), "--encoding.box must be two factors, low < high, above 0"),
         (("--encoding.stopping.patience", "-1"), "--encoding.stopping.patience must be an integer of at least 0"),
     ],
@@ -141,7 +141,7 @@ REFUSED = {
         (("--seeds", "2"), "--seeds must be at least 3, got 2"),
         (("--repeats", "0"), "--repeats must be an integer of at least 1, got 0"),
     ],
-    "changes": [(("--sizes", "100", "300"), "--sizes must be one number")],
+    "changes": [(("--n-target", "100", "300"), "--n-target must be one number")],
     "excitation": [
         (("--change", "rain"), "--change must be one of source, parameter_shift"),
         (("--noise", "0"), "--noise must be above 0"),
@@ -156,7 +156,7 @@ REFUSED = {
     ],
     "reaction_diffusion": [
         (("--points", "4"), "--points must be at least 8"),
-        (("--sizes", "2", "1"), "--sizes must be in ascending order"),
+        (("--n-target", "2", "1"), "--n-target must be in ascending order"),
         (("--steps", "0"), "--steps must be an integer of at least 1"),
     ],
     "closed_loop": [

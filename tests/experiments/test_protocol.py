@@ -178,7 +178,7 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
 
 
 REFUSED = [
-    *(({"sizes": sizes}, "--sizes") for sizes in ((10,), (), (100, 100), (100, 1_000_000_000))),
+    *(({"sizes": sizes}, "--n-target") for sizes in ((10,), (), (100, 100), (100, 1_000_000_000))),
     ({"sizes": (9,), "batch_size": 9}, "constant_disturbance"),
     ({"models": ()}, "--models"),
     ({"batch_size": 1}, "--batch-size must be at least 2 with --norm batch, got 1"),
@@ -188,7 +188,10 @@ REFUSED = [
     ({"perturbed_by": math.nan}, "--perturbed-by must be a positive finite number, got nan"),
     ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
     ({"draw": "contiguous", "pool": 2000}, "--pool is for --draw random: leave it out"),
-    ({"validation": "own", "sizes": (4,), "batch_size": 4, "models": ("hybrid",)}, "--sizes must each be at least 5"),
+    (
+        {"validation": "own", "sizes": (4,), "batch_size": 4, "models": ("hybrid",)},
+        "--n-target must each be at least 5",
+    ),
     ({"rates": replace(PAPER.rates, hybrid=(1e-3,))}, "--rates.hybrid"),
     ({"rates": replace(PAPER.rates, no_physics=(1e-4,) * 4 + (math.nan,))}, "--rates.no-physics must be a finite"),
     ({"rates": replace(PAPER.rates, decay=(0.1, 0.0))}, "--rates.decay"),

@@ -2,9 +2,9 @@
 
 import json
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from experiments.runner.command import read
 from experiments.runner.stages import Stages
 from hybrid_jax.cli.command import split_lists
 from hybrid_jax.cli.errors import UNITS
+from hybrid_jax.cli.help import option_of
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 from hybrid_jax.flights.windows import (
@@ -104,16 +105,18 @@ def test_guide_is_printed_without_flights_but_a_wrong_option_is_named_first(argu
 
 
 def test_lists_may_be_comma_separated():
-    given = ["--n", "100,300", "--horizon=10,50", "--source", "1,2", "--test=3,4", "--learn", "Ix,Iy", "k", "--anyway"]
+    given = ["--n-target", "100,300", "--horizon=10,50", "--source", "1,2", "--test=3,4"]
+    given += ["--learn", "Ix,Iy", "k", "--anyway"]
     given += ["--motor-order", "2,0,3,1", "--topics", "imu=/imu,motors=/m:data:rpm", "--polynomial", "-150.5,9e2"]
-    expected = ["--n", "100", "300", "--horizon", "10", "50", "--source", "1,2", "--test=3,4"]
+    expected = ["--n-target", "100", "300", "--horizon", "10", "50", "--source", "1,2", "--test=3,4"]
     expected += ["--learn", "Ix", "Iy", "k", "--anyway", "--motor-order", "2", "0", "3", "1"]
     expected += ["--topics", "imu=/imu", "motors=/m:data:rpm", "--polynomial", "-150.5", "9e2"]
     assert split_lists(given, LISTS) == expected
     config: Any = read("real_flight", "", expected, PRESETS)
     assert (config.polynomial, config.learn, config.test) == ((-150.5, 900.0), ("Ix", "Iy", "k"), Path("3,4"))
-    several = {f"--{each.name.replace('_', '-')}" for each in fields(RealFlightConfig) if "tuple" in str(each.type)}
-    assert several == set(LISTS)
+    hints = get_type_hints(RealFlightConfig, include_extras=True).items()
+    several = {option_of(name, getattr(hint, "__metadata__", ())) for name, hint in hints if "tuple" in str(hint)}
+    assert {f"--{name}" for name in several} == set(LISTS)
 
 
 @pytest.fixture

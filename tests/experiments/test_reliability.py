@@ -104,7 +104,7 @@ def test_a_killed_run_survives_other_inputs_a_full_disk_and_a_truncated_checkpoi
     assert other.returncode == 2
     assert f"holds an unfinished run, begun {record['started']}, that differs:" in other.stderr
     assert "  config.regulariser_weight: 0.001 → 0.01\n" in other.stderr
-    assert "--fresh" in other.stderr
+    assert "--restart" in other.stderr
 
     # No file may grow beyond 6 blocks of 512 bytes: the next checkpoint cannot be written, as on a full disk.
     full = place.run(prefix=["sh", "-c", 'ulimit -f 6; exec "$@"', "sh"])

@@ -49,7 +49,7 @@ def test_another_configuration_is_refused_field_by_field(tmp_path):
         f"{tmp_path}: holds an unfinished run, begun {before['started']}, that differs:",
         "  config.rates.physics: 0.01 → 0.5",
         "  config.seeds: 1 → 2",
-        "  --fresh starts anew and moves it aside; another --out leaves it as it is",
+        "  --restart starts anew and moves it aside; another --out leaves it as it is",
     ]
     assert record(tmp_path) == before
 
@@ -94,7 +94,7 @@ def test_bad_input_begins_no_run_and_ends_none(tmp_path, error):
 @pytest.mark.parametrize("text", ["[]", "null", '{"state": "unfinished"}', "[" * 100_000, "{"])
 def test_what_is_no_record_is_refused_in_a_line_and_kept(tmp_path, text):
     (tmp_path / FILE).write_text(text)
-    with pytest.raises(ValueError, match=rf"{FILE}: (not the record of a run; --fresh|truncated or not JSON)"):
+    with pytest.raises(ValueError, match=rf"{FILE}: (not the record of a run; --restart|truncated or not JSON)"):
         finish(tmp_path, SMOKE)
     assert (tmp_path / FILE).read_text() == text
 
