@@ -18,7 +18,7 @@ namespace {
 
 constexpr int STAGES = 4;
 constexpr int UNITS = 8;  // of the layer at a time
-constexpr int64_t SLOTS = 16;  // of factors, which wait for their products
+constexpr int64_t SLOTS = 28;  // of factors, which wait for their products: those of a step of a hundred windows
 constexpr int64_t U = H ? H | 1 : 0;  // vectors from one n to the next: an even number may put all into the same lines of the cache
 
 // A lane of a call of XLA: the lanes of a sweep are the first axes of all arrays. These are in single precision, and the
