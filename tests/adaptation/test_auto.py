@@ -97,7 +97,8 @@ def test_parameters_that_are_not_free_stay():
 FREE = np.array([[False, False], [True, False], [True, True]])
 
 
-def chosen(start, apparent=0.0, size=1.0):
+@eqx.filter_jit
+def chosen(start, apparent, size=1.0):
     """Which of `FREE` is taken, and how probable each is, where the source has other gains than the truth."""
     windows, _ = pushes(40, noise=0.3)
     source, every = (jax.tree.map(lambda leaf, i=i: leaf[i], fits(Push(start), windows, *FREE[[0, 2]])) for i in (0, 1))
@@ -107,12 +108,12 @@ def chosen(start, apparent=0.0, size=1.0):
 def test_a_change_is_believed_if_the_evidence_is_strong_and_the_source_does_not_err_as_much():
     truth = jnp.array([3.0, -2.0])
     for away, taken in (([0.0, 0.0], 0), ([0.5, 0.0], 1), ([0.5, 0.5], 2)):
-        found = chosen(truth + jnp.array(away))
+        found = chosen(truth + jnp.array(away), jnp.zeros(()))
         assert found.taken == taken
         np.testing.assert_allclose(found.probability.sum(), 1, rtol=1e-5)
         assert taken == 0 or found.probability[taken] > STRONG * found.probability[0]
         np.testing.assert_allclose(found.theta[taken], truth, atol=0.25 if taken else 1e-6)
-    erring = chosen(truth + jnp.array([0.5, 0.0]), apparent=0.25)
+    erring = chosen(truth + jnp.array([0.5, 0.0]), jnp.array(0.25))
     assert erring.taken == 0
     assert erring.naive[1] > STRONG * erring.naive[0]  # it would be believed of an exact source
 

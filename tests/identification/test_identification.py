@@ -115,6 +115,7 @@ def test_the_delay_of_a_log_is_told_from_the_lag_of_its_rotors():
     np.testing.assert_allclose(float(found.intervals["time_constant"].value), 0.07, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_what_a_log_does_not_tell_has_an_interval_as_wide_as_that(twin):
     found = identify(start(("Ix", "Iz", "torque_coefficient", "k"), ()), [only(twin, "specific_force")], LAYOUT)
     for name in ("Ix", "Iz", "torque_coefficient"):
@@ -122,6 +123,7 @@ def test_what_a_log_does_not_tell_has_an_interval_as_wide_as_that(twin):
     assert np.isfinite(float(found.intervals["k"].high))
 
 
+@pytest.mark.slow
 def test_windows_are_taken_where_they_tell_something():
     """Yaw is shaken for a tenth of the log only: of 36 windows spread over all of it, its torque has no interval."""
     body = hj.rigid_body(replace(TRUTH, torque_coefficient=0.5 * TRUTH.torque_coefficient), ("torque_coefficient",))
