@@ -15,7 +15,7 @@ def outliers(errors: Float[np.ndarray, "n t d"], windows: Trajectories) -> Bool[
     """Return which windows contain an outlier, also as their first state.
 
     There, differences of successive errors are much larger than usual (Hampel 1974), and nearly as large as the errors
-    themselves, so that no motion explains them.
+    themselves and as the same differences of the predicted states, so that no motion explains them.
 
     Args:
         errors: measured minus predicted states of each window.
@@ -25,8 +25,11 @@ def outliers(errors: Float[np.ndarray, "n t d"], windows: Trajectories) -> Bool[
         return np.zeros(len(errors), bool)
     with np.errstate(invalid="ignore", over="ignore"):
         size = np.abs(errors).max(axis=1)
+        start = np.asarray(windows.x0)[:, None]
+        predicted = np.concatenate([start, np.asarray(windows.x) - errors], axis=1)
+        motion = np.abs(np.diff(predicted, ORDER, axis=1)).max(axis=1)
         rough = np.abs(np.diff(np.pad(errors, ((0, 0), (1, 0), (0, 0))), ORDER, axis=1))
         rounding = np.finfo(errors.dtype).eps * np.abs(np.asarray(windows.x)).max((0, 1))
         usual = DEVIATION * np.median(rough, axis=(0, 1)) + rounding
         rough = rough.max(axis=1)
-        return ((rough > FAR * usual) & (rough > ROUGH * size)).any(axis=1)
+        return ((rough > FAR * usual) & (rough > ROUGH * size) & (rough > motion)).any(axis=1)
