@@ -21,7 +21,7 @@ from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import ADAM, make_run_config, run, start
-from hybrid_jax.training.objective import Objective, Settings
+from hybrid_jax.training.objective import Objective, Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories
 
 
@@ -203,6 +203,10 @@ class Source(Method):
 
 def scale_of(objective: Objective, d: int) -> Scale:
     """The error of each of d states that counts as 1 in the objective; None if each counts in its own unit."""
+    if not isinstance(objective, TrajectoryLoss):
+        remedy = "or take method='fine_tune', which minimises any"
+        given = type(objective).__name__
+        raise ValueError(f"settings.objective must be a TrajectoryLoss for least squares, got {given}; {remedy}")
     if not isinstance(objective, ChannelLoss):
         return None
     if objective.huber is not None:

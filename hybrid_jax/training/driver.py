@@ -25,7 +25,7 @@ from hybrid_jax.status import Status
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, FitState, Optimiser, RunConfig, make_run_config
 from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
-from hybrid_jax.trajectories import Trajectories, check, check_like, overflows
+from hybrid_jax.trajectories import Trajectories, check_like, overflows
 
 WEIGHT = 1e-3  # λ, where none is given
 RATE = 1e-2
@@ -143,17 +143,15 @@ def checked_arguments(
 ) -> tuple[PyTree, Shared, float]:
     """The training data, the settings of all stages, and λ: the checked arguments of `fit` with defaults."""
     checks.not_traced("fit", field, train, validation, key)
-    if settings is None:
-        settings = Settings(batch_size=min(Settings.batch_size, len(check(train, "train"))))
+    settings = Settings() if settings is None else settings
     checks.instance("settings", settings, Settings)
     windows = {"train": train, "validation": validation}
     windows = {n: check_windows(field, w, n) if isinstance(w, Trajectories) else w for n, w in windows.items()}
     data, validated_on = (settings.objective.prepare(w, name) for name, w in windows.items())
     _check_field(field, windows, settings)
     checks.key("key", key)
+    settings = replace(settings, batch_size=min(settings.batch_size, len(data)))
     check_minibatch(field, settings)
-    if len(data) < settings.batch_size:
-        raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")
     if not isinstance(optimiser, Optimiser | None):
         raise ValueError(f"optimiser must be an optax.GradientTransformation, got {checks.short_repr(optimiser)}")
     if weight is not None and settings.regulariser is None and isinstance(settings.objective, TrajectoryLoss):

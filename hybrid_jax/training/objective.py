@@ -117,7 +117,7 @@ class Settings:
     """Settings of a compiled training program, the same for all runs of a sweep.
 
     Attributes:
-        batch_size: windows of a minibatch; you should try less if there are only a hundred.
+        batch_size: windows of a minibatch, or all if there are fewer; you should try less for only a hundred.
         regulariser: L_reg of a `Hybrid`, given the field, the minibatch and its predicted states; by default none.
         solver: integrates from sample to sample, by default one step of RK4 each.
         objective: training and validation loss, by default the squared error of trajectories.

@@ -44,6 +44,18 @@ def flown(truth, count=40, seed=0):
     return replace(start, x=eqx.filter_jit(hj.rollout_batch)(truth, start.x0, start.u, start.dt))
 
 
+class Own(hj.training.TrajectoryLoss.__base__):
+    """An objective of a user's own."""
+
+    prepare = batch = loss = observe = validate = lambda self, *_: None
+
+
+@pytest.mark.parametrize("method", ["auto", "least_squares", "theta_least_squares"])
+def test_least_squares_refuses_another_objective(method):
+    with pytest.raises(ValueError, match=r"^settings.objective must be a TrajectoryLoss .* got Own; .*fine_tune"):
+        adapt(hj.Hybrid(pendulum(), network()), swings(4), method=method, settings=hj.Settings(4, objective=Own()))
+
+
 class Stretched(AbstractVectorField):
     """Another field with the unit of each state divided by a factor."""
 
