@@ -15,8 +15,8 @@ from hybrid_jax.adaptation import ridge
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Frozen, Hybrid
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
-from hybrid_jax.estimation.least_squares import Scale, check_determined, fit_least_squares, ravel_parameters
-from hybrid_jax.estimation.uncertainty import select_disturbance
+from hybrid_jax.estimation.least_squares import Scale, fit_least_squares, ravel_parameters
+from hybrid_jax.estimation.uncertainty import check_determined, select_disturbance
 from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import ChannelLoss

@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,6 +23,7 @@ from hybrid_jax.dynamics.batching import (
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.trajectories import Trajectories, check
 
+Learned = TypeVar("Learned")
 Columns = Float[Array, "d c"]  # derivatives of d numbers in c directions
 
 
@@ -179,3 +180,8 @@ def ravel_learned(field: Any) -> tuple[Float[Array, " p"], Callable[[Float[Array
     learned, rest = eqx.partition(field, trainable(field))
     theta, unravel = ravel_pytree(learned)
     return theta, lambda theta: eqx.combine(unravel(theta), rest)
+
+
+def in_double(field: Learned) -> Learned:
+    """Convert the arrays of a field or model to double precision, if JAX has it enabled."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)

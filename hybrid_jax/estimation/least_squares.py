@@ -5,19 +5,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_learned
+from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
-from hybrid_jax.estimation.levenberg_marquardt import State, begin, minimise, move_of_rows
+from hybrid_jax.estimation.levenberg_marquardt import State, begin, corrected, judged, minimise, move_of_rows
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.runtime import entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
@@ -32,7 +33,6 @@ FINE = 1e-3  # of how far the states move: smaller errors do not count as noise 
 Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
 Scale = Float[Array, " d"] | None  # the error of each state that counts as 1; without one, 1 in its own unit
 Theta = Float[Array, " p"]
-Field = TypeVar("Field")
 
 
 class LeastSquaresFit(eqx.Module):
@@ -158,14 +158,6 @@ def _triangle(errors: Callable[[Theta, Trajectories], Array], theta: Theta, wind
     return found[None, None, :, :p], found[None, None, :, p]
 
 
-def check_determined(field: AbstractVectorField, n: int, fitted: int | None = None) -> None:
-    """Raise if n windows are too few for the parameters to fit, by default all of the physics, or if there are none."""
-    size, name = jax.eval_shape(lambda: ravel_parameters(field)[0]).size, type(physics_of(field)).__name__
-    p = size if fitted is None else fitted
-    if n <= p:
-        raise ValueError(f"windows: {n} are too few for the {p} parameters of {name}, at least {p + 1} are needed")
-
-
 def rounding(windows: Trajectories, scale: Scale) -> Float[Array, ""]:
     """Return the norm of rounding errors of all states: parameters with less effect cannot be fitted."""
     x = windows.x if scale is None else windows.x / scale
@@ -204,15 +196,18 @@ def fit_and_linearise(
         held: error per unit of a parameter's distance from the start.
     """
     start, unravel = ravel_parameters(field)
+    compressed, own = weigh is None and len(windows) > MANY, weigh or (lambda errors: errors)
 
     def errors(theta: Theta, window: Trajectories):
-        return prediction_errors(unravel(theta), window, solver, scale)
+        return prediction_errors(fixed_residual(unravel(theta)), window, solver, scale)
+
+    def residuals(theta: Theta):
+        return own(jax.vmap(partial(errors, theta))(windows))
 
     def linearised(theta: Theta):
-        if weigh is None:
-            return (_triangle if len(windows) > MANY else _linearised)(errors, theta, windows)
-        own = weigh
-        return jax.jacfwd(lambda theta: 2 * (own(jax.vmap(partial(errors, theta))(windows)),), has_aux=True)(theta)
+        if compressed:
+            return _triangle(errors, theta, windows)
+        return jax.jacfwd(lambda theta: 2 * (residuals(theta),), has_aux=True)(theta)
 
     def theta_at(z: Theta, unit: Theta) -> Theta:
         return (start + unit * z).astype(start.dtype)
@@ -223,26 +218,49 @@ def fit_and_linearise(
     def anchor(units):
         return (jnp.broadcast_to(held, start.shape) * units[0] / units[1]).astype(float)
 
-    def evaluate(z: Theta, state: State):
-        units = state.best[3]
-        jacobian, found = linearised(theta_at(z, units[0]))
+    def cost_of(z: Theta, found, units):
+        return jnp.sum(jnp.square(scaled(found, units[1]))) + jnp.sum(jnp.square(anchor(units) * z))
+
+    def bent(tried, state: State) -> tuple[Theta, Float[Array, ""]]:
+        (z, upper), (before, found, jacobian, units) = tried, state.best
+
+        def cost_and_errors(z):
+            errors = residuals(theta_at(z, units[0]))
+            return cost_of(z, errors, units), errors
+
+        def correction(z, errors):
+            missed = errors - found - jacobian @ (units[0] * (z - before)).astype(errors.dtype)
+            slope = scaled(jacobian * units[0], units[1]).T @ scaled(missed, units[1])
+            return -solve_triangular(upper, solve_triangular(upper, slope, trans=1))
+
+        return corrected(cost_and_errors, correction, z)
+
+    def evaluate(tried, state: State):
+        (z, _), (_, found, jacobian, units) = tried, state.best
+        if compressed:
+            jacobian, found = linearised(theta_at(z, units[0]))
+        else:
+            z, cost = bent(tried, state)
+            at, known = theta_at(z, units[0]), (jacobian, found)
+            jacobian, found = jax.lax.cond(judged(state, cost)[0], linearised, lambda _: known, at)
         own = _units(jacobian, found, windows, scale, free, held)
-        units = jax.tree.map(partial(jnp.where, state.steps == 0), own, units)
-        cost = jnp.sum(jnp.square(scaled(found, units[1]))) + jnp.sum(jnp.square(anchor(units) * z))
+        first = state.steps == 0
+        units = jax.tree.map(partial(jnp.where, first), own, units)
+        cost = cost_of(z, found, units) if compressed else jnp.where(first, cost_of(z, found, units), cost)
         return cost, (z, found, jacobian, units)
 
     def aim(best, damping):
         z, found, jacobian, (unit, size) = best
         to_start = anchor((unit, size))
         rows = jnp.concatenate([scaled(jacobian * unit, size), jnp.diag(to_start)])
-        move, expected = move_of_rows(rows, jnp.concatenate([scaled(found, size), to_start * z]), damping)
-        return z + move, expected, jnp.square(LEAST * rounding(windows, scale) / size)
+        move, expected, upper = move_of_rows(rows, jnp.concatenate([scaled(found, size), to_start * z]), damping)
+        return (z + move, upper), expected, jnp.square(LEAST * rounding(windows, scale) / size)
 
     shape = jax.eval_shape(lambda: linearised(start)[1])
     zero = jnp.zeros(start.shape)  # of JAX's default precision, as all numbers of the loop but the errors are
     nothing = jnp.zeros(shape.shape, shape.dtype), jnp.zeros((*shape.shape, start.size), shape.dtype)
     units = jnp.zeros(start.shape, shape.dtype), jnp.ones((), shape.dtype)
-    end = minimise(evaluate, aim, begin(zero, (zero, *nothing, units)), max_steps)
+    end = minimise(evaluate, aim, begin((zero, jnp.eye(start.size)), (zero, *nothing, units)), max_steps)
     z, found, jacobian, (unit, _) = end.best
     mse = jnp.sum(jnp.square(found)) / (len(windows) * (windows.horizon if weigh is None else found.shape[1]))
     theta = jnp.where(jnp.isfinite(mse), theta_at(z, unit), start)
@@ -257,11 +275,6 @@ def _units(jacobian, errors, windows: Trajectories, scale: Scale, free, held) ->
     effect = jnp.linalg.norm(jacobian.reshape(-1, jacobian.shape[-1]), axis=0)
     seen, effect = effect > rounding(windows, scale), jnp.sqrt(jnp.square(effect) + jnp.square(held))
     return jnp.where(seen if free is None else free & seen, size / _nonzero(effect), 0), size
-
-
-def in_double(field: Field) -> Field:
-    """Convert the arrays of a field or model to double precision, if JAX has it enabled."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
 
 
 def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta], AbstractVectorField]]:

@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import ravel_learned, trainable
+from hybrid_jax.dynamics.base import in_double, ravel_learned, trainable
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
 from hybrid_jax.estimation.elimination import End, descend, reduced
-from hybrid_jax.estimation.least_squares import FINE, Solver, in_double, ravel_parameters, solver_errors, warn_of_steps
+from hybrid_jax.estimation.least_squares import FINE, Solver, ravel_parameters, solver_errors, warn_of_steps
 from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.estimation.record_search import TINY, size_of
 from hybrid_jax.estimation.shooting import Problem

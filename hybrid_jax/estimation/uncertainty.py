@@ -98,7 +98,7 @@ def covariance_of(
     if not checks.is_traced(fitted):
         # White noise makes each number of a window an observation; otherwise each window is one.
         n = windows.x.size if kind == "homoscedastic" else len(windows)
-        least_squares.check_determined(field, n, int(fitted))
+        check_determined(field, n, int(fitted))
     checks.count("chunk", chunk)
     checks.count("cluster", cluster)
     if kind not in Kind.__args__:
@@ -177,6 +177,14 @@ def intervals(
         name: Interval(value, jnp.minimum(left[name], right[name]), jnp.maximum(left[name], right[name]))
         for name, value in named_parameters(physics).items()
     }
+
+
+def check_determined(field: AbstractVectorField, n: int, fitted: int | None = None) -> None:
+    """Raise if n windows are too few for the parameters to fit, by default all of the physics, or if there are none."""
+    size, name = jax.eval_shape(lambda: ravel_parameters(field)[0]).size, type(physics_of(field)).__name__
+    p = size if fitted is None else fitted
+    if n <= p:
+        raise ValueError(f"windows: {n} are too few for the {p} parameters of {name}, at least {p + 1} are needed")
 
 
 def check_level(level: float) -> None:

@@ -16,12 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hybrid_jax.dynamics.actuators import Actuated
-from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, in_double, ravel_learned, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.hidden import RandomWalk, with_hidden
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.elimination import descend, reduced
-from hybrid_jax.estimation.least_squares import in_double
 from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, inverses, masked
 from hybrid_jax.estimation.record_search import Search
 from hybrid_jax.estimation.shooting import Problem, effects

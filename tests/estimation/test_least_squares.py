@@ -12,12 +12,14 @@ from pendulum import LENGTH, log_lengths, pendulum, swings
 from pushes import Push, pushes
 
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation import least_squares, levenberg_marquardt
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.uncertainty import covariance_of
 from hybrid_jax.integrate import RK4, rollout_batch
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.trajectories import Trajectories
 
 _mse, _flown = eqx.filter_jit(rollout_mse), eqx.filter_jit(rollout_batch)
@@ -48,6 +50,18 @@ def test_a_linear_problem_meets_its_closed_form_in_any_unit(unit):
     np.testing.assert_allclose(found.field.gains, gains, rtol=1e-5)
     # One step would do without damping; with 1e-3 of it each step leaves 1e-3 of the error.
     assert found.steps <= 6
+
+
+def test_a_residual_is_differentiated_by_the_product_that_jax_would_form():
+    field, key = pendulum(), jax.random.key(0)
+    field = Hybrid(field, residual_network(2, EXACT.u.shape[-1], key, hidden=5, norm="none", activation="tanh"))
+    x, u = EXACT.x0[0], EXACT.u[0, 0]
+    own, plain = (jax.jacfwd(each)(x, u) for each in (fixed_residual(field), field))
+    np.testing.assert_allclose(own, plain, rtol=1e-5, atol=1e-6)
+    # Weights move too where somebody differentiates by them.
+    found = eqx.filter_jvp(lambda field: fixed_residual(field)(x, u), (field,), (field,))[1]
+    plain = eqx.filter_jvp(lambda field: field(x, u), (field,), (field,))[1]
+    np.testing.assert_allclose(found, plain, rtol=1e-5, atol=1e-6)
 
 
 def test_many_windows_are_fitted_a_few_at_a_time_with_the_same_result(monkeypatch):
