@@ -157,8 +157,8 @@ class CTranslation(Translation[np.ndarray]):
         return self._filled(m * n, lambda out: Call("product", (*given, Address(out), m, k, n))).reshape(m, n)
 
     def _dot(self, row: Iterable, other: Iterable):
-        terms = [self._one("mul", pair) for pair in zip(row, other, strict=True)]
-        return reduce(lambda a, b: self._one("add", (a, b)), terms)
+        terms = [self._scalar("mul", pair) for pair in zip(row, other, strict=True)]
+        return reduce(lambda a, b: self._scalar("add", (a, b)), terms)
 
     def _power(self, base: np.ndarray, exponent: int, shape) -> np.ndarray:
         if exponent < 0:
@@ -168,10 +168,6 @@ class CTranslation(Translation[np.ndarray]):
         if exponent == 0:
             return column([1.0] * len(base))
         return reduce(lambda a, b: self.entrywise("mul", (a, b), shape), [base] * exponent)
-
-    def _one(self, name: str, operands: Sequence):
-        simple = self._simple(name, operands)
-        return self._scalar(name, operands) if simple is None else simple
 
     def _simple(self, name: str, operands: Sequence) -> Any:
         """Return the result if no operation is needed, else None."""
@@ -189,8 +185,8 @@ class CTranslation(Translation[np.ndarray]):
                 return chosen
         return self._written.get((name, *operands))
 
-    def _scalar(self, name: str, operands: Sequence) -> Entry:
-        if (found := self._written.get((name, *operands))) is None:
+    def _scalar(self, name: str, operands: Sequence) -> Any:
+        if (found := self._simple(name, operands)) is None:
             found = self._written[(name, *operands)] = Entry(self.tables.name("t"), None, name in LOGICAL)
             defined = Variable(found.name, Operation(name, tuple(operands)), found.logical)
             self.steps.append(Step(found.name, (defined,)))

@@ -55,13 +55,6 @@ def stage_shares(lag: float, dt: float) -> tuple[float, float, float]:
     return 24 * third - 6 * second, 6 * second - 12 * third, 6 * first - 18 * second + 24 * third
 
 
-def lag_matrix(lag: float, dt: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Map the speeds before the first interval (t), and all commands (t, t), to the speeds before each interval."""
-    kept, k = math.exp(-dt / lag) if lag else 0.0, np.arange(steps)
-    since = np.maximum(k[:, None] - k - 1, 0)
-    return kept**k, np.tril((1 - kept) * kept**since, -1)
-
-
 def step_of(derivative: Derivative, x: State, inputs: Sequence[Any], dt: float) -> State:
     """One RK4 step over dt [s] with these inputs at its start, middle and end."""
     evaluate = traced_once(derivative, x)
@@ -117,8 +110,9 @@ def condensed(
 ) -> Float[Array, "t 13 t 4"]:
     """∂(state at the end of each interval) / ∂(all commands); `before` are the initial rotor speeds."""
     d, (t, m) = STATE_SIZE, commands.shape
-    kept, mixed = (part.astype(x.dtype) for part in lag_matrix(lag, dt, t))
-    speeds = kept[:, None] * before + mixed @ commands
+    share, k = math.exp(-dt / lag) if lag else 0.0, np.arange(t)  # of the speeds that an interval keeps
+    mixed = np.tril((1 - share) * share ** np.maximum(k[:, None] - k - 1, 0), -1).astype(x.dtype)
+    speeds = (share**k).astype(x.dtype)[:, None] * before + mixed @ commands
 
     def stage(x, speeds, command):
         return advance_with_jacobian(model, x, speeds, command, lag, dt)[1]

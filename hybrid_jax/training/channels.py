@@ -1,6 +1,5 @@
 """A loss that divides each channel of the state by its error under a baseline, and is robust against outliers."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -102,37 +101,13 @@ def _huber(square: Float[Array, "*n"], threshold: float) -> Float[Array, "*n"]:
     return jnp.where(far, 2 * threshold * length - threshold**2, square)
 
 
-def channels_from(
-    baseline: AbstractVectorField, windows: Trajectories, parts: Mapping[str, slice] | None = None
-) -> tuple[Channel, ...]:
-    """Channels scaled by the RMS error of a baseline, for example one of baselines.py, at the end of the windows.
-
-    Args:
-        baseline: the field whose errors are the scales.
-        windows: the training windows.
-        parts: entries of each channel; by default the quantities of the baseline's state space.
-
-    Raises:
-        ValueError: malformed windows, or a channel in which the baseline has no error.
-    """
-    size = check(windows, "windows").x.shape[-1]
-    parts = {one.name: part for part, one in state_space(baseline, size).parts} if parts is None else parts
-    predicted = rollout_batch(baseline, windows.x0, windows.u, windows.dt)
-    difference = np.asarray(predicted[:, -1], float) - np.asarray(windows.x[:, -1], float)
-    scales = {name: _rms(difference[:, part]) for name, part in parts.items()}
-    for name, scale in scales.items():
-        if not 0 < scale < np.inf:
-            raise ValueError(f"baseline: its error in {name} must be positive and finite, got {scale}")
-    return tuple(Channel(part.start, part.stop, scales[name]) for name, part in parts.items())
-
-
 def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLoss:
     """A loss relative to the RMS change over a window of each quantity in the field's state space."""
     parts = [part for part, _ in state_space(field, windows.x0.shape[-1]).parts]
     x0, end = np.asarray(windows.x0, float), np.asarray(windows.x[:, -1], float)
-    scales = [max(_rms(end[:, part] - x0[:, part]), FLOOR * _rms(end[:, part])) or 1.0 for part in parts]
+
+    def rms(vectors: Float[np.ndarray, "n k"]) -> float:
+        return float(np.sqrt(np.mean(np.sum(np.square(vectors), axis=-1))))
+
+    scales = [max(rms(end[:, part] - x0[:, part]), FLOOR * rms(end[:, part])) or 1.0 for part in parts]
     return ChannelLoss(tuple(Channel(part.start, part.stop, s) for part, s in zip(parts, scales, strict=True)))
-
-
-def _rms(vectors: Float[np.ndarray, "n k"]) -> float:
-    return float(np.sqrt(np.mean(np.sum(np.square(vectors), axis=-1))))

@@ -11,13 +11,12 @@ import pytest
 from pendulum import DAMPING, LENGTH, pendulum, swings
 
 from hybrid_jax import Settings, fit
-from hybrid_jax.dynamics.baselines import HoldState
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.training.channels import Channel, ChannelLoss, channels_from
+from hybrid_jax.training.channels import Channel, ChannelLoss, scaled_loss
 from hybrid_jax.training.objective import TrajectoryLoss
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
-PARTS = {"angle": slice(0, 1), "rate": slice(1, 2)}
+CHANNELS = Channel(0, 1, 0.5), Channel(1, 2, 2.0)
 PLAIN = ChannelLoss((Channel(0, 2, 1.0),))
 FIELD = pendulum(0.8)
 
@@ -35,19 +34,12 @@ def test_with_a_scale_of_one_it_is_the_plain_loss():
         )
 
 
-def test_scales_are_the_baseline_s_errors_at_the_horizon():
-    channels = channels_from(HoldState(), TRAIN, PARTS)
+def test_the_scales_of_a_field_are_the_changes_over_a_window_and_free_of_units():
     last = (TRAIN.x - TRAIN.x0[:, None])[:, -1]
-    counted = ChannelLoss(channels).error(last)
-    np.testing.assert_allclose(counted.mean(), 2.0, rtol=1e-5)
-    degrees = jax.tree.map(lambda leaf: leaf * np.array([57.3, 1.0]), eqx.tree_at(lambda w: w.u, TRAIN, TRAIN.x))
-    same = ChannelLoss(channels_from(HoldState(), degrees, PARTS))
-    np.testing.assert_allclose(same.error(last * np.array([57.3, 1.0])), counted, rtol=1e-5)
-
-
-def test_a_baseline_without_error_is_no_measure():
-    with pytest.raises(ValueError, match="error in angle must be positive and finite, got 0"):
-        channels_from(HoldState(), eqx.tree_at(lambda w: w.x, TRAIN, 0 * TRAIN.x + TRAIN.x0[:, None]), PARTS)
+    counted = scaled_loss(FIELD, TRAIN).error(last)
+    np.testing.assert_allclose(counted.mean(), 2.0, rtol=1e-5)  # two quantities
+    half = jax.tree.map(lambda leaf: leaf / 2, eqx.tree_at(lambda w: w.u, TRAIN, TRAIN.x))
+    np.testing.assert_allclose(scaled_loss(FIELD, half).error(last / 2), counted, rtol=1e-5)
 
 
 def test_beyond_its_threshold_a_robust_loss_grows_with_the_error_and_not_its_square():
@@ -66,7 +58,7 @@ def test_a_robust_loss_does_not_follow_outliers():
     wild = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[::10].add(20.0))
     found = {}
     for name, huber in (("square", None), ("robust", 0.05)):
-        objective = ChannelLoss(channels_from(HoldState(), TRAIN, PARTS), huber)
+        objective = ChannelLoss(CHANNELS, huber)
         settings = Settings(batch_size=60, objective=objective)
         state = fit(pendulum(0.8, DAMPING), wild, VALIDATION, KEY, rates=0.03, max_epochs=60, settings=settings)
         found[name] = abs(float(jnp.exp(state.field.log_length)) - LENGTH)
@@ -87,6 +79,6 @@ def test_what_makes_no_sense_is_refused(wrong):
 
 def test_it_can_be_found_by_what_it_is():
     """A cache keeps an objective as JSON values, a program by its hash."""
-    objective = ChannelLoss(channels_from(HoldState(), TRAIN, PARTS), huber=1.0)
+    objective = ChannelLoss(CHANNELS, huber=1.0)
     assert hash(objective) == hash(dataclasses.replace(objective))
     json.dumps(dataclasses.asdict(objective), allow_nan=False)
