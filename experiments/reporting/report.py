@@ -69,7 +69,7 @@ class Report:
     def page(self, folder: Path) -> Page:
         """Lay out question, answer, one figure, one small table and their meaning; the rest is folded."""
         asked, (_, _, introduction) = self.asked, self.head.partition("\n")
-        said = [" ".join(re.sub(r"[*`]", "", each).split()) for each in re.split(r"\n\s*\n|\n- ", introduction)]
+        said = [" ".join(re.sub(r"^- |[*`]", "", each).split()) for each in re.split(r"\n\s*\n|\n- ", introduction)]
         found = self.main()
         main = narrowed(found) if found else None
         answer, *more = self.conclusions() or [""]
@@ -137,7 +137,10 @@ def _cells(table: Table) -> Cells:
 def markdown_page(page: Page, report: Report) -> str:
     """report.md: the same page; folded parts open on a click, in a site and in a forge."""
     figures = [f"![{plain(caption)}]({path})\n\n*{plain(caption)}*" for path, caption in report.ordered()]
-    more = {table.title: markdown(table) for table in page.details}
+    more = {
+        each.title: _bullets([line for (line,) in each.lines]) if [*each.header] == [""] else markdown(each)
+        for each in page.details
+    }
     more |= {"More figures": "\n\n".join(figures[1:]), "Notes": _bullets(page.notes)}
     parts = [
         f"# {page.question}",
