@@ -60,7 +60,7 @@ def _gains(rows: Results) -> Part:
     for domain, own in rows.where(domain=(names.PARAMETER_SHIFT, names.EXTERNAL_FORCE)).group("domain").items():
         rho = 1 - over(own, "source")
         sound.append(rho.mean() >= MEAN_RHO and rho.min() >= WORST_RHO)
-        words.append(f"{domain}: mean {rho.mean():.3f}, worst {rho.min():.3f}")
+        words.append(f"{names.label(domain)}: mean {rho.mean():.3f}, worst {rho.min():.3f}")
     if not sound:
         raise Undecided("neither was flown")
     return all(sound), "; ".join(words)
@@ -79,7 +79,7 @@ def _expects_its_error(rows: Results) -> Part:
         raise Undecided("there is no other flight to compare with")
     shares = {domain: float(np.mean(group["expected_inside"])) for domain, group in own.group("domain").items()}
     share = float(np.mean([*shares.values()]))
-    words = ", ".join(f"{domain} {value:.0%}" for domain, value in shares.items())
+    words = ", ".join(f"{names.label(domain)} {value:.0%}" for domain, value in shares.items())
     return HELD[0] <= share <= HELD[1], f"{share:.1%} in the mean over changes ({words})"
 
 

@@ -39,8 +39,8 @@ LABELS = {
     "moving": "usual flight",
     "near_ground": "near the ground",
     "outliers": "usual flight with outliers",
-    "iris": "Iris, our simulator",
-    "hummingbird": "Hummingbird, RotorPy",
+    "iris": "Iris (our simulator)",
+    "hummingbird": "Hummingbird (RotorPy)",
 }
 
 

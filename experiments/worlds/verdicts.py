@@ -132,7 +132,7 @@ def _intervals_hold(rows: Results) -> Part:
         margin = 1.96 * np.sqrt(HELD[0] * (1 - HELD[0]) / n)
         holds = True if share >= HELD[0] else False if share < HELD[0] - margin else None
         too_often = share > HELD[1] and LEVEL**n < 1 - LEVEL  # so many would seldom all hold
-        return False if too_often else holds, f"{world} {share:.1%} of {n}"
+        return False if too_often else holds, f"{label(world)}: {share:.1%} of {n}"
 
     found = {
         str(world): np.concatenate([known(own, f"{name}_inside") for name in LEARNED])
@@ -141,13 +141,15 @@ def _intervals_hold(rows: Results) -> Part:
     if not any(map(len, found.values())):
         raise Undecided("no parameter is called physical")
     holds, measured = all_of(of(*one) for one in found.items() if len(one[1]))
-    return holds, "; ".join([measured, *(f"{world} has none" for world, inside in found.items() if not len(inside))])
+    return holds, "; ".join(
+        [measured, *(f"{label(str(world))} has none" for world, inside in found.items() if not len(inside))]
+    )
 
 
 def _expects_its_errors(rows: Results) -> Part:
     def of(world: str, own: Results, name: str) -> Part:
         share = known(own, name).mean()
-        return EXPECTED[0] <= share <= EXPECTED[1], f"{world} after {name.split(' ', 1)[1]} {share:.0%}"
+        return EXPECTED[0] <= share <= EXPECTED[1], f"{label(world)} after {name.split(' ', 1)[1]} {share:.0%}"
 
     if not (groups := _expecting(rows)):
         raise Undecided("no errors were expected")
