@@ -1,5 +1,6 @@
 """Vector fields ẋ = f(x, u) of one state x (d,) and one input u (m,): physics, a network, or any function."""
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,9 +9,11 @@ from typing import Any, ClassVar, Self, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import (
     AbstractInferenceOnly,
     Batch,
@@ -120,7 +123,23 @@ def check_windows(field: AbstractVectorField, windows: Trajectories, name: str =
     space = state_space(field, windows.x0.shape[-1])
     for part, states in (("x0", windows.x0), ("x", windows.x)):
         space.check(f"{name}: {part}", states)
+    _warn_of_turns(space, windows, name)
     return continuous(field, windows)
+
+
+def _warn_of_turns(space: StateSpace, windows: Trajectories, name: str) -> None:
+    """Warn of numbers that jump by 2π, as an angle does where it is wrapped, and otherwise change little."""
+    if checks.is_traced(windows.x0) or checks.is_traced(windows.x):
+        return
+    path = np.concatenate([windows.x0[:, None], windows.x], axis=1)
+    for part, one in space.parts:
+        moved = np.abs(np.diff(path[..., part], axis=1)).max(axis=1, initial=0.0) if one.is_vector else np.zeros((1, 0))
+        for i, each in enumerate(moved.T):
+            jumps = each > 1.5  # rad, of the largest change in each window
+            if jumps.any() and np.all(np.abs(each[jumps] - 2 * np.pi) < 1):
+                where = f"{name}: x[{part.start + i}] jumps by about 2π in {jumps.sum()} of {len(each)} windows"
+                remedy = "if it is an angle, unwrap it, or give the field a `state_space` with an `Angle`"
+                warnings.warn(f"{where}; {remedy}", stacklevel=3)
 
 
 def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectories:

@@ -154,6 +154,13 @@ def checked_arguments(
     check_minibatch(field, settings)
     if not isinstance(optimiser, Optimiser | None):
         raise ValueError(f"optimiser must be an optax.GradientTransformation, got {checks.short_repr(optimiser)}")
+    if optimiser is not None:
+        moving = eqx.filter(field, trainable(field))
+        try:
+            jax.eval_shape(lambda each: optimiser.update(each, optimiser.init(each), each), moving)
+        except TypeError as error:
+            text = "optimiser must need nothing but gradients and parameters"
+            raise ValueError(f"{text}: {checks.first_line(error)}") from error
     if weight is not None and settings.regulariser is None and isinstance(settings.objective, TrajectoryLoss):
         remedy = "leave it out, or take one of hybrid_jax.training.loss.REGULARISERS"
         given = checks.short_repr(weight)

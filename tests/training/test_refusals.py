@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from pendulum import pendulum, swings
 
@@ -50,6 +51,11 @@ REFUSED = {
     "validation": (pendulum(), {"validation": SPOILED}, r"validation: x\[2, 3, 1\] is not finite"),
     "weight": (pendulum(), {"regulariser_weight": 1.0}, "regulariser_weight is 1.0 but settings.regulariser is None;"),
     "optimiser": (pendulum(), {"optimiser": "adam"}, r"optimiser must be an optax\.GradientTransformation"),
+    "line search": (
+        pendulum(),
+        {"optimiser": optax.lbfgs()},
+        "optimiser must need nothing but gradients and parameters: ",
+    ),
     "hidden": (Stopped(jnp.ones(()), NETWORK), {}, "field: Stopped contains a BatchNorm whose minibatch statistics"),
     "float": (Stiff(1.0), {}, f"field: {NOTHING.format('Stiff')}"),
     "integer": (Hybrid(Stiff(jnp.array(1)), NETWORK), {}, "field: physics.length is an integer, which is not learned;"),
