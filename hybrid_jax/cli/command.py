@@ -11,14 +11,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import fields
 from importlib import import_module
-from typing import Any, NoReturn, TypeVar, cast
+from typing import Any, NoReturn, TypeVar, cast, get_type_hints
 
 import tyro
 
 from hybrid_jax.cli.flags import in_flags
-from hybrid_jax.cli.help import short_help
+from hybrid_jax.cli.help import option_of, short_help
 from hybrid_jax.runtime import configure
 
 Options = TypeVar("Options")
@@ -122,7 +121,8 @@ def parsed(
         if not stop.code:
             raise  # --help
         message = _message(output.getvalue())
-        known = [f"--{field.name.replace('_', '-')}" for field in fields(cast(Any, kind))]
+        hints = get_type_hints(kind, include_extras=True).items()
+        known = [f"--{option_of(name, getattr(hint, '__metadata__', ()))}" for name, hint in hints]
         # One that is wrong is named even where an argument is missing, which the parser finds first.
         for word in (re.split(r"[=.]", word)[0] for word in given if word.startswith("--")):
             if word.replace("--no-", "--", 1) not in (*known, "--help"):
