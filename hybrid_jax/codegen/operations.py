@@ -138,7 +138,8 @@ class CTranslation(Translation[np.ndarray]):
         m, k, n = sizes
         a, b = left.reshape(m, k), right.reshape(k, n)
         if ((a != 0.0).astype(int) @ (b != 0.0).astype(int)).sum() <= PRODUCTS:
-            return column(self._dot(one, other) for one in a for other in b.T)
+            pairs = ([self._scalar("mul", pair) for pair in zip(one, other, strict=True)] for one in a for other in b.T)
+            return column(reduce(lambda a, b: self._scalar("add", (a, b)), terms) for terms in pairs)
         if all(isinstance(one, float) for one in right) and ((b != 0.0).sum(axis=0) <= 1).all():  # a selection
             chosen = (b != 0.0).argmax(axis=0)
             factors = np.tile(b[chosen, np.arange(n)], m)
@@ -155,10 +156,6 @@ class CTranslation(Translation[np.ndarray]):
             return self._loops(b.T, a.T).T
         given = [loops.address(self.tables, self._gathered(one.ravel(), one.shape)) for one in (a, b)]
         return self._filled(m * n, lambda out: Call("product", (*given, Address(out), m, k, n))).reshape(m, n)
-
-    def _dot(self, row: Iterable, other: Iterable):
-        terms = [self._scalar("mul", pair) for pair in zip(row, other, strict=True)]
-        return reduce(lambda a, b: self._scalar("add", (a, b)), terms)
 
     def _power(self, base: np.ndarray, exponent: int, shape) -> np.ndarray:
         if exponent < 0:

@@ -199,10 +199,6 @@ def _broadcast(params, a: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.expand_dims(a, added), params["shape"])
 
 
-def _sliced(params, a: np.ndarray) -> np.ndarray:
-    return a[tuple(map(slice, params["start_indices"], params["limit_indices"], params["strides"] or (1,) * a.ndim))]
-
-
 def _padded(params, a: np.ndarray, value: np.ndarray) -> np.ndarray:
     pads = params["padding_config"]
     if any(low < 0 or high < 0 or inner for low, high, inner in pads):
@@ -211,7 +207,9 @@ def _padded(params, a: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 
 _BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
-    "slice": _sliced,
+    "slice": lambda params, a: a[
+        tuple(map(slice, params["start_indices"], params["limit_indices"], params["strides"] or (1,) * a.ndim))
+    ],
     "broadcast_in_dim": _broadcast,
     "squeeze": lambda params, a: a.squeeze(params["dimensions"]),
     "reshape": lambda params, a: a.reshape(params["new_sizes"]),

@@ -104,7 +104,12 @@ def export_program(
     if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
         known = ", ".join(PLATFORMS)
         raise ValueError(f"platforms must be a tuple of some of {known}, got {checks.short_repr(platforms)}")
-    exported = _exported(field, dt, sizes, batched, platforms, smooth)
+    with jax.enable_x64(False), _without_source_locations():
+        likes = [jax.ShapeDtypeStruct((size,), jnp.float32) for size in sizes]
+        program = program_of(field, likes, dt, smooth, batched)
+        batch = jax.export.symbolic_shape(BATCH) if batched else ()
+        rows = (jax.ShapeDtypeStruct((*batch, size), jnp.float32) for size in sizes)
+        exported = jax.export.export(jax.jit(program), platforms=platforms)(*rows)
     _check_calls(exported)
     metadata = {"dt": dt, "about": dict(about or {})}
     save_archive(path, FORMAT, metadata, {"exported": np.frombuffer(exported.serialize(), np.uint8)})
@@ -132,15 +137,6 @@ def load_program(path: str | Path) -> Program:
     except Exception as error:  # JAX's parser raises errors of any type
         raise ValueError(f"{path}: not a program of a field or a step: {checks.first_line(error)}") from error
     return Program(dt, state_size, input_size, batched, exported.platforms, about, jax.jit(exported.call))
-
-
-def _exported(field, dt: float | None, sizes, batched: bool, platforms, smooth) -> jax.export.Exported:
-    with jax.enable_x64(False), _without_source_locations():
-        likes = [jax.ShapeDtypeStruct((size,), jnp.float32) for size in sizes]
-        program = program_of(field, likes, dt, smooth, batched)
-        batch = jax.export.symbolic_shape(BATCH) if batched else ()
-        x, u = (jax.ShapeDtypeStruct((*batch, size), jnp.float32) for size in sizes)
-        return jax.export.export(jax.jit(program), platforms=platforms)(x, u)
 
 
 @contextmanager

@@ -89,16 +89,13 @@ class ChannelLoss(TrajectoryLoss):
 
         def one(channel: Channel):
             square = jnp.sum(jnp.square(difference[..., channel.start : channel.stop] / channel.scale), axis=-1)
-            return square if self.huber is None else _huber(square, self.huber)
+            if self.huber is None:
+                return square
+            far = square > self.huber**2
+            length = jnp.sqrt(jnp.where(far, square, 1.0))  # of finite slope at zero, where it is not used
+            return jnp.where(far, 2 * self.huber * length - self.huber**2, square)
 
         return sum(map(one, self.channels[1:]), one(self.channels[0]))
-
-
-def _huber(square: Float[Array, "*n"], threshold: float) -> Float[Array, "*n"]:
-    """ρ(r) from r², with a finite slope at zero, where the root is not used."""
-    far = square > threshold**2
-    length = jnp.sqrt(jnp.where(far, square, 1.0))
-    return jnp.where(far, 2 * threshold * length - threshold**2, square)
 
 
 def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLoss:

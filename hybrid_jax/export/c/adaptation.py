@@ -53,8 +53,11 @@ def export_adaptation_c(
         sizes = {"state": flat.size, "x": d, "u": m, "elapsed": 1}
         likes = {key: jax.ShapeDtypeStruct((size,), float) for key, size in sizes.items()}
 
+        def in_turn(one: Callable) -> Callable:  # a loop in the place of `jax.vmap` makes the C code small
+            return lambda *stacked: jax.lax.map(lambda row: one(*row), stacked)
+
         def update(state, x, u, elapsed):
-            return [ravel_pytree(exact.update(unravel(state), x, u, elapsed[0], _in_turn))[0]]
+            return [ravel_pytree(exact.update(unravel(state), x, u, elapsed[0], in_turn))[0]]
 
         def begin(x):
             return [ravel_pytree(exact.begin(x))[0]]
@@ -65,11 +68,6 @@ def export_adaptation_c(
     parts |= {"elapsed": f"periods of {name.upper()}_DT ago"} | _parts(exact, first)
     parts |= printer.parts(tables, begin=begun, update=stepped)
     return written(folder, name, ADAPTATION_HEADER, ADAPTATION_SOURCE, parts)
-
-
-def _in_turn(one: Callable) -> Callable:
-    """Replace `jax.vmap` by a loop, which makes the C code small."""
-    return lambda *stacked: jax.lax.map(lambda row: one(*row), stacked)
 
 
 def _parts(adaptation: Any, state: Any) -> dict[str, Any]:

@@ -67,7 +67,8 @@ def export_c(
         likes = [jax.ShapeDtypeStruct((size,), float) for size in (d, m)]
         fused = as_field(prepared(field, likes, smooth)).fuse_for_inference()
         values = body_of(fused, likes, tables, ("xdot",))
-        slopes = body_of(lambda x, u: _with_slopes(fused, x, u), likes, tables, ("xdot", "jacobian"))
+        directions = jnp.split(jnp.eye(d + m), [d])
+        slopes = body_of(lambda x, u: as_field(fused).linearize(x, u, *directions), likes, tables, ("xdot", "jacobian"))
     about = _about(vehicle_in(field) is not None, smooth)
     parts = {"d": d, "m": m, "dt": printer.number(float(dt)), "about": about}
     return written(folder, name, HEADER, SOURCE, parts | printer.parts(tables, values=values, slopes=slopes))
@@ -84,11 +85,6 @@ def written(folder: str | Path, name: str, header: str, source: str, parts: Mapp
     for path, template in zip(paths, (header, source), strict=True):
         write_atomic(path, Template(template).substitute(parts, name=name, NAME=name.upper()))
     return paths
-
-
-def _with_slopes(field: AbstractVectorField, x, u):
-    directions = jnp.eye(len(x) + len(u))
-    return as_field(field).linearize(x, u, directions[: len(x)], directions[len(x) :])
 
 
 def body_of(
