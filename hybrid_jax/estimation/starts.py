@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
+from hybrid_jax.dynamics.by_product import fixed_residual
+from hybrid_jax.estimation.least_squares import Scale, Solver
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.matrices import solve
 from hybrid_jax.trajectories import Trajectories
@@ -79,15 +80,15 @@ def smoothed(
         return None, jnp.zeros(())
     unit = jnp.ones(d) if scale is None else scale
     counts = jnp.isfinite(unit)
-    unit = jnp.where(counts, unit, 1).astype(windows.x0.dtype)
+    unit, fixed = jnp.where(counts, unit, 1).astype(windows.x0.dtype), fixed_residual(field)
 
     def one(window: Trajectories):
         def predicted(start):
-            return rollout(field, window.x0 + unit * start, window.u, window.dt, compact(solver))
+            return 2 * (rollout(fixed, window.x0 + unit * start, window.u, window.dt, compact(solver)),)
 
-        effect = jax.jacfwd(predicted)(jnp.zeros_like(window.x0)) / unit[:, None]
-        effect = effect * counts[:, None] * counts
-        r = prediction_errors(field, window, solver, scale)
+        effect, x = jax.jacfwd(predicted, has_aux=True)(jnp.zeros_like(window.x0))
+        effect = effect / unit[:, None] * counts[:, None] * counts
+        r = jnp.where(counts, (window.x - x) / unit, 0).astype(x.dtype)
         rows = jnp.concatenate([jnp.eye(d, dtype=r.dtype)[None], effect])
         errors = jnp.concatenate([jnp.zeros_like(r[:1]), r])
         return effect, r, _unexplained(rows, errors), jnp.sum(jnp.square(jnp.diff(errors, n=order, axis=0)))

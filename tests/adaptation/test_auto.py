@@ -238,7 +238,7 @@ def test_a_parameter_of_which_the_network_has_a_share_is_effective(share):
     assert found.changed == ("log_length",)
     assert (one.effective is None) == one.has_interval == (share == 0)
     assert one.effective or one.low < np.log(LENGTH) < one.high
-    assert ("Effective, and therefore without an interval: log_length" in found.report()) == (share > 0)
+    assert ("Effective, so without an interval: log_length" in found.report()) == (share > 0)
 
 
 def test_results_of_auto_are_pooled_with_what_the_networks_express():
