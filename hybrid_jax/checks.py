@@ -54,7 +54,7 @@ def floating(name: str, value: Any) -> jax.Array:
     return jnp.asarray(array, None if jnp.issubdtype(array.dtype, jnp.floating) else float)
 
 
-def finite(name: str, array: Numbers) -> Numbers:
+def finite(name: str, array: Numbers, remedy: str = "") -> Numbers:
     """The array unchanged; ValueError, with the position, for a number that is not finite in JAX's precision."""
     if is_traced(array):
         return array
@@ -65,7 +65,7 @@ def finite(name: str, array: Numbers) -> Numbers:
     bad = ~np.isfinite(values)
     if bad.any():
         place = np.argwhere(bad)[0].tolist()
-        raise ValueError(f"{name}{place or ''} is not finite in {precision}")
+        raise ValueError(f"{name}{place or ''} is not finite in {precision}{remedy and '; '}{remedy}")
     return array
 
 

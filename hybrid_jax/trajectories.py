@@ -71,7 +71,8 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
         raise ValueError(f"{name}: dt must be a number and not an array, such as float(dt)")
     checks.positive(f"{name}: dt", trajectories.dt, "a positive number of seconds")
     for part, array in parts.items():
-        checks.finite(f"{name}: {part}", array)
+        remedy = "leave such windows out, or see `fit_records` for states that are not always measured"
+        checks.finite(f"{name}: {part}", array, "" if part == "u" else remedy)
     return trajectories
 
 
