@@ -59,7 +59,7 @@ def test_hover_changes_what_the_source_does_not_err_on_its_own_motion(force, tak
     found = hj.adapt(body(0.5), hover, learned_from=moving)
     assert "force" in found.refused or taken
     assert (found.chosen == "source") != taken
-    assert "hj.excitation plans a flight" in found.report()
+    assert "hj.excitation plans an experiment" in found.report()
 
 
 @pytest.mark.slow
