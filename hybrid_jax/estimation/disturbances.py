@@ -138,8 +138,14 @@ def _cut(one: Trajectories, pieces: int) -> Trajectories:
 
 def _states(field: AbstractVectorField, windows: Trajectories) -> tuple[int, ...]:
     """The states that the field depends on; for example, a vehicle's position has no effect on its motion."""
-    slope = jax.vmap(jax.jacfwd(field))(jnp.asarray(windows.x[0]), jnp.asarray(windows.u[0]))
+    x, u = (np.resize(np.asarray(part[0]), (CHUNK, part.shape[-1])) for part in (windows.x, windows.u))
+    slope = _slopes(field, x, u)
     return tuple(np.flatnonzero(np.abs(np.asarray(slope)).max(axis=(0, 1)) > 0).tolist())
+
+
+@eqx.filter_jit
+def _slopes(field, x, u) -> Float[Array, "n d d"]:
+    return jax.vmap(jax.jacfwd(field))(x, u)
 
 
 def _features(model: DisturbanceModel, states: np.ndarray) -> Float[np.ndarray, "n f"]:
