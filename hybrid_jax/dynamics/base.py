@@ -131,7 +131,7 @@ def _warn_of_turns(space: StateSpace, windows: Trajectories, name: str) -> None:
     """Warn of numbers that jump by 2π, as an angle does where it is wrapped, and otherwise change little."""
     if checks.is_traced(windows.x0) or checks.is_traced(windows.x):
         return
-    path = np.concatenate([windows.x0[:, None], windows.x], axis=1)
+    path = np.concatenate([np.asarray(windows.x0)[:, None], windows.x], axis=1)
     for part, one in space.parts:
         moved = np.abs(np.diff(path[..., part], axis=1)).max(axis=1, initial=0.0) if one.is_vector else np.zeros((1, 0))
         for i, each in enumerate(moved.T):
