@@ -6,17 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from experiments.flying.changes import CHANGES
 from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
-from experiments.runner.options import (
-    Activation,
-    Count,
-    CountFromZero,
-    NotNegative,
-    Positive,
-    Run,
-    Target,
-    distinct,
-    factors,
-)
+from experiments.runner import options
+from experiments.runner.options import Activation, Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.networks.mlp import NORMS
@@ -110,7 +101,7 @@ class Encoding:
 class Config(Run):
     """Shared options of all experiments in simulation. Defaults: the paper's full protocol."""
 
-    sizes: Annotated[tuple[int, ...], Target] = TABLE_SIZES
+    sizes: Annotated[tuple[int, ...], options.Target] = TABLE_SIZES
     """N, target trajectories to train on. Rates and patience are those of the nearest size in the paper's table."""
     pool: int | None = None
     """Target trajectories from which a seed draws its N; by default as many as the largest N."""
@@ -176,8 +167,8 @@ class Config(Run):
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
         self._check_draws()
         if self.pooled() + self.source_train + self.validating() + self.test > MOST:
-            options = "--n-target, --draws, --pool, --source-train, --validation and --test"
-            raise ValueError(f"{options} must request at most {MOST:,} trajectories together")
+            named = "--n-target, --draws, --pool, --source-train, --validation and --test"
+            raise ValueError(f"{named} must request at most {MOST:,} trajectories together")
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
         if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
             needed = f"more than the {FITTED} parameters of {CONSTANT_DISTURBANCE}"
@@ -248,7 +239,7 @@ class AdaptationConfig(Config):
 class OneFlight(Config):
     """What you have after a change: one short flight with sensor noise, and no other data."""
 
-    sizes: Annotated[tuple[int, ...], Target] = (100,)
+    sizes: Annotated[tuple[int, ...], options.Target] = (100,)
     """N, windows of 0.1 s: one number."""
     draw: Literal["random", "contiguous"] = "contiguous"
     """Which N target trajectories. contiguous: from the start of one flight (ten seconds for 100
