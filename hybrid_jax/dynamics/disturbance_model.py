@@ -20,7 +20,8 @@ class DisturbanceModel(AbstractVectorField):
     Attributes:
         field: f, of d states with e numbers in their tangent space.
         weights: W (e, k e + n + 1), in the units of ẋ, z and x.
-        sizes: of z, x and 1 where W was first learned (k e + n + 1), in their units.
+        sizes: how much each number that W multiplies varied in the data of the first fit (k e + n + 1), in its unit;
+            infinite for a state that did not vary.
         time_constants: τ₁, …, τ_k of the filters [s].
         states: indices of the n states that W reads.
     """

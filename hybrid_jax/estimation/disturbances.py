@@ -30,8 +30,9 @@ def fit_disturbance(
 
     Use it when the errors of a model last, because the system has states that you do not measure. Parts of the
     sequences that are left out in turn choose the penalty; an infinite one leaves the field's predictions unchanged.
-    If you learn again after a change, weights must explain more than twice as much of the errors in each part left out
-    as they would alter where the model was learned (Mallows, 1973): otherwise noise in a hover would teach them.
+    If you start from a model that was learned before, its weights change only if this explains more than twice as much
+    of the errors in each part left out as it alters predictions of the earlier data (after Mallows, 1973). So noise in
+    a hover does not change them.
 
     Example:
         model = hj.fit_disturbance(result.field, flights)
@@ -39,7 +40,7 @@ def fit_disturbance(
         x = hj.rollout_batch(model, state, u, dt)[..., :d]
 
     Args:
-        field: the field, or a `DisturbanceModel` whose weights the new ones start from, see above.
+        field: the field, or a `DisturbanceModel` that was learned before.
         sequences: long windows, each without a gap; for one or two, parts of them are left out.
         steps: intervals after which predictions are compared.
         solver: of diffrax, by default `RK4`.
