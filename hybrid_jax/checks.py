@@ -54,15 +54,18 @@ def floating(name: str, value: Any) -> jax.Array:
     return jnp.asarray(array, None if jnp.issubdtype(array.dtype, jnp.floating) else float)
 
 
-def finite(name: str, array: Numbers, remedy: str = "") -> Numbers:
-    """The array unchanged; ValueError, with the position, for a number that is not finite in JAX's precision."""
+def finite(name: str, array: Numbers, remedy: str = "", missing: bool = False) -> Numbers:
+    """The array unchanged; ValueError, with the position, for a number that is not finite in JAX's precision.
+
+    If `missing`, NaN is allowed.
+    """
     if is_traced(array):
         return array
     values, precision = np.asarray(array), jnp.result_type(float)
     if values.dtype.itemsize > precision.itemsize:
         with np.errstate(over="ignore"):
             values = values.astype(precision)
-    bad = ~np.isfinite(values)
+    bad = ~np.isfinite(values) & ~(missing & np.isnan(values))
     if bad.any():
         place = np.argwhere(bad)[0].tolist()
         raise ValueError(f"{name}{place or ''} is not finite in {precision}{remedy and '; '}{remedy}")

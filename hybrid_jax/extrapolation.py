@@ -21,5 +21,5 @@ def features_of(windows: Trajectories, space: StateSpace) -> Features:
 
 def shares_outside(known: Features, asked: Features) -> dict[str, float]:
     """By quantity, the fraction of samples outside the 1 to 99 % range of the known ones."""
-    ends = {name: np.quantile(values, RANGE) for name, values in known.items()}
+    ends = {name: np.nanquantile(values, RANGE) for name, values in known.items()}
     return {name: float(np.mean((asked[name] < low) | (asked[name] > high))) for name, (low, high) in ends.items()}

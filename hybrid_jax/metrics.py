@@ -9,7 +9,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, continuous
 from hybrid_jax.integrate import Solver
 from hybrid_jax.rollouts import predict
 from hybrid_jax.runtime import entry
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.trajectories import Trajectories, check, errors_of
 
 CHUNK = 1000  # windows predicted at once
 
@@ -17,13 +17,15 @@ CHUNK = 1000  # windows predicted at once
 def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:
     """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window; ValueError if the shapes differ or there is no state.
 
+    Numbers that were not measured, NaN in `truth`, count as no error.
+
     Args:
         predicted: x̂, predicted states (n, t, d) or, for one window, (t, d).
         truth: x, the true states, of the same shape.
     """
     if predicted.shape != truth.shape or predicted.ndim < 2 or 0 in predicted.shape[-2:]:
         raise ValueError(f"predicted and truth must both be (n, t, d), got shapes {predicted.shape} and {truth.shape}")
-    return jnp.mean(jnp.sum(jnp.square(predicted - truth), axis=-1), axis=-1)
+    return jnp.mean(jnp.sum(jnp.square(errors_of(predicted, truth)), axis=-1), axis=-1)
 
 
 @entry
@@ -57,7 +59,7 @@ def window_mse(
         solver: by default `RK4`.
         chunk: windows predicted at a time.
     """
-    windows = continuous(field, check(windows, "windows"))
+    windows = continuous(field, check(windows, "windows", missing=True))
     checks.count("chunk", chunk)
     checks.count("every", every)
     if every > windows.horizon:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -25,7 +26,8 @@ class Trajectories(eqx.Module):
     Attributes:
         x0: initial state of each window (n, d), in SI units; you should not scale it.
         u: input during each interval (n, t, m), constant over it.
-        x: state at the end of each interval (n, t, d): x[:, i] is (i + 1) dt after x0.
+        x: state at the end of each interval (n, t, d): x[:, i] is (i + 1) dt after x0. For `fit`, `adapt` and least
+            squares, NaN means not measured.
         dt: length of an interval [s].
     """
 
@@ -50,8 +52,11 @@ class Trajectories(eqx.Module):
         return jax.tree.map(lambda leaf: leaf[index], self)
 
 
-def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectories:
-    """The trajectories unchanged; ValueError for wrong shapes or dt or, unless traced, numbers that are not finite."""
+def check(trajectories: Trajectories, name: str = "trajectories", missing: bool = False) -> Trajectories:
+    """The trajectories unchanged; ValueError for wrong shapes or dt or, unless traced, numbers that are not finite.
+
+    If `missing`, x may contain NaN, but not everywhere.
+    """
     if not isinstance(trajectories, Trajectories):
         raise ValueError(f"{name}: must be Trajectories, got {type(trajectories).__name__}")
     x0, u, x = trajectories.x0, trajectories.u, trajectories.x
@@ -71,9 +76,16 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
         raise ValueError(f"{name}: dt must be a number and not an array, such as float(dt)")
     checks.positive(f"{name}: dt", trajectories.dt, "a positive number of seconds")
     for part, array in parts.items():
-        remedy = "leave such windows out, or see `fit_records` for states that are not always measured"
-        checks.finite(f"{name}: {part}", array, "" if part == "u" else remedy)
+        remedy = {"x0": "begin where every state is measured, or see `fit_records`", "x": "leave such windows out"}
+        checks.finite(f"{name}: {part}", array, remedy.get(part, ""), missing and part == "x")
+    if missing and not checks.is_traced(x) and np.isnan(np.asarray(x)).all():
+        raise ValueError(f"{name}: x is NaN everywhere: no state was measured")
     return trajectories
+
+
+def errors_of(predicted: Float[Array, "*s"], x: Float[Array | np.ndarray, "*s"]) -> Float[Array, "*s"]:
+    """Predicted minus measured states; zero, also in its derivatives, where x is NaN: not measured."""
+    return jnp.where(jnp.isnan(x), 0, predicted - x)
 
 
 def overflows(trajectories: Trajectories) -> bool:

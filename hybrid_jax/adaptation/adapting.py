@@ -88,7 +88,7 @@ def adapt(
         field: a trained `Hybrid`, or any other field.
         windows: you should pass them in the order of time and without overlap, more windows than parameters. If the
             windows follow each other, for example in one flight, the intervals allow for errors that are correlated
-            within a fifth of the windows.
+            within a fifth of the windows. NaN in x means not measured, and counts as no error; x0 and u must be whole.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` to write your own.
         validation: windows for early stopping and penalties, which should be of another flight. By default
             the last fifth of `windows` is held out if the method needs validation.
@@ -103,10 +103,10 @@ def adapt(
     """
     checks.not_traced("adapt", field, windows, validation, learned_from)
     name, method = _named(method)
-    windows = check_windows(field, windows)
+    windows = check_windows(field, windows, missing=True)
     learned_from = motion_of(field) if learned_from is None else learned_from
     if learned_from is not None:
-        learned_from = check_windows(field, learned_from, "learned_from")
+        learned_from = check_windows(field, learned_from, "learned_from", missing=True)
         check_like(learned_from, windows, "learned_from", dt=False)
     check_level(level)
     if settings is not None:
@@ -128,7 +128,7 @@ def adapt(
     if good.sum() >= max(FEWEST, given / 2):
         windows, errors = (windows, errors) if good.all() else (windows[good], errors[good])
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
-    held_out = check_windows(field, held_out, "validation")
+    held_out = check_windows(field, held_out, "validation", missing=True)
     check_like(held_out, train, "validation")
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
     motion = {"learned_from": learned_from} if getattr(method, "uses_motion", False) else {}
@@ -155,8 +155,8 @@ def adapt(
         field=adapted,
         method=name,
         disturbance=None if found is None else np.asarray(found.vector(windows.x0.shape[-1])),
-        mse_before=_mse(errors),
-        mse_after=_mse(_errors(adapted, windows, compact(settings.solver))),
+        mse_before=_mse(errors, windows),
+        mse_after=_mse(_errors(adapted, windows, compact(settings.solver)), windows),
         windows=len(windows),
         steps=int(solution.steps),
         status=status,
@@ -176,9 +176,9 @@ def _errors(field: AbstractVectorField, windows: Trajectories, solver: Solver) -
     return in_chunks(errors, windows, CHUNK)
 
 
-def _mse(errors) -> float:
+def _mse(errors, windows: Trajectories) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.mean(np.sum(np.square(errors), axis=-1)))
+        return float(np.mean(np.sum(np.square(np.where(np.isnan(windows.x), 0, errors)), axis=-1)))
 
 
 def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[str, Any]:

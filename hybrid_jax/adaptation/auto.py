@@ -231,7 +231,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
     ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(blocks[1])))
     first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
     choice = Choice(*first, inherited, absorbed)
-    status = ended(found.converged, found.converged | jnp.isfinite(ends).all())
+    status = ended(found.converged, found.converged | ~jnp.isinf(ends).any())
     return Solution(candidate(extended(field, train.x0.shape[1]), choice, taken), found.steps, status, choice)
 
 

@@ -1,5 +1,6 @@
 """Estimate the error on an unseen flight from blocks of windows that were left out of the fit."""
 
+import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -17,9 +18,11 @@ def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, f
     """Return the RMSE at the end of single and of joined windows, with an 80 % prediction interval for an equal flight.
 
     The interval (Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7) uses Student's t for the logarithm of the mean
-    `squares` over blocks; `seconds` are the durations of the windows.
+    `squares` over blocks, NaN where a state was not measured; `seconds` are the durations of the windows.
     """
     blocks = len(squares)
+    with warnings.catch_warnings(action="ignore"):  # a state that is measured at no end
+        squares = np.where(np.isnan(squares), np.nanmean(squares, axis=0), squares)
     reach = scipy.special.stdtrit(blocks - 1, (1 + LEVEL) / 2) * np.sqrt(2 * ALIKE / blocks) if blocks > 1 else np.inf
 
     def around(group: slice, factor: float, horizon: int) -> tuple[float, float, float]:

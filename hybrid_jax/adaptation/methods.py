@@ -22,7 +22,7 @@ from hybrid_jax.status import Status
 from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import ADAM, make_run_config, run, start
 from hybrid_jax.training.objective import Objective, Settings, TrajectoryLoss
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, check
 
 
 class Solution(NamedTuple):
@@ -188,6 +188,7 @@ class Ridge(Method):
     penalties: tuple[float, ...] = ridge.PENALTIES
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
+        check(train, "windows")  # before they are traced: it needs the state before and after each interval
         return Solution(_fit_ridge(self.update, field, train, validation, self.penalties, settings).field)
 
 

@@ -18,18 +18,19 @@ def outliers(errors: Float[np.ndarray, "n t d"], windows: Trajectories) -> Bool[
     themselves and as the same differences of the predicted states, so that no motion explains them.
 
     Args:
-        errors: measured minus predicted states of each window.
+        errors: measured minus predicted states of each window; NaN if not measured.
         windows: these windows.
     """
     if len(errors) < 1 or errors.shape[1] < ORDER:
         return np.zeros(len(errors), bool)
     with np.errstate(invalid="ignore", over="ignore"):
-        size = np.abs(errors).max(axis=1)
+        size = np.nan_to_num(np.abs(errors)).max(axis=1)
         start = np.asarray(windows.x0)[:, None]
         predicted = np.concatenate([start, np.asarray(windows.x) - errors], axis=1)
-        motion = np.abs(np.diff(predicted, ORDER, axis=1)).max(axis=1)
+        motion = np.nan_to_num(np.abs(np.diff(predicted, ORDER, axis=1))).max(axis=1)
         rough = np.abs(np.diff(np.pad(errors, ((0, 0), (1, 0), (0, 0))), ORDER, axis=1))
-        rounding = np.finfo(errors.dtype).eps * np.abs(np.asarray(windows.x)).max((0, 1))
-        usual = DEVIATION * np.median(rough, axis=(0, 1)) + rounding
-        rough = rough.max(axis=1)
+        rounding = np.finfo(errors.dtype).eps * np.abs(np.nan_to_num(windows.x)).max((0, 1))
+        known = (each[~np.isnan(each)] for each in rough.T)
+        usual = DEVIATION * np.array([np.median(each) if each.size else np.inf for each in known]) + rounding
+        rough = np.nan_to_num(rough).max(axis=1)
         return ((rough > FAR * usual) & (rough > ROUGH * size) & (rough > motion)).any(axis=1)

@@ -59,7 +59,7 @@ class Plausible:
         k = groups.count("disturbance")
         parts = k if k and windows.x0.shape[1] % k == 0 else 1  # of a grid a component is one part
         rates = (windows.x[:, -1] - windows.x0) / (windows.horizon * windows.dt)
-        rates = jnp.sqrt(jnp.mean(jnp.square(rates).reshape(len(rates), parts, -1), axis=(0, 2)))
+        rates = jnp.sqrt(jnp.nanmean(jnp.square(rates).reshape(len(rates), parts, -1), axis=(0, 2)))
         if "drag" in groups:
             sizes = jnp.asarray([getattr(self, group) for group in groups], theta.dtype)
         else:

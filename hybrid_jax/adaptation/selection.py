@@ -24,7 +24,7 @@ from hybrid_jax.estimation.normal_equations import (
 from hybrid_jax.estimation.starts import Starts, from_starts, smoothed
 from hybrid_jax.extrapolation import RANGE
 from hybrid_jax.integrate import compact, rollout
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, errors_of
 
 BLOCKS = 10
 CLUSTERS = 5  # of windows of one flight, for intervals: in gusts, errors a second apart are still correlated
@@ -102,7 +102,7 @@ def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, field, lear
     beyond = jnp.sum(jnp.square(own.equations.score) - own.noise * known, axis=0)
     apparent = jnp.maximum(beyond, 0.0) / jnp.maximum(jnp.sum(jnp.square(known), axis=0), TINY)
     unknown = jnp.square(outside * missed) * added
-    total = jnp.maximum(jnp.sum(own.equations.square) - own.noise * windows.x.size, 0.0)
+    total = jnp.maximum(jnp.sum(own.equations.square) - own.noise * jnp.sum(~jnp.isnan(learned_from.x)), 0.0)
     return Unchanged(
         apparent / places + unknown / jnp.maximum(jnp.sum(information, axis=0), TINY), total / places + unknown
     )
@@ -193,7 +193,7 @@ def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Traje
         parts: Any = (jnp.asarray(each)[:, :t] for each in (windows.x, 0 * windows.u))
         return space.features(*(each.reshape(-1, each.shape[-1]) for each in parts))
 
-    ends = {name: jnp.quantile(values, jnp.asarray(RANGE)) for name, values in features(known).items()}
+    ends = {name: jnp.nanquantile(values, jnp.asarray(RANGE)) for name, values in features(known).items()}
     outside = [(values < ends[name][0]) | (values > ends[name][1]) for name, values in features(asked).items()]
     return jnp.max(jnp.stack([jnp.mean(each) for each in outside]))
 
@@ -218,7 +218,10 @@ def left_out_steps(
 def errors_at_ends(
     field: AbstractVectorField, block: Trajectories, counted: Bool[Array, " m"], solver: Solver = None
 ) -> Float[Array, "2 d"]:
-    """Return the mean squared error of each state at the end of single windows and of joined windows."""
+    """Return the mean squared error of each state at the end of single windows and of joined windows.
+
+    It is NaN for a state that was not measured at any of these ends.
+    """
 
     def one(carry, item):
         end, recorded = carry
@@ -226,13 +229,14 @@ def errors_at_ends(
         touches = counted & jnp.all(window.x0 == recorded) & (i % JOINED > 0)
         begin = jnp.stack([window.x0, jnp.where(touches, end, window.x0)])
         alone, joined = jax.vmap(lambda x0: rollout(field, x0, window.u, block.dt, compact(solver))[-1])(begin)
-        return (joined, window.x[-1]), (jnp.square(jnp.stack([alone, joined]) - window.x[-1]), touches)
+        square = jnp.square(errors_of(jnp.stack([alone, joined]), window.x[-1]))
+        return (joined, window.x[-1]), (jnp.where(jnp.isnan(square), jnp.inf, square), touches)
 
     nowhere = jnp.full_like(block.x0[0], jnp.nan)  # touches nothing
     _, (ends, touches) = jax.lax.scan(one, (nowhere, nowhere), (block, counted, jnp.arange(len(counted))))
     last = counted & ~jnp.roll(touches, -1).at[-1].set(False)  # windows after which no other goes on
-    weights = jnp.stack([counted / jnp.sum(counted), last / jnp.sum(last)], axis=1)
-    return jnp.einsum("mh,mhd->hd", weights, ends)
+    weights = jnp.stack([counted, last], axis=1)[..., None] & ~jnp.isnan(block.x[:, -1:])
+    return jnp.sum(jnp.where(weights, ends, 0), axis=0) / jnp.sum(weights, axis=0)
 
 
 def correlated(windows: Trajectories) -> int:
@@ -250,7 +254,7 @@ def _follow(starts: Float[np.ndarray, "n d"], ends: Float[np.ndarray, "n d"]) ->
         return False
     starts, ends = (part[:, spread > 0] / spread[spread > 0] for part in (starts, ends))
     shifts = np.linspace(1, n - 1, SHIFTS + 1, dtype=int)
-    near, *others = (np.linalg.norm(np.roll(starts, -k, axis=0) - ends, axis=1) for k in shifts)
+    near, *others = (np.linalg.norm(np.nan_to_num(np.roll(starts, -k, axis=0) - ends), axis=1) for k in shifts)
     return bool(np.median(near) < np.median(others) / 2)
 
 

@@ -23,7 +23,7 @@ from hybrid_jax.dynamics.batching import (
     training_mode,
     with_moved_stats,
 )
-from hybrid_jax.state_space import StateSpace
+from hybrid_jax.state_space import StateSpace, last_measured
 from hybrid_jax.trajectories import Trajectories, check
 
 Learned = TypeVar("Learned")
@@ -117,21 +117,27 @@ def state_space(field: AbstractVectorField, d: int | None = None) -> StateSpace:
     return own if d is None else own.padded(d)
 
 
-def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> Trajectories:
-    """The checked windows, without jumps between representations of a state, in the parameters' precision if double."""
-    check(windows, name)
+def check_windows(
+    field: AbstractVectorField, windows: Trajectories, name: str = "windows", missing: bool = False
+) -> Trajectories:
+    """The checked windows, without jumps between representations of a state, in the parameters' precision if double.
+
+    If `missing`, x may contain NaN where a state was not measured.
+    """
+    check(windows, name, missing)
     space = state_space(field, windows.x0.shape[-1])
-    for part, states in (("x0", windows.x0), ("x", windows.x)):
+    known = windows.x if checks.is_traced(windows.x) else last_measured(windows.x0, windows.x)
+    for part, states in (("x0", windows.x0), ("x", known)):
         space.check(f"{name}: {part}", states)
-    _warn_of_turns(space, windows, name)
+    _warn_of_turns(space, windows.x0, known, name)
     return continuous(field, windows)
 
 
-def _warn_of_turns(space: StateSpace, windows: Trajectories, name: str) -> None:
+def _warn_of_turns(space: StateSpace, x0, x, name: str) -> None:
     """Warn of numbers that jump by 2π, as an angle does where it is wrapped, and otherwise change little."""
-    if checks.is_traced(windows.x0) or checks.is_traced(windows.x):
+    if checks.is_traced(x0) or checks.is_traced(x):
         return
-    path = np.concatenate([np.asarray(windows.x0)[:, None], windows.x], axis=1)
+    path = np.concatenate([np.asarray(x0)[:, None], x], axis=1)
     for part, one in space.parts:
         moved = np.abs(np.diff(path[..., part], axis=1)).max(axis=1, initial=0.0) if one.is_vector else np.zeros((1, 0))
         for i, each in enumerate(moved.T):

@@ -22,7 +22,7 @@ from hybrid_jax.estimation.levenberg_marquardt import State, begin, corrected, j
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.runtime import entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, errors_of
 
 MANY, CHUNK = 10_000, 1000  # windows: of more, a triangle takes the place of J and r, and is found by so many at a time
 LEAST = 0.1  # of what rounding does to the states: a step of which less is expected is the last
@@ -76,7 +76,7 @@ def fit_least_squares(
 
     Args:
         field: its θ_p is the start; a residual beside the physics does not change.
-        windows: of the system whose θ_p you want.
+        windows: of the system whose θ_p you want. NaN in x means not measured, and counts as no error.
         solver: integrates the field over each sample interval, by default one step of RK4.
         max_steps: the most evaluations of the residuals and their Jacobian.
         scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
@@ -85,7 +85,7 @@ def fit_least_squares(
         ValueError: physics without parameters, windows that are malformed or do not fit the field, or an implicit
             solver that finds no step.
     """
-    windows = check_windows(field, windows)
+    windows = check_windows(field, windows, missing=True)
     checks.count("max_steps", max_steps)
     keep_programs("fit_least_squares", windows.x.shape)
     with solver_errors(solver):
@@ -129,7 +129,7 @@ def _fit_and_compare(field: AbstractVectorField, windows: Trajectories, solver: 
 
     jacobian, change = jacobian.reshape(errors.size, -1), (jax.vmap(halved)(windows) - errors).ravel()
     moved = (windows.x - windows.x0[:, None]) / (1 if scale is None else scale)
-    noise = jnp.sqrt(jnp.mean(errors**2)) + FINE * jnp.sqrt(jnp.mean(moved**2))
+    noise = jnp.sqrt(jnp.sum(errors**2) / jnp.sum(~jnp.isnan(moved))) + FINE * jnp.sqrt(jnp.nanmean(moved**2))
     unit = _nonzero(jnp.linalg.norm(jacobian, axis=0))
     inverse = jnp.linalg.pinv((jacobian / unit).T @ (jacobian / unit), hermitian=True)
     steps = inverse @ ((jacobian / unit).T @ change) / _nonzero(jnp.sqrt(jnp.diagonal(inverse)))
@@ -160,7 +160,7 @@ def _triangle(errors: Callable[[Theta, Trajectories], Array], theta: Theta, wind
 
 def rounding(windows: Trajectories, scale: Scale) -> Float[Array, ""]:
     """Return the norm of rounding errors of all states: parameters with less effect cannot be fitted."""
-    x = windows.x if scale is None else windows.x / scale
+    x = jnp.nan_to_num(windows.x) / (1 if scale is None else scale)
     return jnp.finfo(x.dtype).eps * jnp.linalg.norm(x.ravel())
 
 
@@ -290,8 +290,8 @@ def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta
 def prediction_errors(
     field: AbstractVectorField, window: Trajectories, solver: Solver = None, scale: Scale = None
 ) -> Float[Array, "t d"]:
-    """Return (x_t − x̂_t) / scale of one window, with x̂ in inference mode."""
-    errors = jnp.asarray(window.x) - rollout(field, window.x0, window.u, window.dt, compact(solver))
+    """Return (x_t − x̂_t) / scale of one window, zero if not measured, with x̂ in inference mode."""
+    errors = -errors_of(rollout(field, window.x0, window.u, window.dt, compact(solver)), jnp.asarray(window.x))
     return errors if scale is None else (errors / scale).astype(errors.dtype)
 
 

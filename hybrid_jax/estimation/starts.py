@@ -87,15 +87,19 @@ def smoothed(
             return 2 * (rollout(fixed, window.x0 + unit * start, window.u, window.dt, compact(solver)),)
 
         effect, x = jax.jacfwd(predicted, has_aux=True)(jnp.zeros_like(window.x0))
-        effect = effect / unit[:, None] * counts[:, None] * counts
-        r = jnp.where(counts, (window.x - x) / unit, 0).astype(x.dtype)
+        seen = counts & ~jnp.isnan(window.x)
+        effect = effect / unit[:, None] * counts * seen[..., None]
+        r = jnp.where(seen, (window.x - x) / unit, 0).astype(x.dtype)
         rows = jnp.concatenate([jnp.eye(d, dtype=r.dtype)[None], effect])
         errors = jnp.concatenate([jnp.zeros_like(r[:1]), r])
-        return effect, r, _unexplained(rows, errors), jnp.sum(jnp.square(jnp.diff(errors, n=order, axis=0)))
+        gaps = jnp.diff(jnp.concatenate([jnp.zeros_like(r[:1]), 0 * window.x]), n=order, axis=0)  # NaN at a missing one
+        rough = jnp.where(jnp.isnan(gaps), 0, jnp.square(jnp.diff(errors, n=order, axis=0)))
+        return effect, r, _unexplained(rows, errors), jnp.sum(rough), jnp.sum(~jnp.isnan(gaps))
 
-    effect, r, left, noise = jax.lax.map(one, windows, batch_size=64)
-    noise = jnp.sum(noise) / (len(windows) * (t + 1 - order) * d * math.comb(2 * order, order))
-    left = jnp.sum(left) / (len(windows) * t * d)
+    effect, r, left, noise, successive = jax.lax.map(one, windows, batch_size=64)
+    successive, noise = jnp.sum(successive), jnp.sum(noise) / math.comb(2 * order, order)
+    left = jnp.sum(left) / jnp.sum(~jnp.isnan(windows.x))
+    noise = jnp.where(successive > 0, noise / jnp.maximum(successive, 1), left)  # not known apart
     trust = jnp.clip(left / jnp.maximum(noise, 1e-12), 1.0, 1e6)
 
     def start(each):

@@ -93,11 +93,13 @@ def covariance_of(
     Raises:
         ValueError: malformed windows, or no more than parameters; an unknown kind, or homoscedastic with an `error`.
     """
-    windows = least_squares.check_windows(field, windows)
+    windows = least_squares.check_windows(field, windows, missing=True)
+    measured = jnp.sum(~jnp.isnan(windows.x))
     fitted = ravel_parameters(field)[0].size if free is None else jnp.sum(free)
     if not checks.is_traced(fitted):
         # White noise makes each number of a window an observation; otherwise each window is one.
-        n = windows.x.size if kind == "homoscedastic" else len(windows)
+        numbers = windows.x.size if checks.is_traced(measured) else int(measured)
+        n = numbers if kind == "homoscedastic" else len(windows)
         check_determined(field, n, int(fitted))
     checks.count("chunk", chunk)
     checks.count("cluster", cluster)
@@ -109,18 +111,18 @@ def covariance_of(
     seen = has_effect(equations, windows, scale)
     equations = masked(equations, seen if free is None else free & seen)
     unknown = ~seen if free is None else free & ~seen
-    found = _covariance(equations, kind, windows.x[0].size, fitted, cluster)
+    found = _covariance(equations, kind, measured, fitted, cluster)
     return found + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
 
 
 @jit_by_size()
-def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Array, ""] | int, cluster: int):
+def _covariance(equations: NormalEquations, kind: Kind, measured, p: Int[Array, ""] | int, cluster: int):
     gram, score, square = equations
     n = len(score)
     bread = inverse(jnp.sum(gram, axis=0))
     told = bread.told
     if kind == "homoscedastic":
-        found = jnp.sum(square) / (n * entries - p) * bread.matrix
+        found = jnp.sum(square) / (measured - p) * bread.matrix
     elif cluster > 1:
         clusters, of = -(-n // cluster), np.arange(n) // cluster
         gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
@@ -260,7 +262,7 @@ def select_disturbance(
     own = parameters.size - disturbance_of(larger).value.size  # pyright: ignore[reportOptionalMemberAccess]
     none = eqx.tree_at(disturbance_of, larger, replace_fn=partial(jax.tree.map, jnp.zeros_like))
     # Both are fits of the larger field, so that one program serves them.
-    windows = least_squares.check_windows(field, windows)
+    windows = least_squares.check_windows(field, windows, missing=True)
     checks.count("max_steps", max_steps)
     every = np.ones(parameters.size, bool), np.arange(parameters.size) < own
     options = windows, solver, max_steps, scale

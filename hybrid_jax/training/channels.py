@@ -11,8 +11,9 @@ from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import CHUNK
+from hybrid_jax.state_space import last_measured
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.trajectories import Trajectories, check, errors_of
 
 FLOOR = 1e-3  # least scale of a state over its size: one that hardly changes must not outweigh the others
 
@@ -65,7 +66,7 @@ class ChannelLoss(TrajectoryLoss):
             checks.positive("huber", self.huber)
 
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
-        widest, size = max(channel.stop for channel in self.channels), check(windows, name).x.shape[-1]
+        widest, size = max(channel.stop for channel in self.channels), check(windows, name, missing=True).x.shape[-1]
         if size < widest:
             raise ValueError(f"{name}: states of at least {widest} numbers expected, got {size}")
         return windows
@@ -76,7 +77,7 @@ class ChannelLoss(TrajectoryLoss):
     def validate(self, field: AbstractVectorField, data: Trajectories, settings: Settings) -> Float[Array, ""]:
         def errors(windows: Trajectories) -> Float[Array, " n"]:
             predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, settings.solver)
-            return jnp.mean(self.error(predicted - jnp.asarray(windows.x)), axis=-1)
+            return jnp.mean(self.error(errors_of(predicted, jnp.asarray(windows.x))), axis=-1)
 
         return jnp.mean(in_chunks(errors, data, CHUNK))
 
@@ -101,7 +102,7 @@ class ChannelLoss(TrajectoryLoss):
 def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLoss:
     """A loss relative to the RMS change over a window of each quantity in the field's state space."""
     parts = [part for part, _ in state_space(field, windows.x0.shape[-1]).parts]
-    x0, end = np.asarray(windows.x0, float), np.asarray(windows.x[:, -1], float)
+    x0, end = np.asarray(windows.x0, float), last_measured(windows.x0, windows.x)[:, -1].astype(float)
 
     def rms(vectors: Float[np.ndarray, "n k"]) -> float:
         return float(np.sqrt(np.mean(np.sum(np.square(vectors), axis=-1))))

@@ -101,7 +101,7 @@ def fit(
 
     Args:
         field: the initial field, or another module that the objective of `settings` can evaluate.
-        train: training windows.
+        train: training windows. NaN in x means not measured, and counts as no error; x0 and u must be whole.
         validation: windows that determine the best epoch and early stopping; you should take other recordings.
         key: random key for shuffling minibatches.
         rates: learning rates of Adam, a tree prefix of the field: a number, by default 1e-2, or e.g.
@@ -146,7 +146,7 @@ def checked_arguments(
     settings = Settings() if settings is None else settings
     checks.instance("settings", settings, Settings)
     windows = {"train": train, "validation": validation}
-    windows = {n: check_windows(field, w, n) if isinstance(w, Trajectories) else w for n, w in windows.items()}
+    windows = {n: check_windows(field, w, n, True) if isinstance(w, Trajectories) else w for n, w in windows.items()}
     data, validated_on = (settings.objective.prepare(w, name) for name, w in windows.items())
     _check_field(field, windows, settings)
     checks.key("key", key)

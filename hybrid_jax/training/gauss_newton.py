@@ -23,7 +23,7 @@ from hybrid_jax.status import Status
 from hybrid_jax.training.driver import ready
 from hybrid_jax.training.loss import correlation_rows
 from hybrid_jax.training.sensitivities import with_sensitivities
-from hybrid_jax.trajectories import Trajectories, overflows
+from hybrid_jax.trajectories import Trajectories, errors_of, overflows
 
 MOST = 1000  # parameters: the cost of a step grows with their square
 FIRST = 1e-2  # μ at the start
@@ -106,7 +106,7 @@ def fit_gauss_newton(
             penalty, or one for a field that is not a `Hybrid`; a weight that is negative.
     """
     checks.not_traced("fit_gauss_newton", field, windows)
-    windows = check_windows(field, windows)
+    windows = check_windows(field, windows, missing=True)
     checked(field, windows.x0, windows.u, windows.dt, solver, windows=True)
     checks.not_negative("weight", weight)
     checks.count("max_steps", max_steps)
@@ -143,7 +143,7 @@ class _Problem(eqx.Module):
         return ravel_learned(self.source)[1](theta)
 
     def rows(self, candidate, predicted: Float[Array, "t d"], window: Trajectories) -> Float[Array, " r"]:
-        errors = predicted - window.x if self.scale is None else (predicted - window.x) / self.scale
+        errors = errors_of(predicted, window.x) / (1 if self.scale is None else self.scale)
         found = errors.ravel() / len(window.u) ** 0.5
         if self.penalty is not None:
             held = self.penalty(candidate, predicted, window, self.solver)

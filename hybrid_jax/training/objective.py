@@ -17,7 +17,7 @@ from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.rollouts import rollout_minibatch
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training.loss import Minibatch, Regulariser
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.trajectories import Trajectories, check, errors_of
 
 Learner = Any  # an Equinox module: a vector field, or anything that the objective can evaluate
 
@@ -84,7 +84,7 @@ class TrajectoryLoss(Objective):
     """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², mean over trajectories (paper, Sec. 3.3, Eq. 6), in training plus λ L_reg."""
 
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
-        return check(windows, name)
+        return check(windows, name, missing=True)
 
     def batch(self, picked: Trajectories, settings: "Settings") -> Minibatch:
         last = (jnp.moveaxis(a, 0, -1) for a in (picked.x0, picked.u, picked.x))
@@ -92,7 +92,7 @@ class TrajectoryLoss(Objective):
 
     def loss(self, field: AbstractVectorField, batch: Minibatch, settings: "Settings", weight: Float[Array, ""]):
         predicted = rollout_minibatch(field, batch.x0, batch.u, batch.dt, batch.solver)
-        value = self.mean_error(predicted - batch.x)
+        value = self.mean_error(errors_of(predicted, batch.x))
         if settings.regulariser is not None and isinstance(field, Hybrid):
             value = value + weight * settings.regulariser(field, batch, predicted)
         return value, predicted
@@ -101,7 +101,7 @@ class TrajectoryLoss(Objective):
         """The error of a minibatch.
 
         Args:
-            difference: predicted minus true states (t, d, b).
+            difference: predicted minus true states (t, d, b), zero if not measured.
         """
         return jnp.mean(jnp.mean(jnp.sum(jnp.square(difference), axis=1), axis=0))
 
