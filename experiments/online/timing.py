@@ -9,6 +9,7 @@ import numpy as np
 from experiments.flying.timing import on_one_core
 from experiments.online import agents
 from hybrid_jax.control import Hardware
+from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.vehicle import IRIS
 
 STEPS = 1000  # that are timed
@@ -25,7 +26,7 @@ def _step_time(hardware: Hardware, period: float) -> float:
     noise = 0.01 * jax.random.normal(jax.random.key(0), (STEPS, 13))
     u = jnp.full(IRIS.rotors, IRIS.hover_speed)
 
-    @jax.jit
+    @jit_with(FAST_COMPILE)
     def steps(state):
         return jax.lax.scan(lambda state, e: (adaptation.update(state, start + e, u), None), state, noise)[0]
 
