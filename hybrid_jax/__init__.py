@@ -10,16 +10,7 @@ files), `training` (`fit`), `adaptation` (`adapt`), `sweep` (many runs as one pr
 from commands and measurements).
 """
 
-from importlib.metadata import PackageNotFoundError, version
-
 import lazy_loader
 
 # Names are imported when they are first used (Scientific Python's SPEC 1). To import all takes longer than JAX itself.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-try:
-    __version__ = version("hybrid_jax")
-except PackageNotFoundError:  # a checkout that is not installed
-    __version__ = "0+unknown"
-
-__all__ += ["__version__"]

@@ -1,6 +1,7 @@
 """The names of `hybrid_jax` and where they are, for type checkers and for __init__.py."""
 
 from . import runtime
+from ._version import __version__
 from .adaptation import (
     METHODS,
     Adaptation,
@@ -50,8 +51,6 @@ from .records import Record
 from .training import Settings, Stage, fit, fit_gauss_newton, fit_in_stages, rates_by_group
 from .trajectories import Trajectories
 from .vehicle import IRIS, Vehicle, load_vehicle
-
-__version__: str
 
 __all__ = ["Trajectories", "__version__", "runtime"]
 __all__ += ["AbstractVectorField", "Frozen", "Hybrid", "with_disturbance"]

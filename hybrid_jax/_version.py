@@ -1,0 +1,8 @@
+"""The installed version; found when it is first asked for, as `importlib.metadata` loads longer than the package."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("hybrid_jax")
+except PackageNotFoundError:  # a checkout that is not installed
+    __version__ = "0+unknown"
