@@ -50,10 +50,16 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
         _move_aside(folder, say)
     known = path.exists()
     found = read_json(path) if known else {"state": None}
-    if known and not (isinstance(found, dict) and {"state", "started", *FIXED} <= found.keys()):
+    if known and not (isinstance(found, dict) and {"state", "started", *FIXED, *MACHINE} <= found.keys()):
         raise ValueError(f"{path}: not the record of a run; --restart starts anew and moves it aside")
     if found["state"] == "unfinished":
-        require_same(f"{folder}: holds an unfinished run, begun {found['started']}", found, record)
+        begun = f"{folder}: holds an unfinished run, begun {found['started']}"
+        if (kernels_then := found["machine"]["kernels"]) != "used":  # nor are they now, whatever the reason
+            kernels.switch_off()
+            record["machine"]["kernels"] = kernels_then
+        require_same(begun, found, record)
+        if kernels_then != record["machine"]["kernels"]:  # rows of one run have the same rounding
+            raise OtherRun(f"{begun} with kernels, which are now {record['machine']['kernels']}\n{HINT}")
         say(f"{folder}: goes on with the run begun {found['started']}")
         for line in _differences(found, record, MACHINE):
             say(f"{line.strip()}: rows differ, if little, from those of a run on one machine")

@@ -1,15 +1,20 @@
-"""C++ kernels for rollouts of many windows in single precision with AVX2; otherwise JAX gives the same to rounding.
+"""C++ kernels for rollouts of many windows in single precision with AVX2; otherwise JAX gives the same to rounding."""
 
-You should resume a run with the same kernels that it began with.
-"""
+import os
 
 from hybrid_jax.kernels.fields import REFUSED
-from hybrid_jax.kernels.library import obstacle
+from hybrid_jax.kernels.library import SWITCH, obstacle
 from hybrid_jax.kernels.rollout import predicted as predicted
 from hybrid_jax.kernels.rollout import serves_training as serves_training
 from hybrid_jax.kernels.rollout import trained as trained
 
 __all__ = ["status"]  # the rest is for the library's own modules
+
+
+def switch_off() -> None:
+    """Do not use kernels in what this process and those that it starts will compile, as HYBRID_JAX_NATIVE=0."""
+    os.environ[SWITCH] = "0"
+    obstacle.cache_clear()
 
 
 def status() -> str:

@@ -7,7 +7,9 @@ import pytest
 
 from experiments.paper.config import SMOKE
 from experiments.runner.run_record import FILE, OtherRun, recorded
+from hybrid_jax import kernels
 from hybrid_jax.cli.command import ChecksFailed
+from hybrid_jax.kernels.library import SWITCH, obstacle
 
 
 def record(folder):
@@ -99,16 +101,31 @@ def test_what_is_no_record_is_refused_in_a_line_and_kept(tmp_path, text):
     assert (tmp_path / FILE).read_text() == text
 
 
-def test_a_run_that_goes_on_with_other_cores_or_kernels_says_so(tmp_path, monkeypatch):
+def test_a_run_that_goes_on_with_other_cores_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr("experiments.runner.run_record.cores", lambda: 2)
     interrupt(tmp_path, SMOKE)
     began, said = record(tmp_path)["machine"], []
     monkeypatch.setattr("experiments.runner.run_record.cores", lambda: 1)
-    monkeypatch.setattr("hybrid_jax.kernels.status", lambda: "not used: no compiler\nmore")
     finish(tmp_path, SMOKE, said.append)
-    about = "rows differ, if little, from those of a run on one machine"
-    assert said[1:] == [
-        f"machine.cores: 2 → 1: {about}",
-        f"machine.kernels: {began['kernels']} → not used: no compiler: {about}",
-    ]
+    assert said[1:] == ["machine.cores: 2 → 1: rows differ, if little, from those of a run on one machine"]
     assert record(tmp_path)["machine"] == began
+
+
+def test_a_run_goes_on_with_jax_if_it_began_so_and_needs_the_kernels_it_began_with(tmp_path, monkeypatch):
+    monkeypatch.setenv(SWITCH, "0")
+    kernels.switch_off()
+    interrupt(tmp_path, SMOKE)
+    began, said = record(tmp_path), []
+    monkeypatch.delenv(SWITCH)
+    obstacle.cache_clear()
+    interrupt(tmp_path, SMOKE)
+    assert kernels.status() == began["machine"]["kernels"] == f"not used: {SWITCH} is 0"
+    finish(tmp_path, SMOKE, said.append)
+    assert (said[1:], record(tmp_path)["machine"]) == ([], began["machine"])
+    monkeypatch.setattr("hybrid_jax.kernels.status", lambda: "used\nnot for Own: why")
+    interrupt(tmp_path, SMOKE)
+    monkeypatch.setattr("hybrid_jax.kernels.status", lambda: "not used: there is no g++")
+    with pytest.raises(OtherRun, match=r"with kernels, which are now not used: there is no g\+\+\n  --restart"):
+        finish(tmp_path, SMOKE)
+    assert record(tmp_path)["state"] == "unfinished"
+    obstacle.cache_clear()
