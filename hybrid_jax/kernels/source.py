@@ -93,8 +93,8 @@ class SamplePrinter(CPrinter):
 
 
 GIVEN = "const float *__restrict w, const Vec *__restrict x, const Vec *__restrict u, "
-SLOPE, READ = "const Vec *__restrict n, Vec *out", "Vec *out"
-SLOPE_BACK = "const Vec *__restrict n, const Vec *__restrict d_slope, Vec *dx, Vec *du, Vec *dn, Sums s, Vec *f"
+SLOPE, READ = "const Normal n, Vec *out", "Vec *out"
+SLOPE_BACK = "const Normal n, const Vec *__restrict d_slope, Vec *dx, Vec *du, Vec *dn, Sums s, Vec *f"
 READ_BACK = "const Vec *d_read, Vec *dx, Vec *du, Sums s"
 Outputs = list[tuple[str, int]]  # arrays, and where in them the results begin
 

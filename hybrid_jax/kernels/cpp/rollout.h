@@ -17,7 +17,7 @@
 namespace {
 
 constexpr int STAGES = 4;
-constexpr int UNITS = 8;  // of the layer at a time
+constexpr int UNITS = 16;  // of the layer at a time
 constexpr int64_t SLOTS = 28;  // of factors, which wait for their products: those of a step of a hundred windows
 constexpr int64_t U = H ? H | 1 : 0;  // vectors from one n to the next: an even number may put all into the same lines of the cache
 
@@ -95,7 +95,7 @@ struct Lane {
 struct Coupling {
   const Lane& lane;
   const int64_t blocks = lane.group;
-  Vec *zs = lane.room(STAGES * blocks * Z), *dns = lane.room(STAGES * blocks * U), *dz = lane.room(blocks * Z), *n = lane.room(U);
+  Vec *zs = lane.room(STAGES * blocks * Z), *dns = lane.room(STAGES * blocks * U), *dz = lane.room(blocks * Z), *by_scale = lane.room(U);
   float *scale = reinterpret_cast<float*>(lane.room(U)), *through_q = reinterpret_cast<float*>(lane.room(U));
 
   void centre(Vec* z) const {
@@ -117,40 +117,32 @@ struct Coupling {
     if (!known) in_tiles<H, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
       Vec squares[R] = {};
-      by_blocks(blocks, [&](auto count, int64_t j) __attribute__((always_inline)) {
-        constexpr int B = decltype(count)::value;
-        dense<R, Z, B>(lane.w + WEIGHT + i * Z, Z, 1, z + j * Z, h + j * U + i, Z, U);
-        UNROLL for (int b = 0; b < B; ++b)
-          UNROLL for (int r = 0; r < R; ++r) squares[r] += h[(j + b) * U + i + r] * h[(j + b) * U + i + r];
-      });
+      for (int64_t j = 0; j < blocks; ++j) {
+        Vec* block = h + j * U + i;
+        dense<R, Z>(lane.w + WEIGHT + i * Z, Z, 1, z + j * Z, block);
+        UNROLL for (int r = 0; r < R; ++r) squares[r] += block[r] * block[r];
+      }
       UNROLL for (int r = 0; r < R; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(lane.b) + lane.epsilon);
     });
     for (int i = 0; i < H; ++i) scale[i] = lane.w[GAIN + i] * q[i];
   }
-  void normalise(const Vec* h) const {
-    const float *factor = scale, *shift = lane.w + SHIFT;
-    UNROLL for (int i = 0; i < H; ++i) n[i] = factor[i] * h[i] + shift[i];
+  Normal normal(const Vec* h) const { return {scale, lane.w + SHIFT, h}; }
+  // Adds dn of a vector of windows, and dn h, while these are at hand.
+  void collect(const Vec* dn, const Vec* h, Vec* sums) const {
+    for (int i = 0; i < H; ++i) by_scale[i] += dn[i] * h[i], sums[SHIFT + i] += dn[i];
   }
-  // From dn to the derivatives with respect to h, in its place, and z; adds those with respect to γ and β.
+  // From dn to the derivatives with respect to h, in its place, and z; adds those with respect to γ.
   void back(Vec* dn, const Vec* h, const float* q, Vec* sums) const {
-    in_tiles<H, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
-      constexpr int R = decltype(rows)::value;
-      Vec by_scale[R] = {}, by_shift[R] = {};
-      for (int64_t j = 0; j < blocks; ++j)
-        UNROLL for (int r = 0; r < R; ++r) by_scale[r] += dn[j * U + i + r] * h[j * U + i + r], by_shift[r] += dn[j * U + i + r];
-      UNROLL for (int r = 0; r < R; ++r) {
-        sums[GAIN + i + r] += q[i + r] * by_scale[r], sums[SHIFT + i + r] += by_shift[r];
-        through_q[i + r] = -scale[i + r] * q[i + r] * q[i + r] * sum(by_scale[r]) / float(lane.b);
-      }
-    });
-    by_blocks(blocks, [&](auto count, int64_t j) __attribute__((always_inline)) {
-      constexpr int B = decltype(count)::value;
+    for (int i = 0; i < H; ++i) {
+      sums[GAIN + i] += q[i] * by_scale[i];
+      through_q[i] = -scale[i] * q[i] * q[i] * sum(by_scale[i]) / float(lane.b);
+      by_scale[i] = Vec{};
+    }
+    for (int64_t j = 0; j < blocks; ++j, dn += U, h += U) {
       const float *factor = scale, *through = through_q;
-      Vec* d = dn + j * U;
-      for (int i = 0; i < H; ++i)
-        UNROLL for (int b = 0; b < B * U; b += U) d[b + i] = factor[i] * d[b + i] + through[i] * h[j * U + b + i];
-      dense<Z, H, B>(lane.w + WEIGHT, 1, Z, d, dz + j * Z, U, Z);
-    });
+      for (int i = 0; i < H; ++i) dn[i] = factor[i] * dn[i] + through[i] * h[i];
+      dense<Z, H>(lane.w + WEIGHT, 1, Z, dn, dz + j * Z);
+    }
     centre(dz);
   }
 };
@@ -170,10 +162,8 @@ void forward_lane(const Call& call) {
         Vec *point = lane.kept ? lane.point(first, t, stage) : passing, *h = lane.h(point);
         for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + lane.ahead[stage - 1] * slopes[i] : x[i];
         if (H) coupling.evaluate(0, point, u, h, lane.q(point), false);
-        for (int64_t j = 0; j < group; ++j) {
-          coupling.normalise(h + j * U);
-          slope(lane.w, point + j * D, u + j * M, coupling.n, slopes + j * D);
-        }
+        for (int64_t j = 0; j < group; ++j)
+          slope(lane.w, point + j * D, u + j * M, coupling.normal(h + j * U), slopes + j * D);
         for (int64_t i = 0; i < n; ++i) total[i] = (stage ? total[i] : x[i]) + lane.share[stage] * slopes[i];
       }
       std::swap(x, total);
@@ -195,7 +185,7 @@ void backward_lane(const Call& call) {
   Vec *sums = lane.room(P), *factors = lane.room(F * SLOTS);
   int64_t used = 0;
   const Coupling c{lane};
-  std::fill_n(sums, P, Vec{});
+  std::fill_n(sums, P, Vec{}), std::fill_n(c.by_scale, H, Vec{});
   for (int64_t first = 0; first < lane.blocks; first += group) {
     std::fill_n(dx, n, Vec{});
     for (int64_t t = lane.steps; t--;) {
@@ -211,8 +201,8 @@ void backward_lane(const Call& call) {
         Vec* dn = c.dns + stage * group * U;
         for (int64_t j = 0; j < group; ++j) {
           if (used == SLOTS) products(sums, factors, used), used = 0;
-          c.normalise(h + j * U);
-          slope_back(back, point + j * D, u + j * M, c.n, d_slope + j * D, d_point + j * D, more_u, dn + j * U, {sums}, factors + F * used++);
+          slope_back(back, point + j * D, u + j * M, c.normal(h + j * U), d_slope + j * D, d_point + j * D, more_u, dn + j * U, {sums}, factors + F * used++);
+          c.collect(dn + j * U, h + j * U, sums);
           for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
         }
         if (H) c.back(dn, h, lane.q(point), sums);

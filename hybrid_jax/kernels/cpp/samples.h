@@ -62,9 +62,17 @@ template <class A, class B> INLINE Vec fmodf(A a, B b) {
   return l;
 }
 
+// The result of batch normalisation, γ q h + β.
+struct Normal {
+  const float *scale, *shift;
+  const Vec* h;
+  INLINE Vec operator[](int64_t i) const { return scale[i] * h[i] + shift[i]; }
+  INLINE Normal operator+(int64_t i) const { return {scale + i, shift + i, h + i}; }
+};
+
 // out = A B, of m x k and k x n.
 template <class A, class B>
-INLINE void product(const A* a, const B* b, Vec* out, int m, int k, int n) {
+INLINE void product(A a, B b, Vec* out, int m, int k, int n) {
   for (int j = 0; j < n; ++j)
     for (int i = 0; i < m; ++i) {
       Vec sum{};

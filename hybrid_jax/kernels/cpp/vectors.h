@@ -13,12 +13,12 @@
 
 namespace {
 
-// V numbers in a vector. What registers hold: rows of a product of one vector; of BLOCKS at a time, which share the
-// weights that are read; and rows and columns of a sum of products.
+// V numbers in a vector. What registers hold: rows of a product with a vector; and rows and columns of
+// a sum of products.
 #if defined(__AVX512F__)
-constexpr int V = 16, DENSE = 16, BLOCKS = 3, SHARED = 9, ROWS = 4, COLUMNS = 6;
+constexpr int V = 16, DENSE = 16, ROWS = 4, COLUMNS = 6;
 #else
-constexpr int V = 8, DENSE = 8, BLOCKS = 2, SHARED = 5, ROWS = 3, COLUMNS = 3;
+constexpr int V = 8, DENSE = 8, ROWS = 3, COLUMNS = 3;
 #endif
 
 #define INLINE inline __attribute__((always_inline))
@@ -59,26 +59,17 @@ INLINE void in_tiles(Do of) {
     for (; i < M; i += R - 1) of(std::integral_constant<int, R - 1>{}, i);
 }
 
-// out = W v of M rows and K columns, with W[i, k] at w[i row + k step], for B blocks of vectors: the next v and out lie so
-// many vectors behind the last.
-template <int M, int K, int B = 1, class W, class X>
-INLINE void dense(const W* w, int64_t row, int64_t step, const X* v, Vec* out, int64_t next_v = 0, int64_t next_out = 0) {
-  in_tiles<M, B == 1 ? DENSE : SHARED>([&](auto rows, int i) __attribute__((always_inline)) {
+// out = W v of M rows and K columns, with W[i, k] at w[i row + k step].
+template <int M, int K, class W, class X>
+INLINE void dense(const W* w, int64_t row, int64_t step, X v, Vec* out) {
+  in_tiles<M, DENSE>([&](auto rows, int i) __attribute__((always_inline)) {
     constexpr int R = decltype(rows)::value;
-    Vec sum[B][R] = {};
+    Vec sum[R] = {};
     const W* at = w + i * row;
     _Pragma("GCC unroll 4") for (int k = 0; k < K; ++k, at += step)
-      UNROLL for (int r = 0; r < R; ++r) UNROLL for (int b = 0; b < B; ++b) sum[b][r] += at[r * row] * v[b * next_v + k];
-    UNROLL for (int b = 0; b < B; ++b) UNROLL for (int r = 0; r < R; ++r) out[b * next_out + i + r] = sum[b][r];
+      UNROLL for (int r = 0; r < R; ++r) sum[r] += at[r * row] * v[k];
+    UNROLL for (int r = 0; r < R; ++r) out[i + r] = sum[r];
   });
-}
-
-// Blocks from 0 on, BLOCKS at a time, and the last ones alone.
-template <class Do>
-INLINE void by_blocks(int64_t blocks, Do of) {
-  int64_t j = 0;
-  for (; j + BLOCKS <= blocks; j += BLOCKS) of(std::integral_constant<int, BLOCKS>{}, j);
-  for (; j < blocks; ++j) of(std::integral_constant<int, 1>{}, j);
 }
 
 // sums (M, N) += Σ a bᵀ over slots: the next a and b lie so many vectors behind the last.
