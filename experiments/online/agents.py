@@ -62,7 +62,6 @@ PARTS = len(NAMES)
 PRIOR = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3, "centre_of_mass": 0.05, "efficiency": 0.2, "added_drag": 0.3}
 DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)  # m/s², rad/s²
 PROCESS = (0.0,) * 7 + (0.003,) * 3 + (0.005,) * 3  # m/s² and rad/s² of a white noise, √s
-INITIAL = 1.0  # nothing but the prior is known at the start
 INERTIA = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3}
 # One e-fold of mass, which the model does not have, is one less of all accelerations.
 MASS = {"efficiency": -1.0, "Ix": -1.0, "Iy": -1.0, "Iz": -1.0, "added_drag": -DRAG_COEFFICIENT / IRIS.mass}
@@ -175,7 +174,6 @@ def online(hardware: Hardware, period: float) -> OnlineAdaptation:
         PRIOR,
         DISTURBANCE,
         process=PROCESS,
-        initial=INITIAL,
         hypotheses=HYPOTHESES,
     )
 

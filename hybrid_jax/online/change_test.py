@@ -18,17 +18,11 @@ NOTHING = 1e-10  # variance of a sum of corrections that are only rounding
 
 
 class ChangeTest(eqx.Module):
-    """Test statistics for p parameters, over two time constants.
+    """Test statistics for p parameters, over two time constants."""
 
-    Attributes:
-        pull: weighted sums of the corrections of θ.
-        spread: variances of these sums without a change.
-        quiet: time since the last alarm at a pace of 1 [s].
-    """
-
-    pull: Float[Array, "*n 2 p"]
-    spread: Float[Array, "*n 2 p"]
-    quiet: Float[Array, "*n"]
+    pull: Float[Array, "*n 2 p"]  # weighted sums of the corrections of θ
+    spread: Float[Array, "*n 2 p"]  # variances of these sums without a change
+    quiet: Float[Array, "*n"]  # time since the last alarm at a pace of 1 [s]
 
     @classmethod
     def begin(cls, p: int, dtype) -> "ChangeTest":

@@ -63,7 +63,6 @@ class OnlineAdaptation(AbstractEstimator):
         disturbance: standard deviation of the constant part of ẋ at each disturbed state; 0 for none.
         indices: indices of the disturbed states, by default the field's or its state space's.
         process: standard deviation of the white process noise of each state [1/√s].
-        initial: initial uncertainty as a share of the prior, before a change.
         hypotheses: mutually exclusive changes of a few parameters, weighted by how well they explain the samples. The
             model stays the field's own until a change is detected.
         tuning: settings of forgetting and change detection.
@@ -80,7 +79,6 @@ class OnlineAdaptation(AbstractEstimator):
     process: tuple[float, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     scales: tuple[float, ...] = eqx.field(static=True)
-    initial: float = eqx.field(static=True)
     hypotheses: tuple[Subspace, ...] = eqx.field(static=True)
     tuning: Tuning = eqx.field(static=True)
 
@@ -93,7 +91,6 @@ class OnlineAdaptation(AbstractEstimator):
         disturbance: Numbers = 0.0,
         indices: tuple[int, ...] | None = None,
         process: Numbers = 0.0,
-        initial: float = 1.0,
         hypotheses: tuple[Hypothesis, ...] = (),
         tuning: Tuning | None = None,
     ):
@@ -101,8 +98,6 @@ class OnlineAdaptation(AbstractEstimator):
         for name, numbers, check in (("noise", noise, checks.positive), ("process", process, checks.not_negative)):
             for number in np.ravel(numbers):
                 check(name, number)
-        if not 0 < (checks.real(initial) or 0) <= 1:
-            raise ValueError(f"initial must be a share above 0 and at most 1, got {checks.short_repr(initial)}")
         check_callable(field)
         tuning = Tuning() if tuning is None else tuning
         checks.instance("tuning", tuning, Tuning)
@@ -113,7 +108,7 @@ class OnlineAdaptation(AbstractEstimator):
             if indices is None and not known:
                 raise ValueError("indices must say which states are disturbed, as the field's state space does not")
             field = with_disturbance(field, indices)
-        self.field, self.dt, self.initial = field, float(dt), float(initial)
+        self.field, self.dt = field, float(dt)
         self.noise, self.process = (tuple(np.ravel(numbers).tolist()) for numbers in (noise, process))
         self.names, self.scales = named_priors(field, prior, disturbance)
         given = checks.list_of("hypotheses", hypotheses, Hypothesis)
@@ -131,14 +126,14 @@ class OnlineAdaptation(AbstractEstimator):
         if indices is not None:
             checks.places("indices", indices, len(x))
         p, none = ravel_parameters(self.field)[0].size, jnp.zeros_like(x)
-        zero, theta, start = jnp.zeros((), x.dtype), jnp.zeros(p, x.dtype), jnp.full(p, self.initial**2, x.dtype)
+        zero, theta = jnp.zeros((), x.dtype), jnp.zeros(p, x.dtype)
         variances, mixture = self._variances(x), None
         if self.hypotheses:
             mixture = multiple_model.initial(self._models(), x, variances)
         return OnlineState(
             x=x,
             theta=theta,
-            root=kalman.diagonal_root(variances, start),
+            root=kalman.diagonal_root(variances, theta + 1),
             excitation=Excitation.begin(len(x), p, x.dtype),
             test=ChangeTest.begin(p, x.dtype),
             mixture=mixture,

@@ -25,15 +25,13 @@ TAKES_PART = 0.1  # share above which a parameter is part of a direction that is
 
 
 class Excitation(eqx.Module):
-    """Information of recent samples about p parameters.
+    """Information of recent samples about p parameters, each over its share.
 
-    Attributes:
-        sensitivity: sensitivity of the error of the estimated x to the error of θ.
-        root: a square root of the matrix with 1 / (1 + I / `Tuning.excitation`) instead of each eigenvalue I of the
-            information of a sample; each parameter over its share.
+    `root` is a square root of the matrix with 1 / (1 + I / `Tuning.excitation`) instead of each eigenvalue I of the
+    information of a sample.
     """
 
-    sensitivity: Float[Array, "*n d p"]
+    sensitivity: Float[Array, "*n d p"]  # of the error of the estimated x to the error of θ
     root: Float[Array, "*n p p"]
 
     @classmethod

@@ -50,39 +50,23 @@ class Hypothesis:
 
 
 class Subspace(NamedTuple):
-    """A hypothesis of numbers a with θ = S a, in prior standard deviations of p parameters.
+    """A hypothesis of numbers a with θ = S a, in prior standard deviations of p parameters."""
 
-    Attributes:
-        effects: the k rows of Sᵀ.
-        own: whether each parameter has its own number.
-        rates: standard deviation of each number's rate over the number's [1/s]; 0 for none.
-        lead: how far ahead the model is extrapolated [s].
-    """
-
-    effects: tuple[tuple[float, ...], ...]
-    own: tuple[bool, ...]
-    rates: tuple[float, ...]
-    lead: float
+    effects: tuple[tuple[float, ...], ...]  # the k rows of Sᵀ
+    own: tuple[bool, ...]  # whether each parameter has its own number
+    rates: tuple[float, ...]  # standard deviation of each number's rate over the number's [1/s]; 0 for none
+    lead: float  # how far ahead the model is extrapolated [s]
 
 
 class ModelSet(NamedTuple):
-    """h hypotheses with equally many numbers each: first the field's own parameters, then the user's hypotheses.
+    """h hypotheses with equally many numbers each: first the field's own parameters, then the user's hypotheses."""
 
-    Attributes:
-        effects: S.
-        ahead: S of the extrapolated model, including rates.
-        transition: state transition of the numbers over one period.
-        prior: variances after a change; 0 for padding.
-        diffusion: variance of rates [1/s].
-        outside: 1 for parameters without their own number, else 0.
-    """
-
-    effects: Float[np.ndarray, "h p k"]
-    ahead: Float[np.ndarray, "h p k"]
-    transition: Float[np.ndarray, "h k k"]
-    prior: Float[np.ndarray, "h k"]
-    diffusion: Float[np.ndarray, "h k"]
-    outside: Float[np.ndarray, "h p"]
+    effects: Float[np.ndarray, "h p k"]  # S
+    ahead: Float[np.ndarray, "h p k"]  # S of the extrapolated model, including rates
+    transition: Float[np.ndarray, "h k k"]  # of the numbers over one period
+    prior: Float[np.ndarray, "h k"]  # variances after a change; 0 for padding
+    diffusion: Float[np.ndarray, "h k"]  # variance of rates [1/s]
+    outside: Float[np.ndarray, "h p"]  # 1 for parameters without their own number, else 0
 
 
 def subspace_of(hypothesis: Hypothesis, names: tuple[str, ...], scales: tuple[float, ...]) -> Subspace:

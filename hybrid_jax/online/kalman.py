@@ -21,15 +21,10 @@ Field = Callable[[Array, Array], Array]  # ẋ as a function of x and a
 
 
 class Belief(NamedTuple):
-    """Mean of z and a square root of its covariance, which therefore stays positive semidefinite.
-
-    Attributes:
-        z: the mean.
-        root: S of the covariance S Sᵀ; after `triangular` the rows of a are zero after the first k columns.
-    """
+    """Mean of z and a square root of its covariance, which therefore stays positive semidefinite."""
 
     z: Float[Array, " n"]
-    root: Float[Array, "n m"]
+    root: Float[Array, "n m"]  # after `triangular` the rows of a are zero after the first k columns
 
     @property
     def covariance(self) -> Float[Array, "n n"]:
@@ -37,23 +32,13 @@ class Belief(NamedTuple):
 
 
 class FilterModel(NamedTuple):
-    """The model and settings that all filters share in a period.
+    """The model and settings that all filters share in a period."""
 
-    Attributes:
-        field: ẋ as a function of x and θ, under the input of the period.
-        unit: normalises x, for example its quaternion; see `StateSpace.normalise`.
-        variances: measurement variances.
-        process_noise: process noise variance of x per period.
-        dt: length of a period [s].
-        tuning: settings of the filters.
-        each: maps a function over several filters.
-    """
-
-    field: Field
-    unit: Callable[[Array], Array]
-    variances: Float[Array, " d"]
-    process_noise: Float[Array, " d"]
-    dt: float
+    field: Field  # ẋ as a function of x and θ, under the input of the period
+    unit: Callable[[Array], Array]  # normalises x, for example its quaternion; see `StateSpace.normalise`
+    variances: Float[Array, " d"]  # of the measurements
+    process_noise: Float[Array, " d"]  # variance of x per period
+    dt: float  # length of a period [s]
     tuning: Tuning
     each: Each
 
@@ -64,19 +49,12 @@ class FilterModel(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """The correction of the filter by a sample.
+    """The correction of the filter by a sample."""
 
-    Attributes:
-        white: innovations over their standard deviations.
-        sizes: standard deviations of the innovations.
-        gains: gains of z for the whitened innovations.
-        log_likelihood: log-likelihood of the sample up to a constant.
-    """
-
-    white: Float[Array, " d"]
-    sizes: Float[Array, " d"]
-    gains: Float[Array, "d n"]
-    log_likelihood: Float[Array, ""]
+    white: Float[Array, " d"]  # innovations over their standard deviations
+    sizes: Float[Array, " d"]  # standard deviations of the innovations
+    gains: Float[Array, "d n"]  # of z for the whitened innovations
+    log_likelihood: Float[Array, ""]  # of the sample up to a constant
 
 
 def step_with_jacobian(

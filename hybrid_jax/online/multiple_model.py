@@ -32,39 +32,23 @@ LEAST = 1e-3  # weight, relative to the largest, up to which one is left out of 
 
 
 class Mixture(eqx.Module):
-    """Filters of h hypotheses with equally many numbers, and h + 1 weights; θ in prior standard deviations.
+    """Filters of h hypotheses with equally many numbers, and h + 1 weights; θ in prior standard deviations."""
 
-    Attributes:
-        z: x and the numbers that move θ, for each hypothesis.
-        root: a square root of the covariance of each z.
-        previous: 1 for the hypothesis that the first one was before the last alarm, else 0.
-        log_weights: logarithms of the weights, the largest 0; the last belongs to the filter of all parameters.
-        test: the change test of the estimate.
-    """
-
-    z: Float[Array, "*n h d+k"]
-    root: Float[Array, "*n h d+k d+k"]
-    previous: Float[Array, "*n h-1"]
-    log_weights: Float[Array, "*n h+1"]
-    test: ChangeTest
+    z: Float[Array, "*n h d+k"]  # x and the numbers that move θ, for each hypothesis
+    root: Float[Array, "*n h d+k d+k"]  # a square root of the covariance of each z
+    previous: Float[Array, "*n h-1"]  # 1 for the hypothesis that the first one was before the last alarm, else 0
+    log_weights: Float[Array, "*n h+1"]  # the largest 0; the last belongs to the filter of all parameters
+    test: ChangeTest  # of the estimate
 
 
 class Verdict(NamedTuple):
-    """The result of all hypotheses after a sample.
+    """The result of all hypotheses after a sample."""
 
-    Attributes:
-        mixture: their filters and weights; None without hypotheses.
-        theta: the mean of the mixture.
-        squares: mean square of the mixture's white innovations.
-        changed: whether θ has changed.
-        unexplained: θ has changed but no hypothesis explains it, so the filter of all parameters is reset.
-    """
-
-    mixture: Mixture | None
-    theta: Float[Array, " p"]
-    squares: Float[Array, " d"]
-    changed: Bool[Array, ""]
-    unexplained: Bool[Array, ""]
+    mixture: Mixture | None  # None without hypotheses
+    theta: Float[Array, " p"]  # the mean of the mixture
+    squares: Float[Array, " d"]  # mean square of the mixture's white innovations
+    changed: Bool[Array, ""]  # whether θ has changed
+    unexplained: Bool[Array, ""]  # θ has changed but no hypothesis explains it, so the filter of all is reset
 
 
 def initial(models: ModelSet, x: Float[Array, " d"], variances: Float[Array, " d"]) -> Mixture:

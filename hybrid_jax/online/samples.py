@@ -9,23 +9,14 @@ HUGE = 1e15  # a number beyond it, or NaN, was not measured
 
 
 class Sample(NamedTuple):
-    """A measurement at the end of a period and the input over the period.
-
-    Attributes:
-        x: the sample.
-        u: the input; zero where it is unknown.
-        seen: whether each number was measured.
-        acted: whether exactly one period has passed with a known input.
-        restart: whether the state is reset to the sample.
-        elapsed: periods since the last sample.
-    """
+    """A measurement at the end of a period and the input over the period."""
 
     x: Float[Array, " d"]
-    u: Float[Array, " m"]
-    seen: Bool[Array, " d"]
-    acted: Bool[Array, ""]
-    restart: Bool[Array, ""]
-    elapsed: Float[Array, ""]
+    u: Float[Array, " m"]  # zero where it is unknown
+    seen: Bool[Array, " d"]  # whether each number was measured
+    acted: Bool[Array, ""]  # whether exactly one period has passed with a known input
+    restart: Bool[Array, ""]  # whether the state is reset to the sample
+    elapsed: Float[Array, ""]  # periods since the last sample
 
     @property
     def used(self) -> Bool[Array, " d"]:
@@ -39,19 +30,12 @@ class Sample(NamedTuple):
 
 
 class SampleHistory(NamedTuple):
-    """Statistics of the past samples.
+    """Statistics of the past samples."""
 
-    Attributes:
-        last: the last measured value of each number.
-        equal: number of equal samples in a row.
-        silent: time since the last measurement [s].
-        unseen: 1 where the last sample was not used, else 0.
-    """
-
-    last: Float[Array, "*n d"]
-    equal: Float[Array, "*n d"]
-    silent: Float[Array, "*n"]
-    unseen: Float[Array, "*n d"]
+    last: Float[Array, "*n d"]  # measured values
+    equal: Float[Array, "*n d"]  # number of equal samples in a row
+    silent: Float[Array, "*n"]  # time since the last measurement [s]
+    unseen: Float[Array, "*n d"]  # 1 where the last sample was not used, else 0
 
 
 def classify(x, u, elapsed, history: SampleHistory, dt: float, gap: float) -> tuple[Sample, SampleHistory]:

@@ -23,17 +23,8 @@ pytestmark = needs_compiler
 DT = 0.01
 # θ, the last good θ and the sums of corrections are in standard deviations of the prior. An innovation is a difference
 # of two nearly equal numbers: a last digit of 2 m is 1e-4 of a noise of 1 mm, so θ near zero has few right digits.
-UNITS = {
-    "theta": 1.0,
-    "trusted": 1.0,
-    "settled": 1.0,
-    "pull": 1.0,
-    "spread": 1e-3,
-    "nis": 1.0,
-    "z": 1.0,
-    "log_weights": 25.0,
-    "sensitivity": 1e-2,
-}
+UNITS = dict.fromkeys(("theta", "trusted", "settled", "pull", "nis", "z"), 1.0)
+UNITS |= {"spread": 1e-3, "log_weights": 25.0, "sensitivity": 1e-2}
 HYPOTHESES = (
     hj.Hypothesis("inertia", {"Ix": 0.3, "Iy": 0.3}),
     hj.Hypothesis("thrust", {"k": 0.3}),
@@ -90,24 +81,21 @@ def compiled(folder, adaptation, precise, size):
 
 
 def with_covariances(state):
-    """In place of square roots, of which some columns are rounding alone."""
+    """In place of square roots, of which some columns are rounding only."""
 
-    def places(one):
-        mixture = () if one.mixture is None else (one.mixture.root,)
-        return one.root, one.excitation.root, *mixture
+    def squared(path, leaf):
+        return leaf @ leaf.mT if path[-1].name == "root" else leaf
 
-    return eqx.tree_at(places, state, [root @ root.mT for root in places(state)])
+    return jax.tree_util.tree_map_with_path(squared, state)
 
 
 def error(found, expected):
     """The largest difference, relative to the largest number of its part of the state or to the unit of that."""
-    off = {}
-    found, expected = map(with_covariances, (found, expected))
-    parts = zip(*map(jax.tree_util.tree_leaves_with_path, (expected, found)), strict=True)
-    for (path, value), (_, other) in parts:
-        value, other, name = np.asarray(value), np.asarray(other), path[-1].name
-        off[path] = np.abs(other - value).max() / max(np.abs(value).max(), UNITS.get(name, 1e-9))
-    return max(off.values())
+
+    def off(path, value, other):
+        return jnp.abs(other - value).max() / jnp.maximum(jnp.abs(value).max(), UNITS.get(path[-1].name, 1e-9))
+
+    return max(jax.tree.leaves(jax.tree_util.tree_map_with_path(off, *map(with_covariances, (expected, found)))))
 
 
 @pytest.mark.parametrize("hypotheses", [False, True], ids=["alone", "hypotheses"])

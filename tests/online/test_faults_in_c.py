@@ -3,7 +3,6 @@
 import subprocess
 from functools import cache
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 from compiled import needs_compiler
 from jax.flatten_util import ravel_pytree
 from test_excited_directions import DT, HOVER, NOISE, SECOND, Climb
+from test_online import watch
 
 import hybrid_jax as hj
 from hybrid_jax.export import export_adaptation_c
@@ -79,22 +79,6 @@ def filter_of(named):
     return hj.OnlineAdaptation(Climb(jnp.array(1.0)), DT, NOISE, 0.2, **options)
 
 
-@cache
-def states_of(named):
-    """The filter in JAX, as one program."""
-    adaptation = filter_of(named)
-
-    @eqx.filter_jit
-    def states(given):
-        def step(state, row):
-            state = adaptation.update(state, row[:1], row[1:2], row[2])
-            return state, state
-
-        return jax.lax.scan(step, adaptation.begin(jnp.zeros(1)), given)[1]
-
-    return states
-
-
 @pytest.fixture(scope="module", params=[False, pytest.param(True, marks=pytest.mark.slow)], ids=["alone", "hypotheses"])
 def program(request, tmp_path_factory):
     """Whether the filter has hypotheses, and its C with a main function, under sanitizers."""
@@ -116,7 +100,8 @@ def test_a_fault_ends_as_in_jax(name, program):
     done = subprocess.run([main], input=sent, capture_output=True, check=False, timeout=60)
     assert done.returncode == 0, done.stderr[:2000].decode()
     assert not done.stderr
-    adaptation, expected = filter_of(named), states_of(named)(jnp.asarray(given))
+    adaptation = filter_of(named)
+    expected = watch(adaptation, *map(jnp.asarray, (given[:, :1], given[:, 1:2], given[:, 2])))
     unravel = ravel_pytree(adaptation.begin(jnp.zeros(1)))[1]
     found = jax.vmap(unravel)(jnp.asarray(np.frombuffer(done.stdout, np.float32).reshape(STEPS, -1)))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_online import watch
 
 import hybrid_jax as hj
 from hybrid_jax.integrate import rk4_step
@@ -62,25 +63,12 @@ def flown(after, key, rate=0.0):
     return x + NOISE * jax.random.normal(noise_key, x.shape), u
 
 
-@cache
-def watch(hypotheses):
-    """One program for the runs of all tests."""
-    filter = adaptation(hypotheses)
-
-    def run(samples, inputs):
-        def step(state, given):
-            state = filter.update(state, *given)
-            return state, state.trusted * jnp.asarray(filter.scales)
-
-        return jax.lax.scan(step, filter.begin(jnp.zeros(2)), (samples, inputs))
-
-    return jax.jit(run)
-
-
 def watched(hypotheses, after, seeds=6, rate=0.0):
     """The last state of the filter of each run, and the θ of its model after each sample."""
-    runs = [watch(hypotheses)(*flown(after, key, rate)) for key in jax.random.split(jax.random.key(3), seeds)]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *runs)
+    keys = jax.random.split(jax.random.key(3), seeds)
+    runs = [watch(adaptation(hypotheses), *flown(after, key, rate)) for key in keys]
+    states = jax.tree.map(lambda *leaves: np.stack(leaves), *runs)
+    return jax.tree.map(lambda leaf: leaf[:, -1], states), states.trusted * np.array(adaptation(hypotheses).scales)
 
 
 def errors(theta, after):
@@ -139,27 +127,22 @@ def test_intervals_hold_the_truth_with_and_without_a_number_of_their_own():
 
 
 def test_bad_samples_keep_the_model_and_its_weights():
-    filter = adaptation()
-    state = jax.tree.map(lambda leaf: leaf[0], watched(True, cart(stiffness=1.6))[0])
-    update = jax.jit(lambda *given: filter.update(*given))
-    for _ in range(6):
-        after = update(state, jnp.full(2, jnp.nan), jnp.zeros(1))
-        np.testing.assert_allclose(after.trusted, state.trusted, atol=1e-3)
-        np.testing.assert_allclose(after.mixture.log_weights, state.mixture.log_weights, atol=1e-6)
-        state = after
-    assert filter.flags(state).gap
-    assert state.restarts == 0
+    samples, inputs = flown(cart(stiffness=1.6), jax.random.key(3))
+    states = watch(adaptation(), samples.at[-6:].set(jnp.nan), inputs)
+    assert np.ptp(states.trusted[-7:], axis=0).max() < 1e-3
+    assert np.ptp(states.mixture.log_weights[-7:], axis=0).max() < 1e-6
+    assert adaptation().flags(states).gap[-1]
+    assert states.restarts[-1] == 0
 
 
-def test_causes_that_cannot_be_are_refused():
-    for make, words in (
-        (lambda: hj.Hypothesis("none"), "hypothesis none: it must have a parameter"),
-        (lambda: hj.Hypothesis("a", {"push": 0.0}), "hypothesis a: push must be"),
-        (lambda: hj.Hypothesis("a", {"push": 1.0}, rates={"gain": 1.0}), "hypothesis a: rates of gain"),
-        (
-            lambda: OnlineAdaptation(cart(), DT, NOISE, hypotheses=(hj.Hypothesis("a", {"pusch": 1}),)),
-            "pusch must be among",
-        ),
-    ):
-        with pytest.raises(ValueError, match=words):
-            make()
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, "it must have a parameter"),
+        ({"parameters": {"push": 0.0}}, "push must be"),
+        ({"parameters": {"push": 1.0}, "rates": {"gain": 1.0}}, "rates of gain"),
+    ],
+)
+def test_hypotheses_that_cannot_be_are_refused(options, said):
+    with pytest.raises(ValueError, match=f"hypothesis a: {said}"):
+        hj.Hypothesis("a", **options)
