@@ -1,6 +1,7 @@
-"""Evaluate a function on many windows, a few at a time, so that memory does not grow with their number."""
+"""Evaluate a function on many windows, a few at a time: memory does not grow with their number, and caches suffice."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,3 +21,25 @@ def in_chunks(function: Callable[[Any], Any], values: Any, size: int) -> Any:
 
     found = jax.lax.map(function, jax.tree.map(cut, values))
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:n], found)
+
+
+def in_chunks_of_distinct(function: Callable[[Any], Any], values: Any, size: int, distinct: Any = None) -> Any:
+    """`function` on n stacked values, `size` at a time; with `distinct`, the first so many are repeated in order.
+
+    `distinct` may be traced, so that one program serves any number of them.
+    """
+    n = len(jax.tree.leaves(values)[0])
+    size = min(size, n)
+
+    def part(first):
+        return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, size), values)
+
+    def evaluate(i, found):
+        first = jnp.minimum(i * size, n - size)
+        put = partial(jax.lax.dynamic_update_slice_in_dim, start_index=first, axis=0)
+        return jax.tree.map(put, found, function(part(first)))
+
+    shapes = jax.eval_shape(lambda: function(part(0)))
+    zeros = jax.tree.map(lambda leaf: jnp.zeros((n, *leaf.shape[1:]), leaf.dtype), shapes)
+    found = jax.lax.fori_loop(0, -(-(n if distinct is None else distinct) // size), evaluate, zeros)
+    return found if distinct is None else jax.tree.map(lambda leaf: leaf[jnp.arange(n) % distinct], found)

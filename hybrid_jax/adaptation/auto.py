@@ -139,10 +139,11 @@ class Auto(Method):
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
         learned_from = motion_of(field) if learned_from is None else learned_from
         if learned_from is not None:
-            learned_from = alike(learned_from, train)
-            own, refit, _ = fits(larger, learned_from, both, *options)
-            rival = None if physics is None else fits(physics, learned_from, both, *options)[1]
+            distinct, learned_from = jnp.array(min(len(learned_from), len(train))), alike(learned_from, train)
+            own, refit, _ = fits(larger, learned_from, both, *options, distinct)
+            rival = None if physics is None else fits(physics, learned_from, both, *options, distinct)[1]
             larger, source = replace(self, larger, own, refit, rival)
+        options = *options, jnp.array(len(train))
         found, every, starts = fits(larger, train, both, *options)
         for _ in range(ROUNDS):
             chosen, nothing, rows = judge(field, larger, train, found, every, source, learned_from, *options[:3])

@@ -66,16 +66,27 @@ class Fit(NamedTuple):
 
 
 def fit_each(
-    field: AbstractVectorField, windows: Trajectories, free, sizes, solver: Solver, scale: Scale, max_steps: int
+    field: AbstractVectorField,
+    windows: Trajectories,
+    free,
+    sizes,
+    solver: Solver,
+    scale: Scale,
+    max_steps: int,
+    distinct: Int[Array, ""] | None = None,
 ) -> tuple[Fit, Starts | None]:
-    """Fit the free parameters of each candidate, with the prior `sizes`; also return the `smoothed` starts."""
+    """Fit the free parameters of each candidate, with the prior `sizes`; also return the `smoothed` starts.
+
+    Args:
+        distinct: see `fit_and_linearise`.
+    """
     starts, noise = smoothed(field, windows, solver, scale)
     smooth, weigh = from_starts(windows, starts)
     noise = jnp.maximum(noise, jnp.square(rounding(windows, scale)) / windows.x.size)
 
     def one(free: Bool[Array, " p"]) -> Fit:
         held = jnp.sqrt(noise) / sizes
-        found, jacobian, r = fit_and_linearise(field, smooth, solver, max_steps, scale, free, weigh, held)
+        found, jacobian, r = fit_and_linearise(field, smooth, solver, max_steps, scale, free, weigh, held, distinct)
         equations = jax.vmap(equations_of)(jacobian, r)
         seen = has_effect(equations, windows, scale)
         theta = ravel_parameters(found.field)[0]
@@ -109,8 +120,9 @@ def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, field, lear
 
 
 def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:
-    """Select as many of the source's windows as there are others, and no longer ones, so that one program serves."""
-    places, t = np.linspace(0, len(learned_from) - 1, len(windows)).astype(int), windows.horizon
+    """Repeat or select the source's windows until they are as many as the others, and no longer, for one program."""
+    n, m, t = len(windows), len(learned_from), windows.horizon
+    places = np.arange(n) % m if m < n else np.linspace(0, m - 1, n).astype(int)
     own = Trajectories(learned_from.x0, learned_from.u[:, :t], learned_from.x[:, :t], learned_from.dt)
     return jax.tree.map(lambda leaf, other: jnp.asarray(leaf[places], other.dtype), own, windows)
 

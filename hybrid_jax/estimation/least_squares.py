@@ -15,6 +15,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
+from hybrid_jax.chunks import in_chunks_of_distinct
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_learned
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
@@ -25,8 +26,8 @@ from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories, errors_of
 
 MANY, CHUNK = 10_000, 1000  # windows: of more, a triangle takes the place of J and r, and is found by so many at a time
+TOGETHER = 64  # windows that are linearised at a time
 LEAST = 0.1  # of what rounding does to the states: a step of which less is expected is the last
-
 COARSE = 0.5  # standard errors that half the solver's step may move a parameter
 FINE = 1e-3  # of how far the states move: smaller errors do not count as noise of which a fit is
 
@@ -101,10 +102,8 @@ def solver_errors(solver: Solver) -> Iterator[None]:
     try:
         yield
     except eqx.EquinoxRuntimeError:
-        name = type(solver).__name__
-        raise ValueError(
-            f"solver: {name} finds no step where the search went; start nearer, or bound the field"
-        ) from None
+        found = f"{type(solver).__name__} finds no step where the search went"
+        raise ValueError(f"solver: {found}; start nearer, or bound the field") from None
 
 
 def warn_of_steps(discretisation: float, remedy: str) -> None:
@@ -186,14 +185,16 @@ def fit_and_linearise(
     free=None,
     weigh: Callable[[Float[Array, "n t d"]], Float[Array, "n s d"]] | None = None,
     held: Theta | float = 0.0,
+    distinct: Int[Array, ""] | None = None,
 ) -> tuple[LeastSquaresFit, Float[Array, "n s d p"], Float[Array, "n s d"]]:
     """Run `fit_free` and return also the Jacobian of the predictions and their negative errors at the end.
 
     Points are in the units of `_units`. More than `MANY` unweighted windows are compressed by `_triangle`.
 
     Args:
-        weigh: a linear map of the errors, such as `starts.projected`.
+        weigh: an affine map of the errors, such as `starts.projected`.
         held: error per unit of a parameter's distance from the start.
+        distinct: how many windows are distinct, if the others repeat them in order.
     """
     start, unravel = ravel_parameters(field)
     compressed, own = weigh is None and len(windows) > MANY, weigh or (lambda errors: errors)
@@ -201,13 +202,13 @@ def fit_and_linearise(
     def errors(theta: Theta, window: Trajectories):
         return prediction_errors(fixed_residual(unravel(theta)), window, solver, scale)
 
-    def residuals(theta: Theta):
-        return own(jax.vmap(partial(errors, theta))(windows))
-
     def linearised(theta: Theta):
         if compressed:
             return _triangle(errors, theta, windows)
-        return jax.jacfwd(lambda theta: 2 * (residuals(theta),), has_aux=True)(theta)
+        one = partial(_linearised, errors, theta)
+        jacobian, found = in_chunks_of_distinct(one, windows, TOGETHER, distinct)
+        found, push = jax.linearize(own, found)
+        return jax.vmap(push, -1, -1)(jacobian), found
 
     def theta_at(z: Theta, unit: Theta) -> Theta:
         return (start + unit * z).astype(start.dtype)
@@ -225,11 +226,11 @@ def fit_and_linearise(
         (z, upper), (before, found, jacobian, units) = tried, state.best
 
         def cost_and_errors(z):
-            errors = residuals(theta_at(z, units[0]))
-            return cost_of(z, errors, units), errors
+            r = own(jax.vmap(partial(errors, theta_at(z, units[0])))(windows))
+            return cost_of(z, r, units), r
 
-        def correction(z, errors):
-            missed = errors - found - jacobian @ (units[0] * (z - before)).astype(errors.dtype)
+        def correction(z, r):
+            missed = r - found - jacobian @ (units[0] * (z - before)).astype(r.dtype)
             slope = scaled(jacobian * units[0], units[1]).T @ scaled(missed, units[1])
             return -solve_triangular(upper, solve_triangular(upper, slope, trans=1))
 
@@ -252,8 +253,8 @@ def fit_and_linearise(
     def aim(best, damping):
         z, found, jacobian, (unit, size) = best
         to_start = anchor((unit, size))
-        rows = jnp.concatenate([scaled(jacobian * unit, size), jnp.diag(to_start)])
-        move, expected, upper = move_of_rows(rows, jnp.concatenate([scaled(found, size), to_start * z]), damping)
+        rows, r = scaled(jacobian * unit, size), jnp.concatenate([scaled(found, size), to_start * z])
+        move, expected, upper = move_of_rows(jnp.concatenate([rows, jnp.diag(to_start)]), r, damping)
         return (z + move, upper), expected, jnp.square(LEAST * rounding(windows, scale) / size)
 
     shape = jax.eval_shape(lambda: linearised(start)[1])
