@@ -29,7 +29,7 @@ def in_chunks_of_distinct(function: Callable[[Any], Any], values: Any, size: int
     `distinct` may be traced, so that one program serves any number of them.
     """
     n = len(jax.tree.leaves(values)[0])
-    size = min(size, n)
+    size = -(-n // -(-n // size))  # at most `size`, with few left over
 
     def part(first):
         return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, size), values)
