@@ -21,7 +21,7 @@ from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, spread_t
 from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages
 from hybrid_jax.cli import errors
-from hybrid_jax.cli.choice import LEVEL
+from hybrid_jax.cli.learning import LEVEL
 from hybrid_jax.cli.logs import STEPS, Flights
 from hybrid_jax.flights.windows import flight_of
 

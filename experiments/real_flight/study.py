@@ -14,8 +14,8 @@ from experiments.runner.cache import identity_of
 from experiments.runner.stages import Found, Stages, rows_of
 from hybrid_jax.adaptation import Adaptation, adapt
 from hybrid_jax.cli import errors
-from hybrid_jax.cli.learning import Learned, adapted, lagged, learn
-from hybrid_jax.cli.logs import STEPS, Flights, windows_of
+from hybrid_jax.cli.learning import Learned, adapted, learn
+from hybrid_jax.cli.logs import STEPS, Flights, lagged, windows_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.rigid_body import rigid_body
@@ -115,7 +115,7 @@ def of_fold(
             rows.append(row)
 
     if seed == 0:
-        fitted = windows_of(train, STEPS, STEPS, LINEAR).windows
+        fitted = windows_of(train, STEPS, STEPS, LINEAR)
         linear = adapt(rigid, fitted, method=names.LINEAR_RESIDUAL).field
         for name, field in zip(BASELINES, (HoldState(), FrozenRates(physics), linear), strict=True):
             score(name, field)

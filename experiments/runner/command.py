@@ -18,7 +18,8 @@ from experiments.runner.cache import source_digest
 from experiments.runner.options import COMMON, Run
 from experiments.runner.run_record import recorded
 from hybrid_jax import checks
-from hybrid_jax.cli.command import answering, exit_codes, parsed
+from hybrid_jax.cli import answering
+from hybrid_jax.cli.command import exit_codes, parsed
 from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 

@@ -1,29 +1,30 @@
 """`hybrid-jax adapt`: find what changed, and adapt a model."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
-from hybrid_jax import checks
 from hybrid_jax.adaptation import Adaptation, Parameter
 from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
 from hybrid_jax.cli.learning import adapted, without_past
-from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights
-from hybrid_jax.cli.model import Known, flights_for, known_of, unlike
+from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import load, save
+from hybrid_jax.trajectories import Trajectories
 
 __all__ = ["LISTS", "Options", "run"]
 Change = tuple[str, float, Parameter]  # a name, its value before, and after
 UNLIKELY = 0.05  # probability that nothing changed, below which the vehicle is another one
 SHOWN = 5  # parameters beside the answer
 ALONE = "physics alone predicts the flights before better than with the network, and is the adapted model."
+STILL = "These flights hardly move, so they determine hardly anything."
+TAUGHT = ", to which the model was adapted"
 LACKED = (
     "Effects that the model lacked explain these flights as well: {}. Flights before may have had them: name those "
     "that the vehicle always has, such as drag, in `learn` of the vehicle file, and fit again."
@@ -48,24 +49,22 @@ class Options(FlightOptions):
 
 
 def run(options: Options) -> int:
-    checks.writable_folder("--out", options.out)
-    checks.writable_folder("--output", options.output.parent)
     model = load(options.source)
     if "identified" in model.about:
         return identified.adapt(options, model)
     known = known_of(options.source, model)
     flights = flights_for(known, options.after, options, changed=True)
+    x0, u, x = (np.asarray(known.about["windows"][part], "f4") for part in ("x0", "u", "x"))
     with step("adapting") as told:
-        field, found = adapted(known.field, flights.logs, known.windows)
+        field, found = adapted(known.field, flights.logs, Trajectories(x0, u, x, known.dt))
         told(f"{found.windows} windows, chose {found.chosen}")
-    changes = _changes(known, found)
     different = bool(found.changed) or found.alone or found.candidates["source"] < UNLIKELY
     if different:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
         save(options.output, field, json_value(about))
     told = found.to_dict() | {"model": options.output if different else None}
-    page.write(options.out, "adapt", _page(options, known, flights, field, found, changes, different), told)
+    page.write(options.out, "adapt", _page(options, known, flights, field, found, different), told)
     return 0 if different else NOTHING_CHANGED
 
 
@@ -78,21 +77,15 @@ def _changes(known: Known, found: Adaptation) -> list[Change]:
 
 
 def _page(
-    options: Options,
-    known: Known,
-    flights: Flights,
-    field: AbstractVectorField,
-    found: Adaptation,
-    changes: Sequence[Change],
-    different: bool,
+    options: Options, known: Known, flights: Flights, field: AbstractVectorField, found: Adaptation, different: bool
 ) -> page.Page:
-    learned, changed = named_parameters(without_past(known.field)), changes[: len(found.changed)]
+    changes, learned = _changes(known, found), named_parameters(without_past(known.field))
+    changed = changes[: len(found.changed)]
     own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
-    curves = {
-        name: errors.rmse_by_flight(field, flights.logs, known.steps)
-        for name, field in (("before", known.field), ("adapted", field))
-    }
-    seconds, (old, new) = known.steps * known.dt, (errors.texts(each.mean(axis=0)[-1]) for each in curves.values())
+    fields = {"before": known.field} | ({"adapted": field} if different else {})
+    curves = {name: errors.rmse_by_flight(each, flights.logs, known.steps) for name, each in fields.items()}
+    old, *new = (errors.texts(each.mean(axis=0)[-1])[1] for each in curves.values())
+    error = f"On these flights the error of velocity after {known.steps * known.dt:g} s"
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
     answer = "These flights differ from the model, but do not determine which of its parameters changed."
     answer = f"Changed: {what}." if own else answer
@@ -102,30 +95,41 @@ def _page(
     if not different:
         answer = "These flights show no change."
         todo = "Keep the model. If something did change, you should fly manoeuvres that excite it more."
-    rows = [(name, f"{value:.4g}", str(one)) for name, value, one in ([*own, *lacked] or changes)[:SHOWN]]
     title = "What changed" if changed else "Parameters, none of which clearly changed"
-    expected = [
-        (horizon, name, *(f"{number:.3g}" for number in one))
+    moved = [each for each in changes if each[1] != each[2].value] or changes
+    rows = [
+        (name, f"{value:.4g} {one.unit or ''}".rstrip(), str(one))
+        for name, value, one in ([*own, *lacked] or moved)[:SHOWN]
+    ]
+    known_error = known.about.get("expected", {}).get("velocity")  # of a model that `fit` wrote
+    expected = f", where {known_error[0]:.3g} m/s was expected on a new flight" if known_error else ""
+    unseen = [each["velocity"] for each in [*found.expected.values()][:1] if different]
+    coming = [
+        (horizon, name, *(f"{number:.3g}" for number in one), found.units[name])
         for horizon, each in found.expected.items()
         for name, one in each.items()
     ]
-    header = ("after", "of", "RMSE", "from", "to")
+    header = ("after", "of", "RMSE", "from", "to", "unit")
     return page.Page(
         f"What changed in {page.counted(flights.logs, 'flight')} of {options.after} ({flights.seconds:.0f} s)?",
         answer,
         page.Table(f"{title} (95 % intervals)", ("parameter", "before", "after"), rows) if rows else None,
-        [("RMSE on these flights, to which the model was adapted", errors.figure(curves, known.dt))],
+        [(f"RMSE on these flights{TAUGHT * different}", errors.figure(curves, known.dt))],
         [
-            f"On these flights the error of velocity after {seconds:g} s was {old[1]}; it is now {new[1]}.",
+            f"{error} was {old}; it is now {new[0]}." if new else f"{error} is {old}{expected}.",
+            *[f"On flights not seen expect {v:.3g} m/s ({low:.3g} to {high:.3g})." for v, low, high in unseen],
             *([f"Of the model before, {ALONE}"] if found.alone else []),
             *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
             *errors.unknown(found),
+            *(f"Effective means: {why}." for why in dict.fromkeys(each.effective for _, _, each in changes) if why),
+            *[STILL] * flights.still,
             *unlike(known, flights),
+            *flights.warnings,
         ],
         [todo],
         [
             errors.parameter_table(found),
-            page.Table("Error to expect on a flight not seen (80 % intervals)", header, expected),
+            page.Table("Error to expect on a flight not seen (80 % intervals)", header, coming),
         ],
         [*flights.said, *found.report().splitlines()],
     )

@@ -8,11 +8,9 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from hybrid_jax import checks
 from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import step
-from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights
-from hybrid_jax.cli.model import Known, flights_for, known_of, unlike
+from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.baselines import FrozenRates, Kinematics
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.windows import flight_of
@@ -36,7 +34,6 @@ class Options(FlightOptions):
 
 
 def run(options: Options) -> int:
-    checks.writable_folder("--out", options.out)
     model = load(options.model)
     if "identified" in model.about:
         return identified.check(options, model)
@@ -75,8 +72,8 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
         f"Its predictions of {known.steps * known.dt:g} s are {beaten}.",
         page.Table(f"RMSE after {known.steps * known.dt:g} s", header, rows),
         [("RMSE over the time since a prediction began, all flights", errors.figure(curves, known.dt))],
-        [*meaning, errors.BASELINE, *unlike(known, flights)],
-        ["If it is wrong for long, adapt it to such flights: hybrid-jax adapt."],
+        [*meaning, errors.BASELINE, *unlike(known, flights), *flights.warnings],
+        [f"If it is wrong for long: hybrid-jax adapt {options.model} {options.flights} -o adapted.npz."],
         [
             page.Table("When it is most wrong", ("flight", "at", *header[1:]), _worst(known, flights, names, each)),
             page.Table("RMSE on each flight", ("flight", *header[1:]), by_flight),

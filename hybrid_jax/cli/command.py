@@ -8,16 +8,17 @@ import os
 import re
 import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from importlib import import_module
+from itertools import takewhile
 from typing import Any, NoReturn, TypeVar, cast, get_type_hints
 
 import tyro
 
-from hybrid_jax.cli.flags import in_flags
-from hybrid_jax.cli.help import option_of, short_help
+from hybrid_jax import checks
+from hybrid_jax.cli import INTERRUPTED
+from hybrid_jax.cli.help import expected, option_of, short_help
 from hybrid_jax.runtime import configure
 
 Options = TypeVar("Options")
@@ -33,7 +34,6 @@ VERBS = {
     "replay": "show a flight in 3-D, and where a model expects the vehicle",
     "export": "write a model as C, CasADi functions or StableHLO",
 }
-INTERRUPTED = "interrupted, nothing was written"
 USAGE = """usage: hybrid-jax VERB ...
 
 From folders of logs to a model that can be trusted:
@@ -42,6 +42,14 @@ From folders of logs to a model that can be trusted:
 
 hybrid-jax VERB --help says more, VERB --help-all all.
 Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."""
+
+# Arguments that messages of the library name, and the options of the commands that have them.
+READ_LOGS = ("inspect", "fit", "identify", "adapt", "check", "replay", "real_flight")
+_SAME = ("columns", "polynomial", "topics", "motor_order", "dt", "delay")
+FLAGS = {name: f"--{name.replace('_', '-')}" for name in _SAME} | {"failed": "--anyway"}
+_KEYS = ("columns", "polynomial")  # words of column maps as well: options only before a value
+_NAMED, _FREE = "|".join(FLAGS), "|".join(name for name in FLAGS if name not in _KEYS)
+_VALUE = r"\([^)]*\)|\{[^}]*\}|\"[^\"]*\"|[^\s,;:)]+"
 
 
 class Explained(ValueError):
@@ -64,39 +72,14 @@ def run(arguments: Sequence[str]) -> None:
         module = import_module(f"hybrid_jax.cli.{verb}")
         options = parsed(module.Options, f"hybrid-jax {verb}", split_lists(given, module.LISTS))
         configure()
-        with answering(f"hybrid-jax {verb}", INTERRUPTED, end=True):
-            code = module.run(options)
+        checks.writable_folder("--out", options.out)
+        if (output := getattr(options, "output", None)) is not None:
+            checks.writable_folder("--output", output if verb == "export" else output.parent)
+            if verb != "export" and output.is_dir():
+                raise ValueError(f"--output {output}: is a folder; name a file in it")
+        _ = getattr(options, "reading", None)  # is checked before anything is read
+        code = module.run(options)
     sys.exit(code)
-
-
-@contextlib.contextmanager
-def answering(program: str, answer: str, end: bool = False) -> Iterator[None]:
-    """Answer the first Ctrl-C at once, even while XLA is busy, and perhaps end the process."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    ear, mouth = os.pipe()
-    os.set_blocking(mouth, False)
-
-    def listen() -> None:
-        with open(ear, "rb", buffering=0) as signals:
-            while number := signals.read(1):
-                if number[0] == signal.SIGINT:
-                    os.write(2, f"{program}: {answer}\n".encode())
-                    if end:  # files are renamed when complete, so none is left partial
-                        os._exit(128 + signal.SIGINT)
-                    return
-
-    threading.Thread(target=listen, daemon=True).start()
-    before = signal.set_wakeup_fd(mouth, warn_on_full_buffer=False)  # to which a signal is written at once
-    handler = signal.signal(signal.SIGINT, lambda *_: None) if end else None
-    try:
-        yield
-    finally:
-        if handler is not None:
-            signal.signal(signal.SIGINT, handler)
-        signal.set_wakeup_fd(before)
-        os.close(mouth)
 
 
 def parsed(
@@ -120,14 +103,28 @@ def parsed(
     except SystemExit as stop:
         if not stop.code:
             raise  # --help
-        message = _message(output.getvalue())
-        hints = get_type_hints(kind, include_extras=True).items()
-        known = [f"--{option_of(name, getattr(hint, '__metadata__', ()))}" for name, hint in hints]
-        # One that is wrong is named even where an argument is missing, which the parser finds first.
-        for word in (re.split(r"[=.]", word)[0] for word in given if word.startswith("--")):
-            if word.replace("--no-", "--", 1) not in (*known, "--help"):
-                message = f"Unrecognized options: {word}{_meant(word, known)}"
-        raise ValueError(f"{message}; see --help") from None
+        usage = short_help(kind, program, "", default, common).partition("\n")[0]
+        raise ValueError(f"{_complaint(kind, given, output.getvalue(), usage)}; see --help") from None
+
+
+def _complaint(kind: type, given: Sequence[str], box: str, usage: str) -> str:
+    """Say in one line what is wrong with a command line, around which tyro draws a box."""
+    hints = get_type_hints(kind, include_extras=True).items()
+    known = {f"--{option_of(name, getattr(hint, '__metadata__', ()))}": hint for name, hint in hints}
+    # One that is wrong is named even where an argument is missing, which tyro finds first.
+    for word in (re.split(r"[=.]", word)[0] for word in given if word.startswith("--")):
+        if word.replace("--no-", "--", 1) not in (*known, "--help"):
+            return f"Unrecognized options: {word}{_meant(word, known)}"
+    lines = [line.strip("│| ") for line in box.splitlines()]
+    rules = [i for i, line in enumerate(lines) if line.startswith(("─", "╭", "╰", "---", "+"))]
+    text = " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
+    if text.startswith("Missing from"):
+        return f"an argument is missing; {usage}"
+    if (found := re.match(r"Error parsing (--[\w-]+): ", text)) and found[1] in known:
+        at = max(i for i, word in enumerate(given) if word.partition("=")[0] == found[1])
+        values = [given[at].partition("=")[2], *takewhile(lambda word: not word.startswith("--"), given[at + 1 :])]
+        return f"{found[1]} must be {expected(known[found[1]])}, got {' '.join(filter(None, values))}"
+    return re.sub(r"^Error parsing \w+: ", "", text).removesuffix(".")
 
 
 def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
@@ -147,16 +144,15 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a letter ends no run
     if sys.stdout is sys.__stdout__:
-        sys.stdout = io.TextIOWrapper(
-            io.BufferedWriter(_Output(program)), sys.stdout.encoding, "replace", line_buffering=True
-        )
+        binary = io.BufferedWriter(_Output(program))
+        sys.stdout = io.TextIOWrapper(binary, sys.stdout.encoding, "replace", line_buffering=True)
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
         message = str(error) if isinstance(error, Explained) else " ".join(str(error).split())
-        _end(program, [in_flags(command, message)], BAD_INPUT)
+        _end(program, [_option(command, in_flags(message, command))], BAD_INPUT)
     except ChecksFailed as failed:
-        _end(program, [in_flags(command, line) for line in failed.args], FAILED_CHECKS)
+        _end(program, [in_flags(line, command) for line in failed.args], FAILED_CHECKS)
     except KeyboardInterrupt as stop:
         _end(program, [interrupted], 128 + (stop.args[0] if stop.args else signal.SIGINT))
 
@@ -183,17 +179,35 @@ def _end(program: str, lines: Sequence[str], code: int) -> NoReturn:
     sys.exit(code)
 
 
-def _meant(word: str, known: Any) -> str:
+def _meant(word: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(word, list(known), 1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _message(box: str) -> str:
-    """Extract the message from the box that tyro draws around an error, without the class name."""
-    lines = [line.strip("│| ") for line in box.splitlines()]
-    rules = [i for i, line in enumerate(lines) if line.startswith(("─", "╭", "╰", "---", "+"))]
-    text = " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
-    return re.sub(r"^Error parsing \w+: ", "", text).removesuffix(".")
+def _option(command: str, message: str) -> str:
+    """Replace an argument at the start of a message, `argument must …`, by the option of a verb."""
+    found = re.match(r"([a-z_]+)(?=(\[\d\])? must )", message)
+    if found is None or command not in VERBS:
+        return message
+    name = "learn" if found[1] == "parameters" else found[1]
+    return f"--{name.replace('_', '-')}{message[found.end() :]}"
+
+
+def in_flags(message: str, command: str = READ_LOGS[0]) -> str:
+    """Replace `argument=value` and `argument must …` in a message by the options of a command, if it has them."""
+    if command not in READ_LOGS:
+        return message
+
+    def option(found: Any) -> str:
+        flag, value = FLAGS[found[1]], found[2]
+        if value in ("True", '"warn"'):
+            return flag
+        pairs = re.sub(r"\"([^\"]*)\": *", r"\1=", value)
+        typed = re.sub(r"[(){}\"]", "", pairs).replace(", ", "," if value.startswith("(") else " ").rstrip(",…")
+        return f"{flag} {typed}".rstrip()
+
+    message = re.sub(rf"\b({_NAMED})=({_VALUE})", option, message)
+    return re.sub(rf"(?<![-\w])({_FREE})(?=: | must | needs )", lambda found: FLAGS[found[1]], message)
 
 
 @contextlib.contextmanager
@@ -201,7 +215,5 @@ def step(doing: str) -> Iterator[Callable[[str], None]]:
     """Print on stderr what is being done, then the result (set by the yielded function) and the duration."""
     began, found = time.perf_counter(), [""]
     print(f"{doing} …", file=sys.stderr, flush=True)
-    yield lambda text: found.__setitem__(0, text)
-    print(
-        f"{doing}: {f'{found[0]}, ' * bool(found[0])}{time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True
-    )
+    yield lambda text: found.__setitem__(0, f"{text}, ")
+    print(f"{doing}: {found[0]}{time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)

@@ -2,26 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hybrid_jax.cli.command import ChecksFailed
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, rotation_of
 from hybrid_jax.flights.checks.airborne import airborne, within
-from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, Check, check_log
-from hybrid_jax.flights.checks.suitability import failures
+from hybrid_jax.flights.checks.consistency import ORDER, RATES, RATIO, SPIN, THRUST, Check, check_log
 from hybrid_jax.flights.conversion import DT, STATES, to_flight
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import AXES, Recording, Signal
 from hybrid_jax.identification.slow_commands import SLOW
 
-MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
-NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
 MOTORS = "rotor_speed"
 DRAGGED = 0.6  # correlation of forces with the velocity from which on they are drag
 GUESSED = 10.0  # factor by which a thrust that is learned may be off; units are farther off
@@ -30,20 +25,11 @@ OF_THRUST = {"curve", "mass", "k", "k_rotors"}
 # leaves out gaps and the ground by itself, and learns or ignores the lag.
 COMPARED = (
     (("position", "velocity"), 0.05, ("dp/dt against v",)),
-    (("attitude", "rates"), 0.05, ("q̇ against ω",)),
+    (("attitude", "rates"), 0.05, (RATES,)),
     (("attitude", "velocity", MOTORS), 0.11, (THRUST, RATIO)),
     (("rates", MOTORS), SLOW, ("columns", ORDER, SPIN)),
     ((MOTORS,), np.inf, ("interval between samples",)),
 )
-
-
-def require_passed(found: Sequence[tuple[Recording, list[Check]]], anyway: bool) -> list[str]:
-    """Return a line for each failed check of each log, or raise ChecksFailed without `anyway`."""
-    needed = [(Path(log.name).name, [each for each in checks if each.name not in NOT_NEEDED]) for log, checks in found]
-    lines = [line for name, checks in needed for line in failures(checks, name)]
-    if lines and not anyway:
-        raise ChecksFailed(*lines, MEND)
-    return lines
 
 
 def compared(recording: Recording, field: Any, learn: Sequence[str]) -> list[Check]:

@@ -19,7 +19,10 @@ from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import sequences
 
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
-BASELINE = "Frozen rates are a baseline: the thrust of the motors acts, and body rates stay as they are."
+BASELINE = (
+    "RMSE is the root mean square of the error of predictions. Frozen rates are a baseline: the thrust of the motors "
+    "acts, and body rates stay as they are."
+)
 MOST = 500  # windows of a flight
 LINES = {  # colour and dashes of a model, the same on every page
     "thrust, rates frozen": ("0.6", "--"),
@@ -47,7 +50,7 @@ def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[n
         cut = [trajectories.windows_of(seen, np.asarray(each.u[0]), each.dt, steps=steps) for each, seen in parts]
         windows = trajectories.concatenate(cut)
     else:
-        windows = windows_of([log], steps, steps).windows
+        windows = windows_of([log], steps, steps)
     places = np.arange(-(-len(windows) // MOST) * MOST) % len(windows)  # so that flights share a program
     return np.stack(flight_errors(field, windows[places], chunk=MOST), axis=-1)[: len(windows)]
 

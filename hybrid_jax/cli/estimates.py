@@ -29,31 +29,18 @@ LEAST_SPREAD = 0.3  # m/s², of the specific force, for a curve of thrust
 
 
 class Estimate(NamedTuple):
-    """Estimates for a vehicle with n rotors.
+    """Estimates for a vehicle with n rotors."""
 
-    Attributes:
-        commands: whether motors are commands from 0 to 1, else speeds [rad/s].
-        largest: motor value in the logs.
-        hover: RMS value of each motor in hover.
-        voltage: voltage in hover [V]; NaN if unknown.
-        effect: B, the angular acceleration per squared motor [rad/s² / motor²].
-        correlations: correlations of roll, pitch and yaw with the regression.
-        lag: time constant τ [s].
-        curve: c0, c1, c2: specific force of one rotor's thrust [m/s²] over its command.
-        seconds: time in flight.
-        moves: whether a log has the velocity, which drag requires.
-    """
-
-    commands: bool
-    largest: float
-    hover: Float[np.ndarray, " n"]
-    voltage: float
-    effect: Float[np.ndarray, "3 n"]
-    correlations: Float[np.ndarray, " 3"]
-    lag: float
-    curve: Float[np.ndarray, " 3"] | None
-    seconds: float
-    moves: bool
+    commands: bool  # whether motors are commands from 0 to 1, else speeds [rad/s]
+    largest: float  # motor value in the logs
+    hover: Float[np.ndarray, " n"]  # RMS value of each motor in hover
+    voltage: float  # in hover [V]; NaN if unknown
+    effect: Float[np.ndarray, "3 n"]  # B, the angular acceleration per squared motor [rad/s² / motor²]
+    correlations: Float[np.ndarray, " 3"]  # of roll, pitch and yaw with the regression
+    lag: float  # time constant τ [s]
+    curve: Float[np.ndarray, " 3"] | None  # c0, c1, c2: specific force of one rotor [m/s²] over its command
+    seconds: float  # time in flight
+    moves: bool  # whether a log has the velocity, which drag requires
 
     @property
     def placed(self) -> bool:
@@ -82,10 +69,6 @@ class Estimate(NamedTuple):
         roll, pitch = self.effect[0], -self.effect[1]
         y, x = places[:, 1], places[:, 0]
         return float(thrust * (y @ roll) / (roll @ roll)), float(thrust * (x @ pitch) / (pitch @ pitch))
-
-    def centre(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " 2"]:
-        """Return the centre of thrust in hover [m], assuming equal rotors."""
-        return self.hover**2 @ places / (self.hover**2).sum()
 
 
 def estimate(recordings: Sequence[Recording]) -> Estimate:

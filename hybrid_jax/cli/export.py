@@ -39,6 +39,7 @@ UNITS = "velocity [m/s]", "body rates [rad/s]"
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
 PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.md
 PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
+STATES = "x: position [m], quaternion w x y z, velocity [m/s], body rates [rad/s]; u: rotor speeds [rad/s]."
 WITHOUT = "The model is written without its past: in a program you would have to filter its errors yourself."
 
 
@@ -107,8 +108,6 @@ def run(options: Options) -> int:
     adaptation = _filter(options, field, dt, d) if "c" in options.to else ""
     if field is not model.field:
         said.append(WITHOUT)
-    checks.writable_folder("--output", options.output)
-    checks.writable_folder("--out", options.out)
     written: list[Path] = []
     with step(f"writing {', '.join(options.to)}"):
         if "c" in options.to:
@@ -137,6 +136,7 @@ def run(options: Options) -> int:
 def _page(
     options: Options, field: AbstractVectorField, dt: float, written: Sequence[Path], said: Sequence[str]
 ) -> page.Page:
+    rigid = state_space(field) == RIGID_BODY_SPACE and not isinstance(field, Actuated)
     rows = [(str(path), f"{path.stat().st_size / 1024:.0f} KB") for path in written]
     compiled = f"gcc -std=c99 -O2 -I{options.output} main.c {options.output / options.name}.c -lm"
     todo = [f"Compile it with yours: {compiled}. docs/howto/c.md has a program."] if "c" in options.to else []
@@ -145,7 +145,7 @@ def _page(
         f"{len(written)} files in {options.output}: ẋ = f(x, u), and a step of {dt:g} s.",
         page.Table("Files", ("file", "size"), rows),
         _response(field, dt),
-        said,
+        [*([STATES] if rigid else []), *said],
         todo or ["docs/howto/export.md says what reads them."],
     )
 

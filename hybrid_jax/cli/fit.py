@@ -1,5 +1,6 @@
 """`hybrid-jax fit`: learn a vehicle from its logs, with a network if that predicts better than physics only."""
 
+import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,11 +13,11 @@ from hybrid_jax.cli import errors, identify, page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.inspect import inspected, write_vehicle
 from hybrid_jax.cli.learning import CANDIDATES, FROZEN, PAST, Learned, learn
-from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, raw_logs, read_flights
+from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, paths_of, read_flights
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.flights.conversion import missing_states
-from hybrid_jax.flights.load import find_logs, read_recording
+from hybrid_jax.flights.load import read_recording
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
 
@@ -60,8 +61,6 @@ class Options(FlightOptions):
 
 def run(options: Options) -> int:
     checks.positive("--dt", options.dt)
-    checks.writable_folder("--out", options.out)
-    checks.writable_folder("--output", options.output.parent)
     path = options.vehicle or _written(options)
     model = load_vehicle_model(path)
     if _identified(options, model):
@@ -74,6 +73,8 @@ def run(options: Options) -> int:
     flights = read_flights(options.before, model.vehicle, options.dt, options, lagging=lagging)
     if len(flights.logs) < 2:
         raise ValueError(f"{options.before}: has one flight; you need at least two, because one is held out")
+    if flights.still and not options.anyway:
+        raise ValueError(f"{options.before}: no flight excites anything: fly manoeuvres, or go on with --anyway")
     with step(f"learning from {len(flights.logs)} flights, each held out in turn") as told:
         found = learn(model, flights.logs, options.seed)
         told(f"{found.chosen} predicts them best")
@@ -89,17 +90,18 @@ def _written(options: Options) -> Path:
     """Write a vehicle file estimated from the logs into the folder of the page."""
     path = options.out / "vehicle.toml"
     with step("a vehicle file from the logs, as none is given"):
-        logs = [log for _, log in raw_logs(options.before, lambda log: inspected(log, None, options))[0]]
-        write_vehicle(path, logs, options.before)
+        write_vehicle(path, inspected(paths_of(options.before)[0], None, options), options.before)
     return path
 
 
 def _identified(options: Options, model: VehicleModel) -> bool:
-    """Whether the first log is incomplete, or has commands for the vehicle file's actuator."""
-    paths = find_logs(options.before)[0] if options.before.is_dir() else [options.before]
-    found = next((read_recording(path, **options.reading) for path in paths if path.exists()), None)
-    if found is None:
-        return False  # which is refused where all logs are read
+    """Whether the first log that can be read is incomplete, or has commands for the vehicle file's actuator."""
+    for path in paths_of(options.before)[0]:
+        with contextlib.suppress(ValueError):  # a log that cannot be read is left out later
+            found = read_recording(path, **options.reading)
+            break
+    else:
+        return False
     commands = model.actuator is not None and not options.polynomial and "rotor_speed" not in found.signals
     return commands or bool({*missing_states(found)} - {"motors"})
 
@@ -128,27 +130,31 @@ def _page(options: Options, flights: Flights, found: Learned) -> page.Page:
     seconds, frozen = STEPS * options.dt, found.left_out[FROZEN][:, -1]
     better = errors.ratio(frozen, found.left_out[found.chosen][:, -1])
     cells = [errors.texts(each) for each in (*found.expected, np.exp(np.log(frozen).mean(axis=0)))]
-    rows = [(name.replace("_", " "), *numbers) for name, *numbers in zip(errors.UNITS, *cells, strict=True)]
+    rows = [
+        (name.replace("_", " "), value, f"{low.partition(chr(160))[0]} to {high}", baseline)
+        for name, value, low, high, baseline in zip(errors.UNITS, *cells, strict=True)
+    ]
     by_flight = [
         (name, *(f"{errors.ratio(found.left_out[each][i, -1], frozen[i]):.3g}" for each in CANDIDATES))
         for i, name in enumerate(flights.contents)
     ]
-    adds = "a network improves the predictions" if found.chosen.startswith("hybrid") else "a network does not help"
+    helps = "improves the predictions" if found.chosen.startswith("hybrid") else "does not help"
     return page.Page(
         f"What do {len(flights.logs)} flights of {options.before} show about the vehicle?",
         f"Predictions of {seconds:g} s on held-out flights are {better:.2g} times as accurate as with frozen rates.",
         page.Table(
             f"Expected error after {seconds:g} s on a new flight",
-            ("quantity", "RMSE", "80 % from", "to", FROZEN),
+            ("quantity", "RMSE", "80 % interval", FROZEN),
             rows,
         ),
         [("RMSE on held-out flights", errors.figure(found.left_out, options.dt))],
         [
-            f"The model is {found.chosen}: {adds}.",
+            f"The model is {found.chosen}: a network beside the physics {helps}.",
             errors.BASELINE,
             *([REMEMBERS] if found.chosen.endswith(PAST) else []),
             *([f"Rotors follow the motors of the logs with {1000 * found.lag:.3g} ms."] if found.lag else []),
             *errors.unknown(found.physics),
+            *flights.warnings,
         ],
         [f"After a change: hybrid-jax adapt {options.output} AFTER -o adapted.npz, with ten seconds of flight."],
         [

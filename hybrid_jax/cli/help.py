@@ -16,6 +16,7 @@ import tyro
 RARE = "rare"  # in the annotation of an option that only --help-all lists
 INDENT, WIDEST, LONG = 26, 100, 20  # columns; choices that are longer follow the text
 VALUES: dict[Any, str] = {bool: "", int: "N", float: "X", str: "NAME"}
+WORDS = {"N": "an integer", "X": "a number"}
 
 
 def short_help(kind: type, program: str, about: str, default: Any, common: Collection[str] | None) -> str:
@@ -81,6 +82,15 @@ def _values(hint: Any) -> str:
     if args:
         return "|".join(_values(each) for each in args if each is not NoneType)
     return VALUES.get(hint, "PATH")
+
+
+def expected(hint: Any) -> str:
+    """Describe what a user should type after an option of this type."""
+    values, many, _ = _values(hint).partition(" …")
+    one, *more = values.split()
+    what = f"one of {one.replace('|', ', ')}" if "|" in one else WORDS.get(one, one)
+    several = "" if many else f"{1 + len(more)} "
+    return f"{several}{what.split()[-1]}s" if (many or more) and one in WORDS else what
 
 
 def _wrapped(text: str, width: int) -> list[str]:

@@ -38,7 +38,7 @@ HEADER = ("parameter", "before", "after", "from", "to", "unit")
 def adapt(options: Any, model: Model) -> int:
     """Identify the model again from logs after a change, beginning with its present parameters."""
     read, layout = _like(options, options.after, model), layout_of(model.about["identified"])
-    found, logs = identified(read, layout), [*read.logs.values()]
+    found, logs = identified(read, layout), read.logs
     before, after = model.about["parameters"], values_of(found)
     with jax.enable_x64(True):  # in which it was identified
         changed = _changed(model, found)
@@ -82,7 +82,7 @@ def adapt(options: Any, model: Model) -> int:
 def check(options: Any, model: Model) -> int:
     """Compare predictions with each measured quantity, over all logs and in each."""
     read, layout = _like(options, options.flights, model), layout_of(model.about["identified"])
-    logs = [*read.logs.values()]
+    logs = read.logs
     whole = predicted(model.field, logs, layout, "all logs")
     ends = "; ".join(f"{name} {error} {unit}" for name, unit, _, error in whole.lines)
     shown = page.Page(
@@ -92,11 +92,11 @@ def check(options: Any, model: Model) -> int:
         [("Errors of predictions, all logs", figure(model.field, logs, layout))],
         [ANYWAY.format(len(read.failed))] * bool(read.failed),
         ["Where it is wrong, learn what changed from such logs: hybrid-jax adapt."],
-        [predicted(model.field, [log], layout, name) for name, log in read.logs.items()],
+        [predicted(model.field, [log], layout, name) for name, log in zip(read.contents, logs, strict=True)],
         [*read.said, *read.failed],
     )
     rmse = {name: error for name, _, _, error in whole.lines}
-    page.write(options.out, "check", shown, {"flights": list(read.logs), "rmse": rmse})
+    page.write(options.out, "check", shown, {"flights": list(read.contents), "rmse": rmse})
     return 0
 
 
@@ -107,7 +107,7 @@ def _like(options: Any, folder: Path, model: Model) -> Read:
     learned = tuple(name.partition("[")[0] for name in model.about["parameters"])
     read = read_checked(folder, options, body.vehicle, learned, lambda _: field)
     told = "command" if isinstance(field, Actuated) else "rotor_speed"
-    for log in read.logs.values():
+    for log in read.logs:
         if told not in log.signals:
             raise ValueError(f"{log.name}: has no {told}, which the model needs; leave it out")
     require_unseen(model.about["learned_from"], read.contents)

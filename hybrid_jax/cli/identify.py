@@ -15,15 +15,14 @@ from matplotlib.figure import Figure
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
-from hybrid_jax.cli.command import step
-from hybrid_jax.cli.compared import compared, require_passed, unlearned_drag
-from hybrid_jax.cli.flags import in_flags
+from hybrid_jax.cli.command import ChecksFailed, in_flags, step
+from hybrid_jax.cli.compared import compared, unlearned_drag
 from hybrid_jax.cli.help import RARE
-from hybrid_jax.cli.logs import LogOptions, content_of, raw_logs, require_distinct
+from hybrid_jax.cli.logs import LogOptions, recordings_of
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
-from hybrid_jax.flights.checks.suitability import check_recording
-from hybrid_jax.flights.load import read_recording
+from hybrid_jax.flights.checks.consistency import Check
+from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, window_errors
@@ -37,6 +36,8 @@ LISTS = ("--learn", "--motor-order", "--topics", "--disturbance")
 ENDS = ("value", "low", "high")
 LINES = 5  # of what is not folded
 FITS = ("dt", "steps", "windows", "disturbance")  # options that a model remembers
+NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
+MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
 ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below counts until they pass."
 
 
@@ -84,29 +85,25 @@ class Options(LogOptions):
 
 
 class Read(NamedTuple):
-    """Recordings by file name, the initial field, lines for the page, and failed checks."""
+    """Recordings, digests of them by file name, the initial field, lines for the page, and failed checks."""
 
-    logs: dict[str, Recording]
+    logs: list[Recording]
+    contents: dict[str, str]
     field: Any
     said: list[str]
     failed: list[str]
-
-    @property
-    def contents(self) -> dict[str, str]:
-        return {name: content_of(log) for name, log in self.logs.items()}
 
 
 def run(options: Options) -> int:
     for name in ("steps", "windows"):
         checks.count(f"--{name}", getattr(options, name))
-    checks.writable_folder("--out", options.out)
-    checks.writable_folder("--output", options.output.parent)
     read = checked(options)
-    found = identified(read, layout_of(vars(options)))
+    fits = {name: getattr(options, name) for name in FITS}
+    found = identified(read, layout_of(fits))
     about = {"dt": options.dt, "learned_from": read.contents, "parameters": values_of(found)}
-    about |= {"identified": {name: getattr(options, name) for name in FITS}, "covariance": found.covariance}
+    about |= {"identified": fits, "covariance": found.covariance}
     save(options.output, found.field, json_value(about))
-    shown = _page(options, found, read)
+    shown = _page(options, found, read, layout_of(fits))
     page.write(options.out, "identify", shown, {"parameters": about["parameters"], "model": options.output})
     return 0
 
@@ -118,34 +115,45 @@ def layout_of(fits: Mapping[str, Any]) -> Layout:
 
 def checked(options: Options) -> Read:
     """Read the logs of a folder and check them against the vehicle file; raise ChecksFailed without --anyway."""
-    model = _model_of(options)
-    return read_checked(
-        options.folder, options, model.vehicle, model.learn, lambda logs: _field_of(options, model, logs)
-    )
+    model = load_vehicle_model(options.vehicle)
+    model = replace(model, learn=options.learn or model.learn)
+    if not model.learn:
+        raise ValueError(f"{options.vehicle}: learn: is empty; give --learn Ix Iy, or other unknown parameters")
+    if LAG in model.learn:
+        mend = _learn(model.learn, (LAG,))
+        raise ValueError(f"{options.vehicle}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
+    start = partial(_field_of, options, model)
+    return read_checked(options.folder, options, model.vehicle, model.learn, start)
 
 
 def read_checked(
     folder: Path, options: Any, vehicle: Vehicle, learn: Sequence[str], start: Callable[[Sequence[Recording]], Any]
 ) -> Read:
     """Read and check the logs of a folder like `checked`, for the field that `start` makes for them."""
-    raws, said = raw_logs(folder, partial(read_recording, **options.reading))
-    logs = {path.name: log for path, log in raws}
-    require_distinct([(log.name, content_of(log)) for log in logs.values()])
-    said += [f"{name}: {note}" for name, log in logs.items() for note in log.notes]
-    failed = require_passed([(log, check_recording(log, vehicle)) for log in logs.values()], options.anyway)
-    field = start([*logs.values()])
-    failed += require_passed([(log, compared(log, field, learn)) for log in logs.values()], options.anyway)
-    failed = [in_flags("identify", line) for line in failed]
-    for line in (*said, *failed):
+    raws, contents, said = recordings_of(folder, options)
+    logs = [*raws.values()]
+    notes = [f"{name}: {note}" for name, log in raws.items() for note in log.notes]
+    failed: list[str] = []
+
+    def require(checks_of: Callable[[Recording], list[Check]]) -> None:
+        kept = {name: [each for each in checks_of(log) if each.name not in NOT_NEEDED] for name, log in raws.items()}
+        failed.extend(line for name, each in kept.items() for line in failures(each, name))
+        if failed and not options.anyway:
+            raise ChecksFailed(*failed, MEND)
+
+    require(lambda log: check_recording(log, vehicle))
+    field = start(logs)
+    require(lambda log: compared(log, field, learn))
+    failed = list(map(in_flags, failed))
+    for line in (*notes, *failed):
         print(f"  {line}", file=sys.stderr)
-    return Read(logs, field, said, failed)
+    return Read(logs, contents, field, said + notes, failed)
 
 
 def identified(read: Read, layout: Layout) -> Identified:
     """Identify the parameters, beginning with the field's; with commands, thrust comes before rotation."""
-    with step(f"identifying by {page.counted(read.logs, 'log')}") as told:
-        fit = identify_in_turn if isinstance(read.field, Actuated) else identify
-        found = fit(read.field, [*read.logs.values()], layout)
+    with step(f"identifying from {page.counted(read.logs, 'log')}") as told:
+        found = (identify_in_turn if isinstance(read.field, Actuated) else identify)(read.field, read.logs, layout)
         told(f"{found.windows} windows, {found.seconds:.4g} s of flight")
     return found
 
@@ -154,25 +162,9 @@ def values_of(found: Identified) -> dict[str, Any]:
     """Return each parameter with its interval and unit as JSON values."""
     units = cast(Any, found.field).parameter_units
     return {
-        name: {
-            "value": float(value),
-            "low": float(low),
-            "high": float(high),
-            "unit": units.get(name.partition("[")[0], ""),
-        }
-        for name, (value, low, high) in found.intervals.items()
+        name: dict(zip(ENDS, map(float, each), strict=True)) | {"unit": units.get(name.partition("[")[0], "")}
+        for name, each in found.intervals.items()
     }
-
-
-def _model_of(options: Options) -> VehicleModel:
-    model = load_vehicle_model(options.vehicle)
-    model = replace(model, learn=options.learn) if options.learn else model
-    if not model.learn:
-        raise ValueError(f"{options.vehicle}: learn: is empty; give --learn Ix Iy, or other unknown parameters")
-    if LAG in model.learn:
-        mend = _learn(model.learn, (LAG,))
-        raise ValueError(f"{options.vehicle}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
-    return model
 
 
 def _field_of(options: Options, model: VehicleModel, logs: Sequence[Recording]) -> Any:
@@ -198,20 +190,24 @@ def _learn(names: Sequence[str], without: Sequence[str]) -> str:
     return f"give --learn {' '.join(name for name in names if name not in without) or 'Ix Iy'}"
 
 
-def _page(options: Options, found: Identified, read: Read) -> page.Page:
-    values, logs = values_of(found), [*read.logs.values()]
-    errors = figure(found.field, logs, layout_of(vars(options)))
+def _page(options: Options, found: Identified, read: Read, layout: Layout) -> page.Page:
+    values = values_of(found)
     lines = [(name, *(f"{one[end]:.4g}" for end in ENDS), one["unit"]) for name, one in values.items()]
     unseen = [name for name, one in values.items() if not np.isfinite(one["high"])]
     header = ("parameter", "estimate", "from", "to", "unit")
     fitted = [(name, _unit(name), "  ".join(f"{e:.3g}" for e in each)) for name, each in found.errors.items()]
     again = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     return page.Page(
-        f"What do {page.counted(logs, 'log')} of {options.folder} show about the vehicle?",
+        f"What do {page.counted(read.logs, 'log')} of {options.folder} show about the vehicle?",
         f"{len(values) - len(unseen)} of {len(lines)} parameters are identified by {found.seconds:.4g} s of flight.",
         page.Table("Parameters, with 95 % intervals", header, lines[:LINES]),
-        [("Errors of predictions from the state estimated from earlier samples", errors)],
-        [*warned(read, found), *_notes(found, logs, unseen)],
+        [
+            (
+                "Errors of predictions from the state estimated from earlier samples",
+                figure(found.field, read.logs, layout),
+            )
+        ],
+        [*warned(read, found), *_notes(found, read.logs, unseen)],
         [f"You should excite {', '.join(unseen)} more, or learn fewer parameters." if unseen else again],
         [
             *([page.Table("All parameters, with 95 % intervals", header, lines)] * (len(lines) > LINES)),
@@ -235,8 +231,8 @@ def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) 
         f"Not identifiable from these logs, unchanged: {', '.join(unseen)}.": unseen,
         f"Commands {max(slow, default=0):.3g} s apart: the intervals include changes in between; such a log "
         "hardly distinguishes a delay from a lag.": slow,
-        f"Share of the detrended body rates within a window that commands explain: {shares}; inertia and "
-        "torque have intervals that contain both regressions, of torque on acceleration and the other way round.": True,
+        f"Share of the changes of the body rates that the motors explain: {shares}; the less, the wider are the "
+        "intervals of inertia and torque.": True,
         ("" if "drag" in learned else unlearned_drag(logs)): True,
     }
     return [note for note, holds in notes.items() if note and holds]

@@ -13,10 +13,9 @@ from matplotlib.figure import Figure
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
-from hybrid_jax.cli.command import BAD_INPUT
+from hybrid_jax.cli.command import BAD_INPUT, in_flags
 from hybrid_jax.cli.estimates import estimate
-from hybrid_jax.cli.flags import in_flags
-from hybrid_jax.cli.logs import LISTS, SpeedOptions, look, raw_logs
+from hybrid_jax.cli.logs import LISTS, SpeedOptions, content_of, grouped, look, paths_of
 from hybrid_jax.cli.vehicle_text import vehicle_text
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
@@ -33,6 +32,7 @@ BORNE = ("quantities", "slowest signal", "gaps", "repeated samples")
 SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
 NOT_RUN = f"Without --vehicle these are not checked: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
 EMPTY = "–"
+READY = "Every verb reads logs that are ready, and leaves out those that fail."
 LESS = "Some logs have motors and lack states ({}): hybrid-jax identify learns what these determine."
 
 
@@ -81,6 +81,12 @@ class Inspected(NamedTuple):
         return [check for check in self.checks if check.verdict == FAILS]
 
     @property
+    def warning(self) -> str:
+        """The first check that warns, for a log that is ready."""
+        warns = [check for check in self.checks if check.verdict == WARNS and self.result == "ready"]
+        return f"; {warns[0].name} warns: {warns[0].suggestion}" if warns else ""
+
+    @property
     def result(self) -> str:
         """The result: not read, FAILS, no flight, or ready."""
         if self.recording is None:
@@ -95,38 +101,39 @@ def run(options: Options) -> int:
     for name in ("dt", "mass", "arm"):
         if (value := getattr(options, name)) is not None:
             checks.positive(f"--{name}", value)
-    _ = options.reading  # topics are checked before anything is read
-    checks.writable_folder("--out", options.out)
-    if options.write_vehicle is not None and options.write_vehicle.exists():
-        raise ValueError(f"--write-vehicle: {options.write_vehicle} exists; name another file")
+    if (path := options.write_vehicle) is not None:
+        checks.writable_folder("--write-vehicle", path.parent)
+        if path.exists():
+            raise ValueError(f"--write-vehicle: {path} exists; name another file")
     vehicle = None if options.vehicle is None else load_vehicle_model(options.vehicle).vehicle
-    read, left = raw_logs(options.folder, lambda path: inspected(path, vehicle, options))
-    logs = [log for _, log in read]
-    left = [printable(line) for line in left]
+    paths, left = paths_of(options.folder)
+    logs = inspected(paths, vehicle, options)
     for log in logs:
-        kind = [
-            f"{format}, {vehicle}, {seconds} s, {motors} motors: "
-            for format, vehicle, *_, seconds, motors in _facts(log)
-        ]
-        print(f"{log.name}: {''.join(kind)}{log.result}")
+        kind = [f"{each[0]}, {each[1]}, {each[-2]} s, {each[-1]} motors: " for each in _facts(log)]
+        print(f"{log.name}: {''.join(kind)}{log.result}{log.warning}")
     rows = [{"log": log.name, "result": log.result} for log in logs]
-    page.write(options.out, "inspect", _page(options, logs, left), {"rows": rows})
-    if options.write_vehicle is not None:
-        write_vehicle(options.write_vehicle, logs, options.folder, options.mass, options.arm)
+    page.write(options.out, "inspect", _page(options, logs, [printable(line) for line in left]), {"rows": rows})
+    if path is not None:
+        write_vehicle(path, logs, options.folder, options.mass, options.arm)
     return BAD_INPUT if all(log.recording is None for log in logs) else 0  # the lines above say why
 
 
-def inspected(path: Path, vehicle: Vehicle | None, options: Any) -> Inspected:
-    """Read and check one log by the options of this verb or of `fit`; an error becomes part of the result."""
-    name = printable(path.name)
-    try:
-        raw = read_recording(path, **options.reading)
-    except ValueError as error:
-        why = str(error).removeprefix(f"{path}: ")
-        return Inspected(name, None, refusal=printable(in_flags("inspect", why)))
-    found = look(path, raw, vehicle, options.dt, options)
-    told = [replace(each, suggestion=in_flags("inspect", each.suggestion)) for each in found.checks]
-    return Inspected(name, raw, told, in_flags("inspect", found.refusal), (*raw.notes, *found.notes))
+def inspected(paths: Sequence[Path], vehicle: Vehicle | None, options: Any) -> list[Inspected]:
+    """Read and check logs by the options of this verb or of `fit`; an error becomes part of the result."""
+    found, first = [], {}
+    for path in paths:
+        name = printable(path.name)
+        try:
+            raw = read_recording(path, **options.reading)
+        except ValueError as error:
+            found.append(Inspected(name, None, refusal=printable(in_flags(str(error).removeprefix(f"{path}: ")))))
+            continue
+        one = look(path, raw, vehicle, options.dt, options)
+        told = [replace(each, suggestion=in_flags(each.suggestion)) for each in one.checks]
+        same = first.setdefault(content_of(raw), name)
+        refusal = in_flags(one.refusal) if same == name else f"the same flight as {same}; leave one of the two out"
+        found.append(Inspected(name, raw, told, refusal, (*raw.notes, *one.notes)))
+    return found
 
 
 def write_vehicle(
@@ -142,7 +149,7 @@ def trusted(logs: Sequence[Inspected]) -> list[Recording]:
     left = [log.name for log in logs if any(check.name not in BORNE for check in log.failed)]
     kept = [log.recording for log in logs if log.recording is not None and log.name not in left]
     if not kept:
-        raise ValueError("vehicle file: no log flew and passed its checks; hybrid-jax inspect says what mends them")
+        raise ValueError(f"vehicle file: no log flew and passed its checks; {logs[0].name}: {logs[0].result}")
     if left:
         print(f"left out of the vehicle file, as checks failed: {', '.join(left)}")
     return kept
@@ -155,34 +162,29 @@ def printable(text: str) -> str:
 
 def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> page.Page:
     ready = sum(log.result == "ready" for log in logs)
-    mends = [(log.name, c.name, c.suggestion) for log in logs for c in log.checks if c.verdict in (FAILS, WARNS)] + [
-        (log.name, "flight", log.refusal) for log in logs if log.refusal
-    ]
+    mends = [(log.name, c.name, c.suggestion) for log in logs for c in log.checks if c.verdict in (FAILS, WARNS)]
+    mends += [(log.name, "no flight", log.refusal) for log in logs if log.refusal]
     learn = f"Learn from them: hybrid-jax fit {options.folder} -o source.npz --vehicle {options.vehicle or 'v.toml'}"
-    read = [log for log in logs if log.recording is not None]
-    motors = [log for log in read if log.recording and log.recording.rotors]
-    less = ", ".join(log.name for log in motors if "quantities" in {check.name for check in log.failed})
+    read = [(log, log.recording) for log in logs if log.recording is not None]
+    less = [log.name for log, raw in read if raw.rotors and "quantities" in {check.name for check in log.failed}]
     worst = sorted(logs, key=lambda log: log.result == "ready")
+    every = [(log.name, log.result, *(*_facts(log), (EMPTY,) * 6)[0]) for log in logs]
     return page.Page(
         f"Do the logs of {printable(str(options.folder))} suffice for a model?",
         f"{ready} of {len(logs)} logs are ready for a model.",
-        page.Table("Logs", ("log", "result"), [(log.name, log.result) for log in worst[:LINES]]),
+        page.Table("Logs", ("log", "result"), [(log.name, f"{log.result}{log.warning}") for log in worst[:LINES]]),
+        [(f"{log.name}: its signals; grey: gaps", _drawn(raw)) for log, raw in read[:PICTURED]],
         [
-            (f"{log.name}: its signals; grey: gaps", _drawn(log.recording))
-            for log in read[:PICTURED]
-            if log.recording is not None
+            READY,
+            *([LESS.format(", ".join(less))] if less else []),
+            *([NOT_RUN] if options.vehicle is None and read else []),
         ],
-        [*([LESS.format(less)] if less else []), *([NOT_RUN] if options.vehicle is None and read else [])],
-        [*([] if ready else [f"{log}: {check}: {mend}" for log, check, mend in mends[:LINES]]), learn],
+        [learn] if ready else grouped(mends)[:LINES],
         [
-            page.Table(
-                "All logs",
-                ("log", "result", "format", "vehicle", "airframe", "program", "s", "motors"),
-                [(log.name, log.result, *(*_facts(log), (EMPTY,) * 6)[0]) for log in logs],
-            ),
+            page.Table("All logs", ("log", "result", "format", "vehicle", "airframe", "program", "s", "motors"), every),
             page.Table("What to do", ("log", "check", "what it found, and what mends it"), mends),
-            _signals(read),
-            _checks(read),
+            _signals([log for log, _ in read]),
+            _checks([log for log, _ in read]),
         ],
         [*(f"{log.name}: {note}" for log in logs for note in log.notes), *left],
     )
@@ -238,8 +240,8 @@ def _drawn(recording: Recording) -> Figure:
         panel.plot(*_broken(signal), linewidth=0.8, label=signal.axes)
         for start, end in signal.gaps():
             panel.axvspan(start, end, color="0.85")
-        panel.set_ylabel(f"{name.replace('_', chr(10))}\n[{_unit(name)}]", fontsize=7)
-        panel.legend(loc="upper right", fontsize=6, ncols=len(signal.axes))
+        panel.set_ylabel(f"{name.replace('_', chr(10))}\n[{_unit(name)}]", fontsize=8)
+        panel.legend(loc="upper right", fontsize=8, ncols=len(signal.axes))
     panels[-1].set_xlabel("time [s]")
     return figure
 

@@ -1,24 +1,24 @@
 """Learn a vehicle from flights, with physics only or with a network, for `fit` and experiments."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Float
 
 from hybrid_jax.adaptation import METHODS, Adaptation, Auto, adapt
 from hybrid_jax.cli import errors
-from hybrid_jax.cli.choice import choose, expected
-from hybrid_jax.cli.logs import STEPS, windows_of
+from hybrid_jax.cli.logs import STEPS, lagged, windows_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.estimation import fit_disturbance
-from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
+from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.windows import sequences
 from hybrid_jax.networks.mlp import InputScaling, zero_output
@@ -27,6 +27,7 @@ from hybrid_jax.training import Settings, fit, rates_by_group
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.trajectories import Trajectories, split
 
+LEVEL = 0.8  # of the interval of the error on a new flight
 TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
 FOLDS = 3  # at most so many groups of flights are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
@@ -36,25 +37,15 @@ FROZEN, CANDIDATES = "thrust, rates frozen", ("physics", "hybrid", f"physics{PAS
 
 
 class Learned(NamedTuple):
-    """A learned model of a vehicle.
-
-    Attributes:
-        field: the model.
-        physics: the identified physics without the network, with intervals.
-        chosen: one of CANDIDATES.
-        lag: rotor lag relative to the logged motors [s].
-        left_out: RMSE of FROZEN and each candidate on held-out flights, after each interval.
-        windows: some of those that it was learned from, by which `adapt` judges its errors without any change.
-        expected: expected error on a new flight, in `errors.UNITS`: value, low, high.
-    """
+    """A learned model of a vehicle."""
 
     field: AbstractVectorField
-    physics: Adaptation
-    chosen: str
-    lag: float
-    left_out: dict[str, Float[np.ndarray, "flights t 4"]]
-    windows: Trajectories
-    expected: Float[np.ndarray, "3 4"]
+    physics: Adaptation  # without the network, with intervals
+    chosen: str  # one of CANDIDATES
+    lag: float  # of the rotors behind the logged motors [s]
+    left_out: dict[str, Float[np.ndarray, "flights t 4"]]  # RMSE of FROZEN and each candidate on held-out flights
+    windows: Trajectories  # some that it was learned from, by which `adapt` judges its errors without any change
+    expected: Float[np.ndarray, "3 4"]  # error on a new flight, in `errors.UNITS`: value, low, high
 
 
 def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Learned:
@@ -77,11 +68,11 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
     found = {name: np.concatenate(each)[order] for name, each in parts.items()}
     ends = {name: each[:, -1] for name, each in found.items()}
     chosen = choose({name: np.log(ends[name] / ends[FROZEN]).mean(axis=1) for name in CANDIDATES})
-    windows = windows_of(logs, STEPS, STEPS, TRAINED).windows
+    windows = windows_of(logs, STEPS, STEPS, TRAINED)
     physics = adapt(model.physics(), windows, method=PHYSICS, settings=settings)
     field = physics.field if chosen.startswith("physics") else _hybrid(physics.field, logs, seed, settings)
     field = with_past(field, logs) if chosen.endswith(PAST) else field
-    kept = windows_of(logs, STEPS, STEPS, KEPT).windows
+    kept = windows_of(logs, STEPS, STEPS, KEPT)
     return Learned(field, physics, chosen, lag, found, kept, expected(np.log(ends[chosen])))
 
 
@@ -92,7 +83,7 @@ def adapted(
 
     Also return the adaptation of the model without its past.
     """
-    windows = windows_of(logs, STEPS, STEPS, most).windows
+    windows = windows_of(logs, STEPS, STEPS, most)
     found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)
     if not isinstance(field, DisturbanceModel):
         return found.field, found
@@ -111,11 +102,6 @@ def with_past(field: AbstractVectorField, logs: Sequence[FlightLog], most: int |
 
 def without_past(field: AbstractVectorField) -> AbstractVectorField:
     return field.field if isinstance(field, DisturbanceModel) else field
-
-
-def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:
-    """Apply a rotor lag [s] to the motors of flights."""
-    return [lag_motors(log, lag) for log in logs] if lag else list(logs)
 
 
 def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
@@ -139,7 +125,7 @@ def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
 
 def _windows(logs: Sequence[FlightLog], count: int) -> Trajectories:
     """Select evenly spaced windows, repeated if there are fewer, so that trainings share a compiled program."""
-    windows = windows_of(logs, STEPS, 1, count).windows
+    windows = windows_of(logs, STEPS, 1, count)
     return windows[np.arange(count) % len(windows)]
 
 
@@ -154,3 +140,28 @@ def _hybrid(physics: Any, logs: Sequence[FlightLog], seed: int, settings: Settin
     train, validation = _windows(learned, TRAINED), _windows(validating, VALIDATED)
     rates = rates_by_group(field, {"residual": RATE})
     return fit(field, train, validation, key, rates=rates, min_epochs=0, max_epochs=EPOCHS, settings=settings).best
+
+
+def choose(scores: Mapping[str, Float[np.ndarray, " flights"]]) -> str:
+    """Choose a candidate by its log-errors on held-out flights; the first is the baseline, and the simplest are first.
+
+    A model should be reliable on flights that nobody has recorded, so one that is worse than the baseline on any flight
+    is rejected. Of the others, the simplest within one standard error of the smallest mean is chosen, by paired
+    differences (Breiman et al., "Classification and regression trees", 1984). Each flight counts once, because its
+    windows share wind, battery and manoeuvre.
+    """
+    baseline = next(iter(scores.values()))
+    considered = {name: each for name, each in scores.items() if np.isfinite(each).all() and (each <= baseline).all()}
+    best = min(considered.values(), key=np.mean)
+    worse = {name: each - best for name, each in considered.items()}
+    error = {name: each.std(ddof=1) / len(each) ** 0.5 if len(each) > 1 else 0.0 for name, each in worse.items()}
+    return next(name for name, each in worse.items() if each.mean() <= error[name])
+
+
+def expected(logs: Float[np.ndarray, "flights ..."], level: float = LEVEL) -> Float[np.ndarray, "3 ..."]:
+    """Return the expected error on another flight and its interval, by Student's t of the flights' log-errors."""
+    n, middle = len(logs), logs.mean(axis=0)
+    if n < 2:
+        return np.stack([np.exp(middle), np.zeros_like(middle), np.full_like(middle, np.inf)])
+    half = scipy.special.stdtrit(n - 1, (1 + level) / 2) * logs.std(axis=0, ddof=1) * (1 + 1 / n) ** 0.5
+    return np.exp([middle, middle - half, middle + half])

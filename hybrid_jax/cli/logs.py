@@ -1,25 +1,43 @@
-"""Read logs of a folder, check them, and cut them into flights and windows, for every verb."""
+"""Read logs of a folder, check them, and cut them into flights and windows, for every verb; and models of them."""
 
 import itertools
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from hybrid_jax.cli.command import ChecksFailed, step
+from hybrid_jax.cli.command import ChecksFailed, in_flags, step
 from hybrid_jax.cli.help import RARE
-from hybrid_jax.flights.checks.cleaning import Cleaning, clean
-from hybrid_jax.flights.checks.consistency import GYRO, RATIO, Check, check_log
-from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.export.program import vehicle_in
+from hybrid_jax.extrapolation import WARN, shares_outside
+from hybrid_jax.flights.checks.cleaning import Cleaning, clean, lag_motors
+from hybrid_jax.flights.checks.consistency import (
+    FAILS,
+    GYRO,
+    ORDER,
+    RATES,
+    RATIO,
+    THRUST,
+    UNKNOWN,
+    WARNS,
+    Check,
+    check_log,
+)
+from hybrid_jax.flights.checks.suitability import ROTORS, check_recording
 from hybrid_jax.flights.conversion import flight_at
+from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import FlightLog, unevenness
 from hybrid_jax.flights.recording import Recording
-from hybrid_jax.flights.windows import LogWindows, cut_windows, require_length
+from hybrid_jax.flights.windows import cut_windows, require_length
 from hybrid_jax.io.archive import digest
+from hybrid_jax.io.models import Model
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 LISTS = ("--polynomial", "--motor-order", "--topics", "--learn")
@@ -43,7 +61,9 @@ class LogOptions:
 
     @property
     def reading(self) -> dict[str, Any]:
-        """Arguments of the functions of `hybrid_jax.flights.load`; raises ValueError for malformed topics."""
+        """Arguments of the functions of `hybrid_jax.flights.load`; raises ValueError for malformed ones."""
+        if self.columns is not None:
+            load_column_map(self.columns)
         for word in self.topics:
             if "=" not in word:
                 raise ValueError(f"topics must be pairs like odometry=/odom, got {word!r}")
@@ -72,17 +92,13 @@ class FlightOptions(SpeedOptions):
 
 
 class Flights(NamedTuple):
-    """The flights of a folder, at one interval.
+    """The flights of a folder, at one interval."""
 
-    Attributes:
-        logs: airborne flights of the logs that passed.
-        contents: digests of the flights' contents by name.
-        said: lines on logs that were read, left out or cut.
-    """
-
-    logs: list[FlightLog]
-    contents: dict[str, str]
-    said: list[str]
+    logs: list[FlightLog]  # airborne, of the logs that passed
+    contents: dict[str, str]  # digests by name
+    said: list[str]  # lines on logs that were read, left out or cut
+    warnings: Sequence[str] = ()  # of checks
+    still: bool = False  # whether none moves enough to be compared with itself
 
     @property
     def seconds(self) -> float:
@@ -91,28 +107,20 @@ class Flights(NamedTuple):
 
 
 class Looked(NamedTuple):
-    """A checked log and its flight.
+    """A checked log and its flight."""
 
-    Attributes:
-        log: its airborne flight, or None.
-        checks: checks of its signals, except what every verb corrects.
-        refusal: why it is not a flight, or empty.
-        notes: what was cut.
-    """
-
-    log: FlightLog | None
-    checks: list[Check]
-    refusal: str
-    notes: list[str]
+    log: FlightLog | None  # airborne
+    checks: list[Check]  # of its signals, except what every verb corrects
+    refusal: str  # why it is not a flight, or empty
+    notes: list[str]  # what was cut
 
 
 def require_distinct(flights: Sequence[tuple[str, Any]]) -> None:
     """Raise ValueError if a flight occurs twice, as it could be in training and test; pass names and contents."""
     first: dict[Any, str] = {}
     for name, content in flights:
-        if content in first:
+        if first.setdefault(content, name) != name:
             raise ValueError(f"{name}: the same flight as {first[content]}; leave one of the two out")
-        first[content] = name
 
 
 def require_unseen(learned_from: Mapping[str, str], contents: Mapping[str, str]) -> None:
@@ -120,9 +128,8 @@ def require_unseen(learned_from: Mapping[str, str], contents: Mapping[str, str])
     names = {content: name for name, content in learned_from.items()}
     for name, content in contents.items():
         if content in names:
-            raise ValueError(
-                f"{name}: the same flight as {names[content]}, which the model was trained on; leave it out"
-            )
+            known = f"{name}: the same flight as {names[content]}, which the model was trained on"
+            raise ValueError(f"{known}; leave it out")
 
 
 def content_of(recording: Recording) -> str:
@@ -131,15 +138,36 @@ def content_of(recording: Recording) -> str:
     return digest(None, {f"{name} {part}": getattr(signal, part) for (name, signal), part in parts})
 
 
-def raw_logs(folder: Path, read: Callable[[Path], Any]) -> tuple[list[tuple[Path, Any]], list[str]]:
-    """Apply `read` to each log of a folder, or to one log; also return a line for each skipped file."""
+def paths_of(folder: Path) -> tuple[list[Path], list[str]]:
+    """List the logs of a folder, or one log; also return a line for each other file."""
     if not folder.exists():
         raise ValueError(f"{folder}: no such file or folder")
     paths, others = find_logs(folder) if folder.is_dir() else ([folder], {})
-    left = [f"{path.name}: left: {why}" for path, why in others.items()]
+    left = [f"{path.name}: {why}" for path, why in others.items()]
     if not paths:
-        raise ValueError(f"{folder}: contains no logs, only {'; '.join(left) or 'nothing'}")
-    return [(path, read(path)) for path in paths], left
+        raise ValueError(f"{folder}: contains no logs{', only ' * bool(left)}{'; '.join(left[:5])}")
+    return paths, left
+
+
+def recordings_of(folder: Path, options: LogOptions) -> tuple[dict[str, Recording], dict[str, str], list[str]]:
+    """Read the logs of a folder, or one log, by file name: recordings, their digests, and a line for each other file.
+
+    A log that cannot be read is left out with a line, unless there is no other.
+    """
+    paths, said = paths_of(folder)
+    found, unread, reading = {}, [], options.reading
+    for path in paths:
+        try:
+            found[path.name] = read_recording(path, **reading)
+        except ValueError as error:
+            unread.append(f"left out: {error}")
+    if not found:
+        raise ValueError(unread[0].removeprefix("left out: "))
+    for line in unread:
+        print(f"  {in_flags(line)}", file=sys.stderr)
+    contents = {name: content_of(log) for name, log in found.items()}
+    require_distinct([*contents.items()])
+    return found, contents, said + unread
 
 
 def read_flights(
@@ -149,29 +177,42 @@ def read_flights(
 
     `changed` tolerates another thrust, and `lagging` motors that lead the gyro because the model includes their lag.
     """
-    with step(f"reading {folder}") as told:
-        raws, said = raw_logs(folder, lambda path: read_recording(path, **options.reading))
-        contents = {path.name: content_of(raw) for path, raw in raws}
-        require_distinct(list(contents.items()))
-        logs, failed = [], []
-        for path, raw in raws:
-            one = look(path, raw, vehicle, dt, options, changed, lagging)
-            lines = failures(one.checks, path.name) or [f"{path.name}: no flight: {one.refusal}"] * bool(one.refusal)
-            said += [f"{path.name}: {note}" for note in (*raw.notes, *one.notes)]
-            failed += lines
+    with step(f"reading {folder}") as done:
+        raws, contents, said = recordings_of(folder, options)
+        logs: list[FlightLog] = []
+        failed: list[tuple[str, str, str]] = []  # a log, a check and what it says
+        warned: list[tuple[str, str, str]] = []
+        moving = False
+        for name, raw in raws.items():
+            one = look(Path(raw.name), raw, vehicle, dt, options, changed, lagging)
+            lines = [(name, each.name, each.suggestion) for each in one.checks if each.verdict == FAILS]
+            failed += (lines := lines or [(name, "no flight", one.refusal)] * bool(one.refusal))
+            told = *raw.notes, *one.notes, *(f"{check}: {why}" for _, check, why in lines)
+            said += [f"{name}: {in_flags(line)}" for line in told]
             if one.log is not None and (options.anyway or not lines):
                 logs.append(one.log)
+                warned += [(name, each.name, each.suggestion) for each in one.checks if each.verdict == WARNS]
+                moving |= {each.verdict for each in one.checks if each.name in (RATES, THRUST, ORDER)} != {UNKNOWN}
             else:
-                del contents[path.name]
-        for line in failed:
-            print(f"  {line}", file=sys.stderr)
+                del contents[name]
+        short = grouped(failed)
         if not logs:
-            raise ChecksFailed(
-                *failed, "no log passed its checks; correct them as the lines above say, or use --anyway"
-            )
-        found = Flights(logs, contents, said + failed)
-        told(f"{len(logs)} of {len(raws)} flights, {found.seconds:.0f} s in the air")
+            other = all({RATIO, ROTORS} & {check for log, check, _ in failed if log == name} for name in raws)
+            why = f"; or are they of another vehicle than {vehicle.name}?" * other
+            raise ChecksFailed(*short, f"no log passed its checks; correct them as said above, or use --anyway{why}")
+        for line in short:
+            print(f"  {in_flags(line)}", file=sys.stderr)
+        found = Flights(logs, contents, said, list(map(in_flags, grouped(warned))), not moving)
+        done(f"{len(logs)} of {len(raws)} flights, {found.seconds:.0f} s in the air")
     return found
+
+
+def grouped(lines: Sequence[tuple[str, str, str]]) -> list[str]:
+    """Return a line for each check that logs failed: what it says of the first, and how many more there are."""
+    checks: dict[str, list[str]] = {}
+    for name, check, told in lines:
+        checks.setdefault(check, []).append(f"{name}: {check}: {told}")
+    return [first + f" (and {len(more)} more of the logs)" * bool(more) for first, *more in checks.values()]
 
 
 def look(
@@ -184,18 +225,18 @@ def look(
     lagging: bool = False,
 ) -> Looked:
     """Check a log and cut it to its flight; if the vehicle cannot be used, it is compared with itself."""
-    checks, notes = check_recording(raw, vehicle, dt), []
+    checks, notes, log, refusal = check_recording(raw, vehicle, dt), [], None, ""
     scaled = "rotor_speed" in raw.signals or bool(options.polynomial)
     try:
         log = flight_at(raw, dt, options.polynomial if scaled else ONE_TO_ONE)
         fits = log.dt == dt and not unevenness(log).any()
-        log, notes = clean(log, Cleaning(in_flight=True, resample=None if fits else dt, delay=options.delay))
+        log, cut = clean(log, Cleaning(in_flight=True, resample=None if fits else dt, delay=options.delay))
+        notes = [line for line in cut if not line.startswith("0 ")]
         other = vehicle is not None and log.u.shape[1] != vehicle.rotors  # a check that failed says so
         checks += check_log(log, None if other or not scaled else vehicle)
         require_length([log], STEPS)
         if not scaled:
             flight_at(raw, dt)  # says what is missing
-        refusal = ""
     except ValueError as error:
         log, refusal = None, str(error).removeprefix(f"{path}: ")
     borne = {RATIO: changed, GYRO: lagging}
@@ -203,12 +244,59 @@ def look(
     return Looked(log, [each for each in checks if each not in excused], refusal, notes)
 
 
-def windows_of(logs: Sequence[FlightLog], steps: int, stride: int, most: int | None = None) -> LogWindows:
+def windows_of(logs: Sequence[FlightLog], steps: int, stride: int, most: int | None = None) -> Trajectories:
     """Cut flights into windows and keep at most `most`, evenly spaced."""
-    found = cut_windows(list(logs), steps, stride)
+    found = cut_windows(list(logs), steps, stride).windows
     if most is None or len(found) <= most:
         return found
-    kept = np.round(np.linspace(0, len(found) - 1, most)).astype(int)
-    of = np.repeat(np.arange(len(found.sizes)), found.sizes)[kept]
-    sizes = [int(np.sum(of == i)) for i in range(len(found.sizes))]
-    return LogWindows(found.windows[kept], sizes, stride)
+    return found[np.round(np.linspace(0, len(found) - 1, most)).astype(int)]
+
+
+def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:
+    """Apply a rotor lag [s] to the motors of flights."""
+    return [lag_motors(log, lag) for log in logs] if lag else list(logs)
+
+
+class Known(NamedTuple):
+    """A model of a vehicle, with its constants and the metadata written by `fit`."""
+
+    field: AbstractVectorField
+    vehicle: Vehicle
+    about: Mapping[str, Any]
+
+    @property
+    def dt(self) -> float:
+        return self.about["dt"]
+
+    @property
+    def steps(self) -> int:
+        return self.about["steps"]
+
+
+def known_of(path: Path, model: Model) -> Known:
+    """Convert a model from a file; raise ValueError if `fit` or `adapt` did not write it."""
+    vehicle = vehicle_in(model.field)
+    if "identified" in model.about:
+        raise ValueError(f"{path}: was identified without states, which replay draws; hybrid-jax check predicts logs")
+    if vehicle is None or not {"dt", "steps", "learned_from", "motion", "windows"} <= model.about.keys():
+        raise ValueError(f"{path}: is not a model written by hybrid-jax fit or adapt")
+    return Known(model.field, vehicle, model.about)
+
+
+def flights_for(known: Known, folder: Path, options: FlightOptions, changed: bool, unseen: bool = True) -> Flights:
+    """Read the flights of a folder like those of a model; if `unseen`, none may be one that it was trained on."""
+    polynomial = options.polynomial or tuple(known.about.get("polynomial", ()))
+    lag, options = known.about.get("lag", 0.0), replace(options, polynomial=polynomial)
+    found = read_flights(folder, known.vehicle, known.dt, options, changed, lag > 0)
+    require_unseen(known.about["learned_from"] if unseen else {}, found.contents)
+    return found._replace(logs=lagged(found.logs, lag))
+
+
+def unlike(known: Known, flights: Flights) -> list[str]:
+    """Warn about quantities that are often outside the training range."""
+    learned = {name: np.asarray(values) for name, values in known.about["motion"].items()}
+    x, u = (np.concatenate([getattr(log, part) for log in flights.logs]) for part in ("x", "u"))
+    shares = shares_outside(learned, RIGID_BODY_SPACE.features(x, u))
+    told = ", ".join(f"{name.partition(' [')[0]} {share:.0%}" for name, share in shares.items() if share > WARN)
+    more = "of the time; errors there may be larger than expected."
+    return [f"These flights have motion that the training flights did not have: {told} {more}"] if told else []

@@ -1,10 +1,12 @@
 """The report of a verb: report.html, a single self-contained file, and report.json with stable keys."""
 
 import base64
-import html
 import io
+import sys
+import textwrap
 from collections.abc import Sequence, Sized
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +15,7 @@ from matplotlib.figure import Figure
 
 from hybrid_jax.io.files import json_text, json_value, write_atomic
 
+WIDTH = 80  # columns
 FORMAT = 1  # of report.json
 STYLE: dict[Any, Any] = {"axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.3}
 # Okabe and Ito's colours, which colour-blind readers can distinguish.
@@ -42,27 +45,16 @@ class Table(NamedTuple):
 
 @dataclass(frozen=True)
 class Page:
-    """The contents of a report, in reading order.
+    """The contents of a report, in reading order."""
 
-    Attributes:
-        question: the question that the verb answers.
-        answer: the answer in a sentence.
-        table: main table, with a few rows.
-        figures: captions and figures, or the bytes of a PNG or GIF; the first is not folded.
-        meaning: sentences that interpret the answer.
-        todo: sentences on what you should do next.
-        details: folded tables.
-        notes: folded lines.
-    """
-
-    question: str
-    answer: str
-    table: Table | None = None
-    figures: Sequence[tuple[str, Figure | bytes]] = ()
-    meaning: Sequence[str] = ()
-    todo: Sequence[str] = ()
-    details: Sequence[Table] = ()
-    notes: Sequence[str] = field(default_factory=tuple)
+    question: str  # that the verb answers
+    answer: str  # in a sentence
+    table: Table | None = None  # of a few rows
+    figures: Sequence[tuple[str, Figure | bytes]] = ()  # captions and figures or GIFs; the first is not folded
+    meaning: Sequence[str] = ()  # sentences that interpret the answer
+    todo: Sequence[str] = ()  # sentences on what you should do next
+    details: Sequence[Table] = ()  # folded
+    notes: Sequence[str] = ()  # folded lines
 
 
 def counted(several: Sized, what: str) -> str:
@@ -75,16 +67,15 @@ def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
     record = {"format": FORMAT, "verb": verb, "answer": page.answer, "notes": list(page.notes)} | found
     write_atomic(out / "report.json", json_text(json_value(record)).encode())
     write_atomic(out / "report.html", document(page).encode())
-    print(page.answer)
-    for line in (*page.meaning, *page.todo):
-        print(f"- {line}")
-    print(f"page: {out / 'report.html'}")
+    lines = page.answer, *(f"- {line}" for line in (*page.meaning, *page.todo)), f"page: {out / 'report.html'}"
+    for line in lines:  # a terminal gets whole words in its width, a pipe a line each
+        print(textwrap.fill(line, WIDTH, subsequent_indent="  ") if sys.stdout.isatty() else line)
 
 
 def document(page: Page) -> str:
     """Render the page as HTML."""
     first, *others = [_figure(*each) for each in page.figures] or [""]
-    parts = [f"<h1>{_text(page.question)}</h1><p class=answer>{_text(page.answer)}</p>", first]
+    parts = [f"<h1>{escape(page.question)}</h1><p class=answer>{escape(page.answer)}</p>", first]
     parts += [_table(page.table)] if page.table else []
     for title, lines in (("What it means", page.meaning), ("What to do next", page.todo)):
         parts += [f"<h2>{title}</h2>{_list(lines)}"] if lines else []
@@ -93,7 +84,7 @@ def document(page: Page) -> str:
     parts += [_folded("Notes", _list(page.notes))] if page.notes else []
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
     head += '<link rel="icon" href="data:,">'  # without one a browser asks for it
-    title = f"<title>{_text(page.question)}</title><style>{CSS}</style>"
+    title = f"<title>{escape(page.question)}</title><style>{CSS}</style>"
     return f'<!doctype html><html lang="en"><head>{head}{title}</head><body>{"".join(parts)}</body></html>\n'
 
 
@@ -104,24 +95,20 @@ def _figure(caption: str, figure: Figure | bytes) -> str:
             figure.savefig(data, format="png", dpi=160)
     kind = "gif" if data.getvalue().startswith(b"GIF") else "png"
     text = base64.b64encode(data.getvalue()).decode()
-    picture = f'<img alt="{_text(caption)}" src="data:image/{kind};base64,{text}">'
-    return f"<figure>{picture}<figcaption>{_text(caption)}</figcaption></figure>"
+    picture = f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{text}">'
+    return f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def _table(table: Table) -> str:
-    head = "".join(f"<th>{_text(cell)}</th>" for cell in table.header)
-    body = "".join(f"<tr>{''.join(f'<td>{_text(cell)}</td>' for cell in line)}</tr>" for line in table.lines)
-    title = f"<h2>{_text(table.title)}</h2>" if table.title else ""
+    head = "".join(f"<th>{escape(str(cell))}</th>" for cell in table.header)
+    body = "".join(f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in line)}</tr>" for line in table.lines)
+    title = f"<h2>{escape(table.title)}</h2>" if table.title else ""
     return f"{title}<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
 
 
 def _list(lines: Sequence[str]) -> str:
-    return f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in lines)}</ul>"
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
 
 
 def _folded(title: str, content: str) -> str:
-    return f"<details><summary>{_text(title)}</summary>{content}</details>"
-
-
-def _text(words: object) -> str:
-    return html.escape(str(words))
+    return f"<details><summary>{escape(title)}</summary>{content}</details>"

@@ -11,7 +11,6 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
@@ -26,6 +25,8 @@ from hybrid_jax.state import POSITION, VELOCITY
 __all__ = ["LISTS", "Options", "run"]
 LISTS = ("--learn", "--low", "--high", "--rotor-speed", "--noise")
 WINDOW, HALF, WELL = 10, 1.96, 0.1  # intervals; standard errors of half an interval; share of a value
+MAIN = 5  # intervals that are not folded
+MEANS = "A flight like this gives these intervals where the model is right, with a constant force and torque unknown."
 HEADER = "t,px,py,pz,yaw,vx,vy,vz"
 BOX = FlightBounds()
 
@@ -72,8 +73,6 @@ class Options:
 
 
 def run(options: Options) -> int:
-    checks.writable_folder("--out", options.out)
-    checks.writable_folder("--output", options.output.parent)
     model = load(options.model)
     dt, field = model.about.get("dt", 0.01), with_disturbance(without_past(model.field))
     box = FlightBounds(options.low, options.high, options.speed, options.tilt, options.yaw, options.rotor_speed)
@@ -89,30 +88,35 @@ def run(options: Options) -> int:
     values = {name: float(value) for name, value in named_parameters(field).items()}
     said = [str(each.message).removeprefix("excitation: ") for each in caught]
     told = {"standard_errors": found.standard_errors, "margins": found.margins, "set_points": options.output}
-    page.write(options.out, "plan", _page(options, found, points, values, said), told)
+    page.write(options.out, "plan", _page(options, found, points, values, field.parameter_units, said), told)
     return 0
 
 
-def _page(options: Options, found: Excitation, points: np.ndarray, values: dict[str, float], said) -> page.Page:
+def _page(options: Options, found: Excitation, points: np.ndarray, values, units, said) -> page.Page:
     halves = {name: HALF * error for name, error in found.standard_errors.items()}
     shares = {name: half / abs(values[name]) if values[name] else np.inf for name, half in halves.items()}
-    rows = [(name, f"{values[name]:.4g}", f"± {half:.2g}", f"{shares[name]:.1%}") for name, half in halves.items()]
+    rows = [
+        (name, f"{values[name]:.4g} {units.get(name.partition('[')[0], '')}", f"± {half:.2g}", f"{shares[name]:.1%}")
+        for name, half in halves.items()
+    ]
     header = ("parameter", "value", "half-width", "of the value")
     worst, within = max(found.parameters, key=lambda name: shares[name]), sum(each < WELL for each in shares.values())
     least = f"{worst} is the least certain, to ± {shares[worst]:.0%}"
     return page.Page(
         f"Which {options.seconds:g} s of flight identify the parameters of {options.model.name} best?",
         f"{options.output} determines {within} of {len(rows)} parameters to ± {WELL:.0%} or better; {least}.",
-        page.Table("Expected 95 % intervals", header, rows[:5]),
+        page.Table("Expected 95 % intervals", header, rows[:MAIN]),
         [("The flight: from above, and over time", _figure(found, points))],
-        said,
+        [MEANS, *said],
         [
             "Fly these set points, first at a height where an error costs nothing, and log the flight.",
             f"Then: hybrid-jax adapt {options.model} LOGS -o adapted.npz.",
         ],
         [
-            page.Table("All intervals", header, rows),
-            page.Table("Limits", ("limit", "left"), [(name, f"{left:.0%}") for name, left in found.margins.items()]),
+            *[page.Table("All intervals", header, rows)] * (len(rows) > MAIN),
+            page.Table(
+                "What is left of limits", ("limit", "left"), [(n, f"{x:.0%}") for n, x in found.margins.items()]
+            ),
         ],
     )
 

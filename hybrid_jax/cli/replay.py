@@ -16,9 +16,8 @@ from PIL import Image
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
-from hybrid_jax.cli.learning import lagged, without_past
-from hybrid_jax.cli.logs import LISTS, FlightOptions, read_flights, windows_of
-from hybrid_jax.cli.model import known_of, reading_of
+from hybrid_jax.cli.learning import without_past
+from hybrid_jax.cli.logs import LISTS, FlightOptions, flights_for, known_of, windows_of
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.io.models import load
@@ -55,16 +54,13 @@ class Options(FlightOptions):
 def run(options: Options) -> int:
     for name in ("ahead", "seconds"):
         checks.positive(f"--{name}", getattr(options, name), "a positive number of seconds")
-    checks.writable_folder("--out", options.out)
     models = {path: known_of(path, load(path)) for path in (options.model, options.other) if path is not None}
     first = models[options.model]
-    lag = first.about.get("lag", 0.0)
-    reading = reading_of(first, options)
-    logs = lagged(read_flights(options.flight, first.vehicle, first.dt, reading, True, lag > 0).logs, lag)
+    logs = flights_for(first, options.flight, options, changed=True, unseen=False).logs
     if len(logs) > 1:
         raise ValueError(f"{options.flight}: has {len(logs)} flights; give one of them")
     steps, every = max(1, round(options.ahead / first.dt)), max(1, round(1 / SHOWN / first.dt))
-    windows = windows_of(logs, steps, every).windows[: max(1, round(options.seconds * SHOWN))]
+    windows = windows_of(logs, steps, every)[: max(1, round(options.seconds * SHOWN))]
     with step(f"predicting and drawing {len(windows)} pictures"):
         forecasts = {
             str(path): np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt))[..., POSITION]

@@ -10,10 +10,10 @@ import pytest
 from cli_logs import simulated
 from PIL import Image
 
-from experiments.real_flight.simulated import csv_of
+from experiments.real_flight.simulated import csv_of, vehicle_toml
 from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.cli import main
-from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED, VERBS
+from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED, VERBS, in_flags
 from hybrid_jax.cli.export import PARTS
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.dynamics.rigid_body import rigid_body
@@ -50,14 +50,31 @@ def test_help_of_a_verb_has_at_most_a_dozen_options(called, verb):
         (["inspect", "none"], "hybrid-jax inspect: none: no such file or folder"),
         (["check", "none.npz", "flights"], "none.npz"),
         (["fit", "none", "-o", "m.npz", "--vehicle", "none.toml"], "none.toml: not a readable TOML file"),
+        (["fit", "flights", "-o", "flights"], "--output flights: is a folder; name a file in it"),
+        (["fit", "flights"], "an argument is missing; usage: hybrid-jax fit BEFORE --output PATH [OPTIONS]"),
+        (["fit", "flights", "-o", "v.toml/m.npz"], "--output v.toml: cannot be written"),
+        (["plan", "m.npz", "-o", "p.csv", "--low", "a,b,c"], "--low must be 3 numbers, got a b c"),
+        (["plan", "m.npz", "-o", "p.csv", "--seconds", "0"], "--seconds must be a positive"),
+        (["export", "m.npz", "-o", "board", "--dt", "fast"], "--dt must be a number, got fast"),
+        (["inspect", "flights", "--write-vehicle", "v.toml"], "v.toml exists; name another file"),
+        (["inspect", "flights", "--write-vehicle", "v.toml/v.toml"], "--write-vehicle v.toml: cannot be written"),
+        (["inspect", "flights", "--topics", "/odom"], "inspect: --topics must be pairs like"),
+        (["inspect", "flights", "--dt", "0"], "inspect: --dt must be a positive"),
+        (["inspect", "flights", "--columns", "v.toml"], "'vehicle': must be one of frames"),
+        (["inspect", "flights", "--vehicle", "v.toml"], "v.toml: learn must be names of"),
+        (["inspect", "flights"], "flights: contains no logs, only notes.txt: no format that is read"),
     ],
 )
 def test_bad_input_ends_in_one_line(tmp_path, monkeypatch, called, arguments, words):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "flights").mkdir()
+    (tmp_path / "flights" / "notes.txt").write_text("windy")
+    (tmp_path / "v.toml").write_text('learn = ["Ix", "mas"]\n' + vehicle_toml(IRIS))
+    save(tmp_path / "m.npz", rigid_body(IRIS), {})
     code, _, said = called(*arguments)
     assert code == BAD_INPUT
-    (line,) = said.splitlines()
-    assert words in line
+    assert words in said.splitlines()[-1]
+    assert not [*tmp_path.glob("runs/*/*"), *tmp_path.glob("board/*")]
 
 
 def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_changed(tmp_path, monkeypatch, called):
@@ -156,3 +173,26 @@ def test_without_a_vehicle_file_one_is_written_first(fitted, tmp_path, called, m
     assert (code, why.splitlines()[-1]) == (BAD_INPUT, "hybrid-jax fit: learning")
     assert "vehicle.toml: written" in said
     assert load_vehicle(tmp_path / "fit" / "vehicle.toml").mass == 1
+
+
+SAID = {
+    "the motors are u3 u0 u1 u2: motor_order=(3, 0, 1, 2)": "the motors are u3 u0 u1 u2: --motor-order 3,0,1,2",
+    "a: motor_order must be of 0, 1": "a: --motor-order must be of 0, 1",
+    "name those of its rotors: motor_order=…": "name those of its rotors: --motor-order",
+    'name them: topics={"motors": "/TOPIC:FIELD:UNIT"}': "name them: --topics motors=/TOPIC:FIELD:UNIT",
+    "topics: motors must be TOPIC:FIELD:UNIT": "--topics: motors must be TOPIC:FIELD:UNIT",
+    'name the columns in a column map: columns="MAP.toml"': "name the columns in a column map: --columns MAP.toml",
+    "columns: u0 never changes": "columns: u0 never changes",  # the name of a check
+    "v.toml: [motors]: polynomial must be numbers": "v.toml: [motors]: polynomial must be numbers",  # a key
+    "polynomial=(c0, c1, …) maps them": "--polynomial c0,c1 maps them",
+    "11.9 ms later: delay=0.0119, or learn": "11.9 ms later: --delay 0.0119, or learn",
+    "--dt must be positive": "--dt must be positive",
+    'use what is whole: failed="warn"': "use what is whole: --anyway",
+    "resample all logs with dt=0.02": "resample all logs with --dt 0.02",
+}
+
+
+@pytest.mark.parametrize(("said", "printed"), SAID.items(), ids=SAID)
+def test_arguments_become_options(said, printed):
+    assert in_flags(said, "real_flight") == printed
+    assert in_flags(said, "external_force") == said  # which reads no logs

@@ -14,6 +14,7 @@ from hybrid_jax.cli.estimates import estimate
 from hybrid_jax.cli.inspect import Options, inspected, trusted
 from hybrid_jax.cli.logs import FlightOptions, read_flights
 from hybrid_jax.cli.vehicle_text import vehicle_text
+from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.state import STATE_NAMES, input_names
@@ -74,7 +75,7 @@ def test_what_a_log_tells_is_found(commanded, tmp_path):
     assert "nominal_voltage = 11.1" in text
     assert "PLACEHOLDER: weigh it" not in text
     assert found.curve is not None
-    x, y = found.centre(found.positions(ARM))
+    x, y = load_vehicle_model(tmp_path / "v.toml").terms.centre_of_mass
     assert x > 0.001 > abs(y)
     np.testing.assert_allclose(np.polynomial.polynomial.polyval(0.7, MASS * found.curve), MASS * 9.81 / 4, rtol=0.03)
 
@@ -100,7 +101,7 @@ def test_a_folder_is_described_whatever_is_in_it(tmp_path, called):
     assert "2 of 3 logs are ready for a model" in said
     page = (tmp_path / "report.html").read_text()
     titles = ("Signals at their own rates", "Checks (?: cannot tell;", "What to do")
-    assert all(words in page for words in (*titles, "notes.txt: left: no format that is read"))
+    assert all(words in page for words in (*titles, "notes.txt: no format that is read"))
     assert page.count("data:image/png;base64,") == 2
     results = json.loads((tmp_path / "report.json").read_text())["rows"]
     assert [row["result"].split(":")[0] for row in results] == ["not read", "ready", "ready"]
@@ -141,7 +142,7 @@ def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
     folder = write(tmp_path / "flights", [LOGS[0], wrong])
     paths = [folder / "chirp_run1.csv.gz", folder / "chirp_run2.csv.gz"]
     options = Options(folder, columns=tmp_path / "map.toml")
-    logs = [inspected(path, None, options) for path in paths]
+    logs = inspected(paths, None, options)
     assert ["has only motor commands" in log.refusal for log in logs] == [True, True]
     assert "FAILS q̇ against ω: body rates are in degrees per second" in logs[1].result
     assert [kept.name for kept in trusted(logs)] == [str(paths[0])]
@@ -150,29 +151,40 @@ def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
         trusted(logs[1:])
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--write-vehicle", "flights/chirp_run1.csv.gz"], "exists; name another file"),
-        (["--topics", "/odom"], "inspect: --topics must be pairs like"),
-        (["--dt", "0"], "--dt must be a positive"),
-        (["--vehicle", "none.toml"], "none.toml: not a readable TOML file"),
-        (["--vehicle", "mas.toml"], "mas.toml: learn must be names of"),  # which real_flight would refuse later
-    ],
-)
-def test_bad_options_end_in_one_line(tmp_path, monkeypatch, called, options, words):
-    write(tmp_path / "flights", LOGS[:1])
-    (tmp_path / "mas.toml").write_text('learn = ["Ix", "mas"]\n' + vehicle_toml(IRIS))
-    monkeypatch.chdir(tmp_path)
-    code, _, said = called("inspect", "flights", *options)
-    assert code == 2
-    (line,) = said.splitlines()
-    assert words in line
-
-
 def test_motors_that_lead_the_gyro_are_borne_where_the_lag_is_known(tmp_path):
     early = [FlightLog(log.t[:-5], log.x[:-5], log.u[5:], log.name) for log in LOGS[:1]]
     options = FlightOptions()
     assert len(read_flights(write(tmp_path, early), IRIS, DT, options, lagging=True).logs) == 1
     with pytest.raises(ChecksFailed, match="lag of the gyro behind the motors"):
         read_flights(tmp_path, IRIS, DT, options)
+
+
+def test_of_a_folder_with_mistakes_what_is_sound_is_used(tmp_path, called, capsys):
+    """A file that cannot be read is left out; a flight under two names, and of another vehicle, is refused."""
+    folder = write(tmp_path / "flights", LOGS[:2])
+    (folder / "broken.csv").write_text("t,px\n0,0\n")
+    flights = read_flights(folder, IRIS, DT, FlightOptions())
+    assert [len(flights.logs), flights.still] == [2, False]
+    assert "left out: " in flights.said[0]
+    assert "broken.csv: row 1, field py" in capsys.readouterr().err
+    with pytest.raises(ChecksFailed) as failed:
+        read_flights(folder, replace(IRIS, mass=9 * IRIS.mass), DT, FlightOptions())
+    assert [line.split(": ")[1] for line in failed.value.args[:-1]] == ["specific force over thrust per mass"]
+    assert "(and 1 more of the logs)" in failed.value.args[0]
+    assert failed.value.args[-1].endswith("or are they of another vehicle than iris?")
+    write(folder, [replace(LOGS[0], name="copy.csv")])
+    _, said, _ = called("inspect", folder, "--out", tmp_path)
+    assert "the same flight as chirp_run1.csv.gz; leave one of the two out" in said
+    with pytest.raises(ValueError, match=r"copy\.csv\.gz: the same flight as chirp_run1\.csv\.gz"):
+        read_flights(folder, IRIS, DT, FlightOptions())
+
+
+def test_from_flights_that_hardly_move_nothing_is_learned(tmp_path, called):
+    n, rng = 200, np.random.default_rng(0)
+    rest, speeds = np.tile([0, 0, 1.5, 1, *[0.0] * 9], (n, 1)), np.full((n, 4), 650.0)
+    noisy = [(rest + 1e-3 * rng.normal(size=rest.shape), speeds + rng.normal(size=speeds.shape)) for _ in range(2)]
+    logs = [FlightLog(DT * np.arange(n), *each, name) for name, each in zip(("a.csv", "b.csv"), noisy, strict=True)]
+    (tmp_path / "v.toml").write_text(vehicle_toml(replace(IRIS, thrust_coefficient=IRIS.mass * 9.81 / 4 / 650**2)))
+    files = ["-o", tmp_path / "m.npz", "--vehicle", tmp_path / "v.toml", "--out", tmp_path / "out"]
+    code, _, said = called("fit", write(tmp_path / "flights", logs), *files)
+    assert (code, "no flight excites anything: fly manoeuvres" in said) == (2, True)

@@ -19,8 +19,8 @@ def test_the_program_runs(tmp_path, monkeypatch):
     body = hj.rigid_body(hj.IRIS)
     hj.save(tmp_path / "model.npz", body, {"dt": 0.01})
     folders = ["-o", tmp_path / "board", "--out", tmp_path]
-    for name in ("configure", "answering"):  # devices and signals are those of this process
-        monkeypatch.setattr(f"hybrid_jax.cli.command.{name}", lambda *_, **__: nullcontext())
+    for name in ("command.configure", "answering"):  # devices and signals are those of this process
+        monkeypatch.setattr(f"hybrid_jax.cli.{name}", lambda *_, **__: nullcontext())
     with pytest.raises(SystemExit, match="0"):
         main([*map(str, ("export", tmp_path / "model.npz", "--name", "iris", *folders))])
     (tmp_path / "main.c").write_text(PROGRAM)

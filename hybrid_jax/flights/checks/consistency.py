@@ -19,8 +19,10 @@ from hybrid_jax.vehicle import Vehicle
 OK, WARNS, FAILS, UNKNOWN = "ok", "warns", "fails", "cannot tell"
 GROUND = "cut it out: in_flight=True"
 MORE_FLIGHT = "check on a flight with more motion"
+CLOCK = "the time is in ms, µs or ns: declare its unit"
 UNUSUAL = "no common mistake explains it: check sensors, time stamps and columns"
 CHANGED = "or the vehicle has changed (wind, load, damage): adapt"
+RATES = "q̇ against ω"
 THRUST = "v̇ against thrust along body z"
 RATIO, ORDER = "specific force over thrust per mass", "motor order against roll and pitch"
 SPIN, GYRO = "spin against yaw", "lag of the gyro behind the motors"
@@ -88,18 +90,17 @@ def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
     skip = max(0, (len(log) - MAX_SAMPLES) // 2)
     log = log[skip : skip + MAX_SAMPLES]
     lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
-    clock = "the time is in ms, µs or ns: declare its unit"
     split = "windows stop at each; resample=… with longest_gap=… bridges short ones"
     moved = _compare(log, "dp/dt against v", mistakes.velocities(log), LEAST_MOTION["velocity"])
     pushed = mistakes.accelerations(log)
     if moved.verdict == OK:
         pushed.pop(mistakes.BODY)  # dp/dt contradicts it
     return [
-        _at_most("interval between samples", log.dt, "s", LONGEST_INTERVAL, clock),
+        _at_most("interval between samples", log.dt, "s", LONGEST_INTERVAL, CLOCK),
         _at_most("gaps", lost, "share of intervals", 0.01, split),
         _at_most("repeated samples", stale, "share of samples", 0.01, split),
         moved,
-        _compare(log, "q̇ against ω", mistakes.rates(log), LEAST_MOTION["rates"]),
+        _compare(log, RATES, mistakes.rates(log), LEAST_MOTION["rates"]),
         _compare(log, THRUST, pushed, LEAST_MOTION["acceleration"]),
         _at_most("time on the ground", float(on_ground(log).mean()), "share of samples", 0.01, GROUND),
         _columns(log),

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hybrid_jax.flights.checks.consistency import FAILS, UNKNOWN, Check, judged
+from hybrid_jax.flights.checks.consistency import CLOCK, FAILS, LONGEST_INTERVAL, UNKNOWN, Check, judged
 from hybrid_jax.flights.conversion import missing_states, motors_of, what_to_log, without_common_time
 from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
 from hybrid_jax.vehicle import MOST_ROTORS, Vehicle
@@ -18,6 +18,7 @@ MOVED = 0.5  # m of height that only flight explains
 BEYOND = 0.02  # share by which a motor may exceed the largest
 MOSTLY = 0.5  # share of samples beyond a limit from which on their unit is wrong
 JUMP = 0.5  # share of the whole time that one gap may last
+ROTORS = "number of motors"
 USED = ("position", "velocity", "body_velocity", "attitude", "rates")
 
 
@@ -63,7 +64,7 @@ def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
     stated = [int(word) for word in kind.split() if word.isdigit()]
     expected = vehicle.rotors if vehicle is not None else stated[0] if stated else found
     if not found:
-        return Check("number of motors", 0.0, "motors", expected, UNKNOWN, "no motors")
+        return Check(ROTORS, 0.0, "motors", expected, UNKNOWN, "no motors")
     mend = "log all motors"
     if found > expected or found > MOST_ROTORS:
         signals = [recording.signals[name] for name in ROTOR_UNITS if name in recording.signals]
@@ -73,7 +74,7 @@ def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
     who = "the airframe" if vehicle is None else "the vehicle file"
     advice = f"{found} motors are logged, {who} has {expected}: {mend}, or correct the vehicle file"
     fits = found == expected and found <= MOST_ROTORS
-    return judged("number of motors", found, "motors", expected, "" if fits else advice)
+    return judged(ROTORS, found, "motors", expected, "" if fits else advice)
 
 
 def _rates(recording: Recording, motors: Signal | None, dt: float) -> Check:
@@ -85,6 +86,8 @@ def _rates(recording: Recording, motors: Signal | None, dt: float) -> Check:
     coarser = f"dt={float(f'{max(slow.values(), default=0.0):.2g}'):g}"
     faster = "log faster" if recording.facts.get("format", "") == "CSV" else what_to_log(recording)
     advice = f"slower than {1 / dt:.3g} Hz: {listed}; {faster}; or take {coarser}"
+    if slow and min(intervals.values()) > LONGEST_INTERVAL:
+        advice = f"all signals are over {LONGEST_INTERVAL} s apart: {CLOCK}"
     return judged("slowest signal", worst, "s", SLOWER * dt, advice if slow else "")
 
 
