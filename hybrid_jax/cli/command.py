@@ -26,8 +26,7 @@ Options = TypeVar("Options")
 BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED = 2, 3, 4
 VERBS = {
     "inspect": "check what logs contain, and write a vehicle file from them",
-    "fit": "learn a vehicle from its logs",
-    "identify": "learn a vehicle from its commands and any measurements",
+    "fit": "learn a vehicle from its logs, of all states or of any measurements",
     "adapt": "adapt a model to logs after a change, and say what changed",
     "check": "compare a model's predictions with flights",
     "plan": "plan the most informative flight for a model",
@@ -44,7 +43,7 @@ hybrid-jax VERB --help says more, VERB --help-all all.
 Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."""
 
 # Arguments that messages of the library name, and the options of the commands that have them.
-READ_LOGS = ("inspect", "fit", "identify", "adapt", "check", "replay", "real_flight")
+READ_LOGS = ("inspect", "fit", "adapt", "check", "replay", "real_flight")
 _SAME = ("columns", "polynomial", "topics", "motor_order", "dt", "delay")
 FLAGS = {name: f"--{name.replace('_', '-')}" for name in _SAME} | {"failed": "--anyway"}
 _KEYS = ("columns", "polynomial")  # words of column maps as well: options only before a value

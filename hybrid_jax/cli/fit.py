@@ -9,20 +9,23 @@ import numpy as np
 import tyro
 
 from hybrid_jax import checks
-from hybrid_jax.cli import errors, identify, page
+from hybrid_jax.cli import errors, identify, logs, page
 from hybrid_jax.cli.command import step
+from hybrid_jax.cli.help import RARE
 from hybrid_jax.cli.inspect import inspected, write_vehicle
 from hybrid_jax.cli.learning import CANDIDATES, FROZEN, PAST, Learned, learn
-from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, paths_of, read_flights
+from hybrid_jax.cli.logs import STEPS, FlightOptions, Flights, paths_of, read_flights
+from hybrid_jax.dynamics.actuators import NAMES
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
-from hybrid_jax.flights.conversion import missing_states
+from hybrid_jax.flights.conversion import DT, missing_states
 from hybrid_jax.flights.load import read_recording
+from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
 
 __all__ = ["LISTS", "Options", "run"]
-IDENTIFIED = ("output", "learn", "anyway", "out", "columns", "topics", "motor_order")  # options of both
+LISTS = (*logs.LISTS, "--disturbance")
 OF_MODEL = ("windows", "motion")  # of the model, and not of the report
 REMEMBERS = (
     "Errors of the model last, for example because a load swings that no sensor shows. So it predicts them from its "
@@ -39,7 +42,9 @@ class Options(FlightOptions):
     error on a new flight.
 
     Your logs should have position, velocity, attitude, body rates, and rotor speeds (or commands with --polynomial).
-    Logs without some of these are used for identification: see hybrid-jax identify.
+    From logs without some of these, and from commands where the vehicle file has a table [actuator], only physics is
+    identified, with a 95 % interval of each parameter that is infinite if the logs do not determine it: see
+    docs/howto/identify.md.
     """
 
     before: Annotated[Path, tyro.conf.Positional]
@@ -51,51 +56,59 @@ class Options(FlightOptions):
     one is estimated from the logs, with a mass of 1 kg and arms of 0.1 m, which scale the results."""
     learn: tuple[str, ...] = ()
     """Parameters to learn, instead of the vehicle file's."""
-    dt: float = 0.01
-    """Interval of the model [s]."""
+    dt: float | None = None
+    """Interval of the model [s], by default 0.01; of an identified one 0.005."""
     seed: int = 0
     """Random seed of the network."""
     out: Path = Path("runs/fit")
     """Folder of the page."""
+    steps: Annotated[int, RARE] = 20
+    """Identification: steps of a window. Short windows are robust to slow disturbances, long ones identify slow
+    effects."""
+    windows: Annotated[int, RARE] = 300
+    """Identification: most windows, half of which are the most informative, and half evenly spaced."""
+    disturbance: Annotated[tuple[float, ...], RARE] = Layout.disturbance
+    """Identification: initial standard deviation of a window's constant force [m/s²] and torque [rad/s²] along x, y and
+    z. You should use 0 for a damaged rotor, because a free torque would absorb its trim."""
 
 
 def run(options: Options) -> int:
-    checks.positive("--dt", options.dt)
-    path = options.vehicle or _written(options)
+    dt = DT if options.dt is None else options.dt
+    checks.positive("--dt", dt)
+    path = options.vehicle or _written(replace(options, dt=dt))
     model = load_vehicle_model(path)
-    if _identified(options, model):
-        own = {name: getattr(options, name) for name in IDENTIFIED}
-        return identify.run(identify.Options(folder=options.before, vehicle=path, **own))
     model = replace(model, learn=options.learn or model.learn)
     if not model.learn:
         raise ValueError(f"{path}: learn: is empty; give --learn Ix Iy, or other unknown parameters")
+    if _identified(options, model):
+        return identify.run(options, path, model)
     lagging = LAG in model.learn or model.terms.motor_time_constant > 0
-    flights = read_flights(options.before, model.vehicle, options.dt, options, lagging=lagging)
+    flights = read_flights(options.before, model.vehicle, dt, options, lagging=lagging)
     if len(flights.logs) < 2:
         raise ValueError(f"{options.before}: has one flight; you need at least two, because one is held out")
     if flights.still and not options.anyway:
         raise ValueError(f"{options.before}: no flight excites anything: fly manoeuvres, or go on with --anyway")
-    with step(f"learning from {len(flights.logs)} flights, each held out in turn") as told:
+    with step(f"learning from {len(flights.logs)} flights") as told:
         found = learn(model, flights.logs, options.seed)
         told(f"{found.chosen} predicts them best")
-    about = _about(options, model, flights, found)
+    about = _about(options, model, flights, found) | {"dt": dt}
     save(options.output, found.field, json_value(about))
     told = {name: each for name, each in about.items() if name not in OF_MODEL}
     told |= {"model": options.output, "adaptation": found.physics.to_dict()}
-    page.write(options.out, "fit", _page(options, flights, found), told)
+    page.write(options.out, "fit", _page(options, flights, found, dt), told)
     return 0
 
 
 def _written(options: Options) -> Path:
     """Write a vehicle file estimated from the logs into the folder of the page."""
     path = options.out / "vehicle.toml"
-    with step("a vehicle file from the logs, as none is given"):
+    with step("estimating a vehicle file, as none is given"):
         write_vehicle(path, inspected(paths_of(options.before)[0], None, options), options.before)
     return path
 
 
 def _identified(options: Options, model: VehicleModel) -> bool:
-    """Whether the first log that can be read is incomplete, or has commands for the vehicle file's actuator."""
+    """Whether the first log that can be read is incomplete, or the vehicle file's actuator is used or learned."""
     for path in paths_of(options.before)[0]:
         with contextlib.suppress(ValueError):  # a log that cannot be read is left out later
             found = read_recording(path, **options.reading)
@@ -103,7 +116,7 @@ def _identified(options: Options, model: VehicleModel) -> bool:
     else:
         return False
     commands = model.actuator is not None and not options.polynomial and "rotor_speed" not in found.signals
-    return commands or bool({*missing_states(found)} - {"motors"})
+    return commands or bool({*missing_states(found)} - {"motors"} or {*model.learn} & {*NAMES})
 
 
 def _about(options: Options, model: VehicleModel, flights: Flights, found: Learned) -> dict[str, Any]:
@@ -113,7 +126,6 @@ def _about(options: Options, model: VehicleModel, flights: Flights, found: Learn
     )
     ends = {name: list(each) for name, *each in zip(errors.UNITS, *found.expected, strict=True)}
     return {
-        "dt": options.dt,
         "steps": STEPS,
         "vehicle": model.vehicle.name,
         "polynomial": list(options.polynomial),
@@ -126,8 +138,8 @@ def _about(options: Options, model: VehicleModel, flights: Flights, found: Learn
     }
 
 
-def _page(options: Options, flights: Flights, found: Learned) -> page.Page:
-    seconds, frozen = STEPS * options.dt, found.left_out[FROZEN][:, -1]
+def _page(options: Options, flights: Flights, found: Learned, dt: float) -> page.Page:
+    seconds, frozen = STEPS * dt, found.left_out[FROZEN][:, -1]
     better = errors.ratio(frozen, found.left_out[found.chosen][:, -1])
     cells = [errors.texts(each) for each in (*found.expected, np.exp(np.log(frozen).mean(axis=0)))]
     rows = [
@@ -143,11 +155,9 @@ def _page(options: Options, flights: Flights, found: Learned) -> page.Page:
         f"What do {len(flights.logs)} flights of {options.before} show about the vehicle?",
         f"Predictions of {seconds:g} s on held-out flights are {better:.2g} times as accurate as with frozen rates.",
         page.Table(
-            f"Expected error after {seconds:g} s on a new flight",
-            ("quantity", "RMSE", "80 % interval", FROZEN),
-            rows,
+            f"Expected error after {seconds:g} s on a new flight", ("quantity", "RMSE", "80 % interval", FROZEN), rows
         ),
-        [("RMSE on held-out flights", errors.figure(found.left_out, options.dt))],
+        [("RMSE on held-out flights", errors.figure(found.left_out, dt))],
         [
             f"The model is {found.chosen}: a network beside the physics {helps}.",
             errors.BASELINE,

@@ -1,15 +1,13 @@
-"""`hybrid-jax identify`: learn a vehicle from logs of its commands and of any other measurements."""
+"""`hybrid-jax fit` for logs of commands and of any other measurements, without all states."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import matplotlib as mpl
 import numpy as np
-import tyro
 from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
@@ -17,10 +15,9 @@ from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import ChecksFailed, in_flags, step
 from hybrid_jax.cli.compared import compared, unlearned_drag
-from hybrid_jax.cli.help import RARE
-from hybrid_jax.cli.logs import LogOptions, recordings_of
+from hybrid_jax.cli.logs import recordings_of
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
-from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
+from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.flights.checks.consistency import Check
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
@@ -31,57 +28,12 @@ from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
 from hybrid_jax.vehicle import Vehicle
 
-__all__ = ["LISTS", "Options", "run"]
-LISTS = ("--learn", "--motor-order", "--topics", "--disturbance")
 ENDS = ("value", "low", "high")
 LINES = 5  # of what is not folded
 FITS = ("dt", "steps", "windows", "disturbance")  # options that a model remembers
 NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
 MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
 ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below counts until they pass."
-
-
-@dataclass(frozen=True)
-class Options(LogOptions):
-    """Learn a vehicle from logs of its commands and of any other measurements.
-
-    The vehicle file has the known constants and, in `learn`, the unknown ones. With commands instead of rotor speeds,
-    it needs a table [actuator], for example
-
-        learn = ["curve", "time_constant", "Ix", "Iy", "delay"]
-        [actuator]
-        curve = [0.0, 0.0, 0.15]     # thrust of a rotor [N]: c0 + c1 command + c2 command², to start from
-        gives = "thrust"             # or "speed" [rad/s]
-        time_constants = 0.05        # s; or [up, down]
-
-    Position, velocity, attitude, body rates and accelerometer are all optional. Each parameter gets a 95 % interval,
-    which is infinite if it is not identifiable.
-
-    Logs are checked first, as far as their signals allow. A failed check ends with exit code 3, except with --anyway.
-    """
-
-    folder: Annotated[Path, tyro.conf.Positional]
-    """Folder of logs of any supported format, or one log."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """File for the model."""
-    vehicle: Path
-    """Vehicle file (TOML)."""
-    learn: tuple[str, ...] = ()
-    """Parameters to learn, instead of the vehicle file's."""
-    anyway: bool = False
-    """Continue although logs failed checks; the page begins with a warning."""
-    out: Path = Path("runs/identify")
-    """Folder of the page."""
-    dt: Annotated[float, RARE] = 0.005
-    """Step of the solver and of the grid on which measurements are compared [s]."""
-    steps: Annotated[int, RARE] = 20
-    """Steps of a window. Short windows are robust to slow disturbances, long ones identify slow effects."""
-    windows: Annotated[int, RARE] = 300
-    """Maximum number of windows: half are the most informative, the others are evenly spaced."""
-
-    disturbance: Annotated[tuple[float, ...], RARE] = Layout.disturbance
-    """Initial standard deviation of a window's constant force [m/s²] and torque [rad/s²] along x, y and z. You should
-    use 0 for a damaged rotor, because a free torque would absorb its trim."""
 
 
 class Read(NamedTuple):
@@ -94,17 +46,18 @@ class Read(NamedTuple):
     failed: list[str]
 
 
-def run(options: Options) -> int:
+def run(options: Any, path: Path, model: VehicleModel) -> int:
+    """Identify a vehicle with the options of `fit`, from its file."""
     for name in ("steps", "windows"):
         checks.count(f"--{name}", getattr(options, name))
-    read = checked(options)
-    fits = {name: getattr(options, name) for name in FITS}
+    fits = {name: getattr(options, name) for name in FITS} | {"dt": options.dt or Layout.dt}
+    read = checked(options, path, model)
     found = identified(read, layout_of(fits))
-    about = {"dt": options.dt, "learned_from": read.contents, "parameters": values_of(found)}
+    about = {"dt": fits["dt"], "learned_from": read.contents, "parameters": values_of(found)}
     about |= {"identified": fits, "covariance": found.covariance}
     save(options.output, found.field, json_value(about))
     shown = _page(options, found, read, layout_of(fits))
-    page.write(options.out, "identify", shown, {"parameters": about["parameters"], "model": options.output})
+    page.write(options.out, "fit", shown, {"parameters": about["parameters"], "model": options.output})
     return 0
 
 
@@ -113,17 +66,13 @@ def layout_of(fits: Mapping[str, Any]) -> Layout:
     return Layout(fits["dt"], fits["steps"], fits["windows"], disturbance=tuple(fits["disturbance"]))
 
 
-def checked(options: Options) -> Read:
+def checked(options: Any, path: Path, model: VehicleModel) -> Read:
     """Read the logs of a folder and check them against the vehicle file; raise ChecksFailed without --anyway."""
-    model = load_vehicle_model(options.vehicle)
-    model = replace(model, learn=options.learn or model.learn)
-    if not model.learn:
-        raise ValueError(f"{options.vehicle}: learn: is empty; give --learn Ix Iy, or other unknown parameters")
     if LAG in model.learn:
         mend = _learn(model.learn, (LAG,))
-        raise ValueError(f"{options.vehicle}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
-    start = partial(_field_of, options, model)
-    return read_checked(options.folder, options, model.vehicle, model.learn, start)
+        raise ValueError(f"{path}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
+    start = partial(_field_of, path, model)
+    return read_checked(options.before, options, model.vehicle, model.learn, start)
 
 
 def read_checked(
@@ -167,21 +116,21 @@ def values_of(found: Identified) -> dict[str, Any]:
     }
 
 
-def _field_of(options: Options, model: VehicleModel, logs: Sequence[Recording]) -> Any:
+def _field_of(path: Path, model: VehicleModel, logs: Sequence[Recording]) -> Any:
     """Make the initial field, with commands as inputs if the logs have any and the vehicle file has [actuator]."""
     for log in logs:
         if log.rotors != model.vehicle.rotors:
-            raise ValueError(f"{log.name}: has {log.rotors} motors, {options.vehicle} has {model.vehicle.rotors}")
+            raise ValueError(f"{log.name}: has {log.rotors} motors, {path} has {model.vehicle.rotors}")
     speeds_alone = [log.name for log in logs if "command" not in log.signals]
     if model.actuator is not None and not speeds_alone:
         return model.commanded()
     for log in logs:
         if "rotor_speed" not in log.signals:
             mend = f"leave out {speeds_alone[0]}" if speeds_alone else "give it a table [actuator]; see --help"
-            raise ValueError(f"{options.vehicle}: {log.name} has commands and no rotor speeds: {mend}")
+            raise ValueError(f"{path}: {log.name} has commands and no rotor speeds: {mend}")
     if lost := [name for name in model.learn if name in NAMES]:
         why = f"need commands, and {speeds_alone[0]} has only rotor speeds"
-        raise ValueError(f"{options.vehicle}: learn: {', '.join(lost)}: {why}: {_learn(model.learn, lost)}")
+        raise ValueError(f"{path}: learn: {', '.join(lost)}: {why}: {_learn(model.learn, lost)}")
     return model.physics()
 
 
@@ -190,7 +139,7 @@ def _learn(names: Sequence[str], without: Sequence[str]) -> str:
     return f"give --learn {' '.join(name for name in names if name not in without) or 'Ix Iy'}"
 
 
-def _page(options: Options, found: Identified, read: Read, layout: Layout) -> page.Page:
+def _page(options: Any, found: Identified, read: Read, layout: Layout) -> page.Page:
     values = values_of(found)
     lines = [(name, *(f"{one[end]:.4g}" for end in ENDS), one["unit"]) for name, one in values.items()]
     unseen = [name for name, one in values.items() if not np.isfinite(one["high"])]
@@ -198,7 +147,7 @@ def _page(options: Options, found: Identified, read: Read, layout: Layout) -> pa
     fitted = [(name, _unit(name), "  ".join(f"{e:.3g}" for e in each)) for name, each in found.errors.items()]
     again = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
     return page.Page(
-        f"What do {page.counted(read.logs, 'log')} of {options.folder} show about the vehicle?",
+        f"What do {page.counted(read.logs, 'log')} of {options.before} show about the vehicle?",
         f"{len(values) - len(unseen)} of {len(lines)} parameters are identified by {found.seconds:.4g} s of flight.",
         page.Table("Parameters, with 95 % intervals", header, lines[:LINES]),
         [

@@ -33,7 +33,7 @@ SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
 NOT_RUN = f"Without --vehicle these are not checked: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
 EMPTY = "–"
 READY = "Every verb reads logs that are ready, and leaves out those that fail."
-LESS = "Some logs have motors and lack states ({}): hybrid-jax identify learns what these determine."
+LESS = "Some logs have motors and lack states ({}): hybrid-jax fit learns what these determine."
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def run(options: Options) -> int:
     logs = inspected(paths, vehicle, options)
     for log in logs:
         kind = [f"{each[0]}, {each[1]}, {each[-2]} s, {each[-1]} motors: " for each in _facts(log)]
-        print(f"{log.name}: {''.join(kind)}{log.result}{log.warning}")
+        page.say(f"{log.name}: {''.join(kind)}{log.result}{log.warning}")
     rows = [{"log": log.name, "result": log.result} for log in logs]
     page.write(options.out, "inspect", _page(options, logs, [printable(line) for line in left]), {"rows": rows})
     if path is not None:

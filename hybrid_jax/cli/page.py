@@ -68,8 +68,13 @@ def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
     write_atomic(out / "report.json", json_text(json_value(record)).encode())
     write_atomic(out / "report.html", document(page).encode())
     lines = page.answer, *(f"- {line}" for line in (*page.meaning, *page.todo)), f"page: {out / 'report.html'}"
-    for line in lines:  # a terminal gets whole words in its width, a pipe a line each
-        print(textwrap.fill(line, WIDTH, subsequent_indent="  ") if sys.stdout.isatty() else line)
+    for line in lines:
+        say(line)
+
+
+def say(line: str) -> None:
+    """Print a line, on a terminal in whole words of `WIDTH` columns."""
+    print(textwrap.fill(line, WIDTH, subsequent_indent="  ") if sys.stdout.isatty() else line)
 
 
 def document(page: Page) -> str:

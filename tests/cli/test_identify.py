@@ -60,7 +60,7 @@ def test_a_folder_of_commands_becomes_a_page_and_a_model(files, called):
     folder, arguments = files
     short = ["--dt", "0.01", "--steps", "40", "--windows", "20"]
     (folder / "logs" / "two.csv").rename(folder / "two.csv")
-    code, said, _ = called("identify", *arguments, *short)
+    code, said, _ = called("fit", *arguments, *short)
     assert code == 0
     assert "2 of 2 parameters are identified" in said
     model: Any = hj.load(folder / "model.npz").field
@@ -111,14 +111,6 @@ def test_errors_are_shown_at_steps_that_were_measured():
     ],
 )
 def test_bad_options_end_in_one_line(files, called, more, said):
-    code, _, printed = called("identify", *files[1], *more)
+    code, _, printed = called("fit", *files[1], *more)
     assert code == 2
     assert said in printed.splitlines()[-1]
-
-
-def test_fit_hands_logs_without_states_over(files, called, monkeypatch):
-    given = []
-    monkeypatch.setattr("hybrid_jax.cli.identify.run", lambda options: given.append(options) or 0)
-    code, *_ = called("fit", *files[1], "--learn", "k")
-    assert code == 0
-    assert (given[0].folder, given[0].learn) == (files[0] / "logs", ("k",))

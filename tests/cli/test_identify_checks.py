@@ -8,8 +8,10 @@ from recorded import LOGS, write
 
 from benchmarks.log_mistakes import parts_of, recording_of
 from experiments.real_flight.simulated import vehicle_toml
+from hybrid_jax.cli.command import ChecksFailed
 from hybrid_jax.cli.compared import compared
-from hybrid_jax.cli.identify import Options, checked
+from hybrid_jax.cli.fit import Options
+from hybrid_jax.cli.identify import checked
 from hybrid_jax.dynamics.actuators import Actuator
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.checks.consistency import FAILS
@@ -31,21 +33,19 @@ def ended(called):
     """The exit code, and the lines on stderr."""
 
     def end(*arguments):
-        code, _, said = called("identify", "logs", "-o", "model.npz", "--vehicle", "v.toml", *arguments)
+        code, _, said = called("fit", "logs", "-o", "model.npz", "--vehicle", "v.toml", *arguments)
         return code, said.splitlines()
 
     return end
 
 
-def test_a_check_that_fails_ends_in_what_to_type(folder, ended):
+def test_a_check_that_fails_ends_in_what_to_type(folder):
     write(folder / "logs", [SWAPPED])
     (folder / "logs" / "notes.txt").write_text("windy")
-    code, lines = ended("--learn", "Ix,Iy")
-    assert code == 3
-    assert "motor order against roll and pitch: " in lines[0]
-    assert lines[0].endswith("--motor-order 3,0,1,2")
-    assert "nothing was identified" in lines[-1]
-    assert not [*(folder / "runs" / "identify").glob("*")]
+    with pytest.raises(ChecksFailed, match="motor order against roll and pitch") as failed:
+        checked(Options(folder / "logs", folder / "m.npz"), folder / "v.toml", VehicleModel(IRIS))
+    assert failed.value.args[0].endswith("motor_order=(3, 0, 1, 2)")
+    assert "nothing was identified" in failed.value.args[-1]
 
 
 MENDS = {"anyway": ({"anyway": True}, ["motor order"]), "mended": ({"motor_order": (3, 0, 1, 2)}, [])}
@@ -54,8 +54,7 @@ MENDS = {"anyway": ({"anyway": True}, ["motor order"]), "mended": ({"motor_order
 @pytest.mark.parametrize(("more", "failed"), MENDS.values(), ids=MENDS)
 def test_it_goes_on_when_asked_or_mended(folder, more, failed):
     write(folder / "logs", [SWAPPED])
-    config = Options(folder / "logs", folder / "m.npz", folder / "v.toml", learn=("Ix",), **more)
-    lines = checked(config).failed
+    lines = checked(Options(folder / "logs", folder / "m.npz", **more), folder / "v.toml", VehicleModel(IRIS)).failed
     assert [line.split(": ")[1].split(" against")[0] for line in lines] == failed
 
 
@@ -65,7 +64,7 @@ def test_what_speeds_do_not_tell_is_refused(folder, ended, learn, rest):
     write(folder / "logs", LOGS[:1])
     code, (line,) = ended("--learn", learn)
     assert code == 2
-    assert line.startswith("hybrid-jax identify: v.toml: learn: curve")
+    assert line.startswith("hybrid-jax fit: v.toml: learn: curve")
     assert line.endswith(f"has only rotor speeds: give --learn {rest}")
 
 

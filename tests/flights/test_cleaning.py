@@ -140,11 +140,7 @@ def test_impossible_cleaning_is_refused_with_log_and_option(options, message):
 
 @pytest.mark.parametrize(
     ("option", "value", "expected"),
-    [
-        ("resample", 0.0, "positive"),
-        ("longest_gap", -0.1, "finite number of at least 0"),
-        ("delay", np.nan, "finite"),
-    ],
+    [("resample", 0.0, "positive"), ("longest_gap", -0.1, "finite number of at least 0"), ("delay", np.nan, "finite")],
 )
 def test_invalid_cleaning_options_are_refused(option, value, expected):
     with pytest.raises(ValueError, match=f"^{option} must be a {expected}.*{value}$"):

@@ -72,10 +72,7 @@ SOURCES: dict[str, list[tuple[tuple[str, ...], Conversion, str]]] = {
         (_named("stateEstimate.{}", ANGLES), lambda v: from_euler(v * DEGREES * NOSE), ""),
         (("stateEstimate.roll", "stateEstimate.yaw", *ACCELERATION), _without_pitch, NO_PITCH),
     ],
-    "velocity": [
-        (_named("stateEstimate.v{}", "xyz"), 1.0, ""),
-        (_named("stateEstimateZ.v{}", "xyz"), 1e-3, ""),
-    ],
+    "velocity": [(_named("stateEstimate.v{}", "xyz"), 1.0, ""), (_named("stateEstimateZ.v{}", "xyz"), 1e-3, "")],
     "rates": [
         (_named("gyro.{}", "xyz"), DEGREES, ""),
         (_named("controller.r_{}", ANGLES), NOSE, ""),
@@ -91,11 +88,7 @@ SOURCES: dict[str, list[tuple[tuple[str, ...], Conversion, str]]] = {
     "command": [
         (_named("pwm.m{}_pwm", MOTORS), 1 / FULL, ""),
         (_named("motor.m{}", MOTORS), 1 / FULL, ""),
-        (
-            _named("controller.cmd_{}", ("thrust", *ANGLES)),
-            lambda v: np.clip(v @ MIXER.T, 0, LIMITED) / FULL,
-            NO_MOTOR,
-        ),
+        (_named("controller.cmd_{}", ("thrust", *ANGLES)), lambda v: np.clip(v @ MIXER.T, 0, LIMITED) / FULL, NO_MOTOR),
     ],
 }
 Variables = dict[str, tuple[np.ndarray, np.ndarray]]  # variable → its ticks [µs] and values

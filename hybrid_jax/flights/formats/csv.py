@@ -23,12 +23,7 @@ CUT = "no line break ends the last row, so its last number may be cut off: cut t
 
 
 def read_table(
-    path: str | Path,
-    columns: Sequence[str],
-    *,
-    delimiter: str = ",",
-    decimal: str = ".",
-    max_rows: int = MAX_ROWS,
+    path: str | Path, columns: Sequence[str], *, delimiter: str = ",", decimal: str = ".", max_rows: int = MAX_ROWS
 ) -> tuple[Float[np.ndarray, "n c"], tuple[str, ...]]:
     """Read the named columns of a CSV file in the given order, and a note if the file was cut off.
 
