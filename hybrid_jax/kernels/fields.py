@@ -7,6 +7,7 @@ takes its result n and returns z and the weights W, γ and β besides ẋ; see c
 
 import contextlib
 from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -38,9 +39,10 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """The library for a field, and the conversion of the field's arrays to its weights."""
+    """The prefix of a field's XLA targets, as soon as these are, and the conversion of its arrays to its weights."""
 
-    prefix: str
+    name: str
+    prefix: Future[str]
     sizes: Sizes
     forward: Split
     back: Split | None
@@ -79,7 +81,7 @@ def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
             _check_methods(whole, "train_batch" if training else "infer_batch")
             if both is None or both.sizes.units:  # or predictions are a part of training
                 with jax.ensure_compile_time_eval():  # this may be inside of a program that JAX traces
-                    both = _made(whole, Sizes(d, m), training)
+                    both = _made(whole, Sizes(d, m), training, _name(field))
             _KNOWN[*key, training] = both
         return _KNOWN[*key, training]
     except Exception as error:  # a user's code may raise anything
@@ -102,7 +104,7 @@ def _name(field: Any) -> str:
     return f"{own}({modules})" if modules else own
 
 
-def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
+def _made(field: PyTree, sizes: Sizes, training: bool, name: str) -> Kernel:
     """Make the kernel of a field whose arrays are replaced by shapes."""
     shapes, structure = jax.tree.flatten(eqx.filter(field, _is_shape))
     rest, norms = eqx.filter(field, _is_shape, inverse=True), batch_norms(field) if training else []
@@ -139,7 +141,7 @@ def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
     sizes, source = sizes._replace(reads=read.size, units=units), Source(forward, of_sample, training)
     constants = dict(zip("DMZH", sizes, strict=True)) | {"P": count}
     constants |= {name: forward.place(i) for i, name in enumerate(("WEIGHT", "GAIN", "SHIFT"), start=2)}
-    return Kernel(library.compiled(source.text(constants)), sizes, forward, source.back, epsilon)
+    return Kernel(name, library.compiled(source.text(constants)), sizes, forward, source.back, epsilon)
 
 
 class _Given(AbstractNorm):

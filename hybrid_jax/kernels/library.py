@@ -1,7 +1,7 @@
 """Compile C++ with GCC for XLA at first use, keep it in the user's cache folder, verify it and load it.
 
-The caller waits: GCC takes about a second, less than XLA saves where a kernel replaces its program. Because the cache
-contains code, its folder must belong to the user, and a library whose checksum is wrong is recompiled.
+GCC runs while JAX traces, which needs the library only when XLA compiles the call. Because the cache contains code,
+its folder must belong to the user, and a library whose checksum is wrong is recompiled.
 HYBRID_JAX_NATIVE=0 disables kernels; `obstacle` reports other reasons.
 """
 
@@ -15,6 +15,7 @@ import subprocess
 import tempfile
 import threading
 import time
+from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
 
@@ -63,13 +64,26 @@ def obstacle() -> str | None:
     return None
 
 
-def compiled(source: str) -> str:
-    """Compile and register a source; return the prefix of its XLA targets, or raise Unusable."""
+def compiled(source: str) -> Future[str]:
+    """Begin to compile and register a source, whose result is the prefix of its XLA targets, or the error Unusable."""
     with _LOCK:
-        return _registered(source)
+        return _begun(source)
 
 
 @cache
+def _begun(source: str) -> Future[str]:
+    result = Future[str]()
+
+    def run() -> None:
+        try:
+            result.set_result(_registered(source))
+        except BaseException as error:
+            result.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()  # Python does not wait for it to exit
+    return result
+
+
 def _registered(source: str) -> str:
     begin = f"hybrid_jax_{_digest(source)}_"
     try:

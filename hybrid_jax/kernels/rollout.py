@@ -8,12 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import jaxpr_as_fun
+from jax.core import ShapedArray
+from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.interpreters import batching, mlir
 from jaxtyping import Array, Float
 
 from hybrid_jax.integrate import RK4, Solver, integrate
 from hybrid_jax.kernels import library
-from hybrid_jax.kernels.fields import Kernel, kernel_of
+from hybrid_jax.kernels.fields import REFUSED, Kernel, kernel_of
 from hybrid_jax.networks.normalisation import row_means
 
 Shaped = Array | np.ndarray | jax.ShapeDtypeStruct
@@ -85,20 +87,46 @@ def _called(kernel_and_dt: tuple[Kernel, float], kept: int, *arrays: Array) -> l
     def plain(*arrays):
         return [_plain(kernel_and_dt, *arrays), jnp.zeros(kept, x0.dtype)]
 
-    return _call((kernel.prefix + "forward", results, dt, kernel.epsilon), plain, *arrays)
+    return _call((kernel, "forward", dt), results, plain, *arrays)
 
 
-def _call(kernel: tuple, plain: Callable, *arrays: Array) -> Any:
+def _call(target: tuple[Kernel, str, float], results: list, plain: Callable, *arrays: Array) -> Any:
     """Call a kernel on arrays, which it does not check; it is differentiated as `plain`, and `vmap` makes one call."""
-    target, results, *numbers = kernel
-
-    @jax.custom_jvp
-    def call(*arrays):
-        kernel = jax.ffi.ffi_call(target, results, vmap_method="broadcast_all")
-        return kernel(*arrays, numbers=np.array(numbers, np.float32))
-
+    call = jax.custom_jvp(partial(_CALL.bind, target=target, results=tuple(results), plain=plain))
     call.defjvp(lambda arrays, tangents: jax.jvp(plain, arrays, tangents))
     return call(*arrays)
+
+
+_CALL = Primitive("kernel")  # as `jax.ffi.ffi_call`, but the library may be compiled until it is lowered
+_CALL.multiple_results = True
+_CALL.def_impl(lambda *arrays, **given: jax.jit(partial(_CALL.bind, **given))(*arrays))
+_CALL.def_abstract_eval(lambda *_, results, **__: [ShapedArray(one.shape, one.dtype) for one in results])
+
+
+def _lowered(context, *arrays, target, results, plain):
+    """Wait for the library. Without it, JAX does the same."""
+    kernel, handler, dt = target
+    try:
+        rule = jax.ffi.ffi_lowering(kernel.prefix.result() + handler)
+    except library.Unusable as error:
+        REFUSED[kernel.name] = str(error)
+        return mlir.lower_fun(plain, multiple_results=True)(context, *arrays)
+    return rule(context, *arrays, numbers=np.array([dt, kernel.epsilon], np.float32))
+
+
+def _batched(arrays, axes, *, target, results, plain):
+    """Make one call for all lanes, which are the first axis of all arrays."""
+    (lanes,) = {array.shape[axis] for array, axis in zip(arrays, axes, strict=True) if axis is not None}
+    whole = [
+        jnp.broadcast_to(array, (lanes, *array.shape)) if axis is None else jnp.moveaxis(array, axis, 0)
+        for array, axis in zip(arrays, axes, strict=True)
+    ]
+    wide = tuple(jax.ShapeDtypeStruct((lanes, *one.shape), one.dtype) for one in results)
+    return _CALL.bind(*whole, target=target, results=wide, plain=jax.vmap(plain)), [0] * len(results)
+
+
+mlir.register_lowering(_CALL, _lowered)
+batching.primitive_batchers[_CALL] = _batched
 
 
 def _forward(kernel_and_dt: tuple[Kernel, float], *arrays: Array):
@@ -124,7 +152,7 @@ def _backward(kernel_and_dt: tuple[Kernel, float], saved: tuple[Array, ...], d_s
 
     *given, kept = saved
     given += [kernel.back_weights(given[0]), kept, d_states]
-    return tuple(_call((kernel.prefix + "backward", results, dt, kernel.epsilon), plain, *given))
+    return tuple(_call((kernel, "backward", dt), results, plain, *given))
 
 
 _rollout.defvjp(_forward, _backward)

@@ -4,6 +4,7 @@ import hashlib
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import jax
@@ -27,12 +28,12 @@ def anew():
     """Nothing is known of kernels, before and after."""
     fields._KNOWN.clear()
     library.obstacle.cache_clear()
-    library._registered.cache_clear()
+    library._begun.cache_clear()
     yield
     fields._KNOWN.clear()
     fields.REFUSED.clear()
     library.obstacle.cache_clear()
-    library._registered.cache_clear()
+    library._begun.cache_clear()
 
 
 @pytest.fixture
@@ -175,7 +176,28 @@ def test_without_kernels_jax_does_the_same(change, reason, anew, tmp_path, monke
     field = untrained("physics_only")
     x0, u = jnp.ones((20, 13)) / 2, jnp.full((20, 2, 4), 500.0)
     predicted = jax.jit(lambda *arrays: predict(*arrays, DT))(field, x0, u)  # a function that is not traced yet
-    np.testing.assert_array_equal(predicted, jax.jit(rollout_batch)(field, x0, u, DT))
+    np.testing.assert_allclose(predicted, jax.jit(rollout_batch)(field, x0, u, DT), rtol=1e-6, atol=1e-6)
     assert reason in kernels.status()
     assert len(kernels.status().splitlines()) <= 2
     assert not list(tmp_path.glob("*/*/*.so")) or "loaded" in reason
+
+
+@needs_kernels
+def test_the_compiler_works_while_jax_traces(anew, tmp_path, monkeypatch):
+    compiler, began, traced = library._run_compiler, threading.Event(), threading.Event()
+
+    def waiting(arguments):
+        began.set()
+        assert traced.wait(60)
+        compiler(arguments)
+
+    monkeypatch.setattr(library, "_run_compiler", waiting)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    field = untrained("physics_only")
+    x0, u = jnp.ones((20, 13)) / 2, jnp.full((20, 2, 4), 500.0)
+    program = jax.jit(lambda *arrays: predict(*arrays, DT)).trace(field, x0, u)
+    assert began.wait(60)
+    traced.set()
+    text = program.lower()
+    assert "custom_call @hybrid_jax_" in text.as_text()
+    np.testing.assert_allclose(text.compile()(field, x0, u), rollout_batch(field, x0, u, DT), rtol=1e-6, atol=1e-6)
