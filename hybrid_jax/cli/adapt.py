@@ -10,6 +10,7 @@ import tyro
 from hybrid_jax.adaptation import Adaptation, Parameter
 from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
+from hybrid_jax.cli.identified import KEEP
 from hybrid_jax.cli.learning import adapted, without_past
 from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -22,6 +23,7 @@ __all__ = ["LISTS", "Options", "run"]
 Change = tuple[str, float, Parameter]  # a name, its value before, and after
 UNLIKELY = 0.05  # probability that nothing changed, below which the vehicle is another one
 SHOWN = 5  # parameters beside the answer
+DIFFER = "These flights differ from the model, but do not determine which of its parameters changed."
 ALONE = "physics alone predicts the flights before better than with the network, and is the adapted model."
 STILL = "These flights hardly move, so they determine hardly anything."
 TAUGHT = ", to which the model was adapted"
@@ -87,14 +89,10 @@ def _page(
     old, *new = (errors.texts(each.mean(axis=0)[-1])[1] for each in curves.values())
     error = f"On these flights the error of velocity after {known.steps * known.dt:g} s"
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
-    answer = "These flights differ from the model, but do not determine which of its parameters changed."
-    answer = f"Changed: {what}." if own else answer
+    answer = f"Changed: {what}." if own else DIFFER
     if not changed and found.candidates["source"] >= UNLIKELY:
-        answer = f"These flights show no change; {ALONE}"
-    todo = f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."
-    if not different:
-        answer = "These flights show no change."
-        todo = "Keep the model. If something did change, you should fly manoeuvres that excite it more."
+        answer = f"These flights show no change; {ALONE}" if different else "These flights show no change."
+    todo = f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS." if different else KEEP
     title = "What changed" if changed else "Parameters, none of which clearly changed"
     moved = [each for each in changes if each[1] != each[2].value] or changes
     rows = [

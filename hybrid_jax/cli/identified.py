@@ -32,6 +32,7 @@ from hybrid_jax.io.models import Model, save
 # Share of a value by which flights of one vehicle differ, and share that a parameter explains at least.
 ALIKE, LEAST = 0.03, 0.2
 REACH, SURE = 1.96, 1.5  # standard errors of an interval; half-widths that a change is at least
+KEEP = "Keep the model. If something did change, you should fly manoeuvres that excite it more."
 HEADER = ("parameter", "before", "after", "from", "to", "unit")
 
 
@@ -55,18 +56,14 @@ def adapt(options: Any, model: Model) -> int:
         f"{share:.0%} of how these logs differ."
         for name, (share, value, low, high) in changed.items()
     ]
-    todo = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
+    kept = found.field if changed else model.field
     shown = page.Page(
         f"What changed in {page.counted(logs, 'log')} of {options.after} ({found.seconds:.0f} s)?",
         f"Changed: {alone[0]}" if changed else "These logs show no change.",
         page.Table("Before, and after with 95 % intervals", HEADER, lines[:LINES]),
-        [("Errors of predictions of the adapted model", figure(found.field, logs, layout))],
+        [(f"Errors of predictions{' of the adapted model' * bool(changed)}", figure(kept, logs, layout))],
         [*warned(read, found), *alone[1:]],
-        [
-            todo
-            if changed
-            else "Keep the model. If something did change, you should fly manoeuvres that excite it more."
-        ],
+        [f"On logs that were not used here: hybrid-jax check {options.output} LOGS." if changed else KEEP],
         [
             page.Table("All parameters", HEADER, lines),
             predicted(model.field, logs, layout, "before"),
@@ -91,7 +88,7 @@ def check(options: Any, model: Model) -> int:
         whole,
         [("Errors of predictions, all logs", figure(model.field, logs, layout))],
         [ANYWAY.format(len(read.failed))] * bool(read.failed),
-        ["Where it is wrong, learn what changed from such logs: hybrid-jax adapt."],
+        [f"If it is wrong: hybrid-jax adapt {options.model} {options.flights} -o adapted.npz."],
         [predicted(model.field, [log], layout, name) for name, log in zip(read.contents, logs, strict=True)],
         [*read.said, *read.failed],
     )
