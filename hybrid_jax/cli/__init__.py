@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 __all__ = ["main"]
 EXTRA = ("tyro", "matplotlib")  # what the script needs beside the library
-INTERRUPTED = "interrupted, nothing was written"
+INTERRUPTED = "interrupted; each file that was written is complete"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
