@@ -30,10 +30,10 @@ def filter_of(noise):
 
 
 @eqx.filter_jit
-def hovering(adaptation, noise, key, steps, change=0.0, sensor=1.0, swing=0.0, gusts=0.0):
+def hovering(adaptation, noise, key, steps, change=0.0, sensor=1.0, turned=1.0, swing=0.0, gusts=0.0):
     """States of the filter while a controller holds a speed, in gusts of an rms [m/s²] that last for a second; and the
-    errors of the acceleration that its model and the first one expect. Halfway the gain changes, or the sensor by a
-    factor."""
+    errors of the acceleration that its model and the first one expect. Halfway the gain changes, the sensor by a
+    factor, or the sign of what the input that the filter is given adds to hover."""
 
     def step(carry, given):
         v, y, gust, state = carry
@@ -45,7 +45,8 @@ def hovering(adaptation, noise, key, steps, change=0.0, sensor=1.0, swing=0.0, g
         errors = jnp.stack([adaptation.model(state)(y[None], u[None])[0], u - HOVER]) - true
         v = v + DT * true
         y = jnp.where(late, sensor, 1.0) * v + noise * white
-        state = adaptation.update(state, y[None], u[None])
+        told = HOVER + jnp.where(late, turned, 1.0) * (u - HOVER)
+        state = adaptation.update(state, y[None], told[None])
         return (v, y, gust, state), (state, errors)
 
     zero = jnp.zeros(())
@@ -108,9 +109,13 @@ def test_a_change_is_found_within_a_second_as_far_as_samples_tell_it():
     assert gains(filter_of(NOISE), swung)[0][after] == pytest.approx(1.0, rel=0.1)
 
 
-@pytest.mark.parametrize(("sensor", "swing"), [(-1.0, 1.0), (57.3, 0.3)], ids=["sign", "unit"])
-def test_a_wrong_sensor_ends_the_adaptation_at_the_last_model_that_was_consistent(sensor, swing):
-    adaptation = filter_of(NOISE)
-    states, _ = hovering(adaptation, NOISE, jax.random.key(0), 24 * SECOND, sensor=sensor, swing=swing)
-    assert adaptation.flags(states).inconsistent[13 * SECOND :].all()
-    assert np.abs(states.trusted[13 * SECOND :]).max() < 0.1
+@pytest.mark.parametrize(
+    ("sensor", "turned", "swing"),
+    [(-1.0, 1.0, 1.0), (57.3, 1.0, 0.3), (1.0, -1.0, 1.0)],
+    ids=["sign", "unit", "exchanged rotors"],
+)
+def test_a_wrong_sensor_or_input_ends_the_adaptation_at_the_last_model_that_was_consistent(sensor, turned, swing):
+    adaptation, wrong = filter_of(NOISE), {"sensor": sensor, "turned": turned, "swing": swing}
+    states, _ = hovering(adaptation, NOISE, jax.random.key(0), 24 * SECOND, **wrong)
+    assert adaptation.flags(states).inconsistent[15 * SECOND :].all()
+    assert np.abs(states.trusted[15 * SECOND :]).max() < 0.1
