@@ -1,6 +1,6 @@
 """Least squares in shared parameters θ and each window's or record's own unknowns, by Schur complements (Bock 1983)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax.estimation.levenberg_marquardt import begin, in_python, minimise, move_of_equations
-from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, inverses
+from hybrid_jax.estimation.normal_equations import RANK, NormalEquations, inverse, inverses
 from hybrid_jax.matrices import solve
 from hybrid_jax.status import Status
+
+TRACE = 1e-2  # share of a direction: names with less are left out
 
 
 class Reduced(NamedTuple):
@@ -91,6 +93,19 @@ def descend(
     end = minimise(evaluate, aim, begin(point, (point, nothing)), max_steps, tolerance, in_python)
     (theta, own), found = end.best
     return End(theta, own, found, int(end.steps), Status(int(end.status)))
+
+
+def undetermined(gram: Float[np.ndarray, "k k"], names: Sequence[str]) -> list[str]:
+    """Return the directions that change no error by more than rounding, for example "0.71 a - 0.71 b"."""
+    size = np.sqrt(np.maximum(np.diagonal(gram), 0.0))
+    unit = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(gram / unit / unit[:, None])
+    lines = []
+    for along in (vectors / unit[:, None]).T[values <= RANK * len(gram) * np.finfo(float).eps]:
+        share = along / np.linalg.norm(along) * np.sign(along[np.argmax(np.abs(along) > TRACE * np.abs(along).max())])
+        terms = [f"{each:.2g} {name}" for each, name in zip(share, names, strict=True) if abs(each) > TRACE]
+        lines.append(" + ".join(terms).replace("+ -", "- ").removeprefix("1 "))
+    return lines
 
 
 def covariance(

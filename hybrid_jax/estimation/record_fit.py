@@ -4,6 +4,7 @@ Levenberg–Marquardt sums normal equations over segments (`shooting`), so memor
 """
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -50,6 +51,7 @@ class RecordFit(eqx.Module):
         status: how the last round ended.
         discretisation: by how many standard errors half the solver's step would change a learned number at most; 0 if
             there is none.
+        directions: what no sample determines: states at the starts, and combinations of learned numbers.
     """
 
     model: StateSpaceModel
@@ -64,6 +66,7 @@ class RecordFit(eqx.Module):
     steps: int
     status: Status
     discretisation: float
+    directions: tuple[str, ...] = ()
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -91,7 +94,8 @@ def fit_records(
 ) -> RecordFit:
     """Fit the learned numbers of a model and the initial states to all measured outputs.
 
-    It warns if half the solver's step would give others, see `RecordFit.discretisation`.
+    It warns if half the solver's step would give others, see `RecordFit.discretisation`, and of what no sample
+    determines, see `RecordFit.directions`.
 
     Args:
         model: the start of the search.
@@ -130,6 +134,7 @@ def fit_records(
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
     with jax.enable_x64(True), solver_errors(solver):
         model = in_double(model)
+        record_search.check_rates(model, records)
         y = {name: np.concatenate([each.y[name] for each in gridded]) for name in gridded[0].y}
         deviation = {name: np.maximum(each.std(axis=0), TINY) for name, each in y.items()}
         known = {name: np.full_like(deviation[name], size) for name, size in (noise or {}).items()}
@@ -159,8 +164,10 @@ def fit_records(
             errors = search.errors(theta, own)
             if i < rounds - 1:
                 search = search.weighted(errors, robust)
-        found = _result(search, end._replace(steps=total), gridded, errors, robust, level)
+        found = _result(search, end._replace(steps=total), records, gridded, errors, robust, level)
     warn_of_steps(found.discretisation, f"a smaller dt, or substeps={2 * substeps}")
+    if found.directions:
+        warnings.warn(f"records: no sample determines {'; '.join(found.directions)}", stacklevel=3)
     return found
 
 
@@ -235,7 +242,7 @@ def predict(
     return simulate(model, Record(future.name, joined), known.ends[0], **options)[0]
 
 
-def _result(search: record_search.Search, end: End, gridded, errors, robust: float, level: float) -> RecordFit:
+def _result(search: record_search.Search, end: End, records, gridded, errors, robust, level: float) -> RecordFit:
     model, start = search.model(end.theta), np.asarray(search.nodes(end.own)[0])[:, 0]
     covariance, variances = _covariance(search, end)
     deviation = np.sqrt(variances[:, : model.space.tangent_size])
@@ -252,7 +259,8 @@ def _result(search: record_search.Search, end: End, gridded, errors, robust: flo
     ends = np.asarray(search.predicted(end.theta, end.own).states)[:, -1, -1]
     times = np.array([(each.start, each.start + len(each.u) * search.problem.dt) for each in gridded])
     moved = _discretisation(search, end, errors)
-    return RecordFit(model, start, deviation, ends, times, found, rms, aside, covariance, end.steps, end.status, moved)
+    fit = RecordFit(model, start, deviation, ends, times, found, rms, aside, covariance, end.steps, end.status, moved)
+    return dataclasses.replace(fit, directions=record_search.directions(search, end, records))
 
 
 def _discretisation(search: record_search.Search, end: End, errors) -> float:

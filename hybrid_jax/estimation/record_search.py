@@ -1,7 +1,8 @@
 """The search for the parameters and the states at the nodes of records, see `record_fit`."""
 
 import dataclasses
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -13,16 +14,17 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import ravel_learned, trainable
 from hybrid_jax.estimation import shooting
-from hybrid_jax.estimation.elimination import descend
+from hybrid_jax.estimation.elimination import End, descend, reduced, undetermined
 from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.estimation.shooting import Local, Model, Predicted, Problem, Segments
-from hybrid_jax.records import Gridded
+from hybrid_jax.records import Gridded, Record, integral
 from hybrid_jax.state_space import StateSpace
 
 APPROACH = (1.0, 0.1, 0.01)  # what a segment's end may be off, over the size of a state, in turn
 MOST = 3000  # unknowns
 CLUSTERS = 20  # of a simulation's errors, each taken as one observation
 TINY, SMALL = 1e-12, 1e-3
+ALIKE, FAR = 0.9, 3.0  # correlation of a rate with what it is the rate of, and a factor between them that is a unit
 
 
 class Sums(NamedTuple):
@@ -154,22 +156,68 @@ def _missing(model: Model, ends, slopes, nodes, charts):
     return jax.vmap(jax.vmap(one))(ends, slopes, nodes, charts)
 
 
+def paths_of(model: Model) -> list[str]:
+    """Return the path of each learned number, in the order of `ravel_learned`."""
+    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(model, trainable(model)))
+    return [jax.tree_util.keystr(path, simple=True, separator=".") for path, leaf in leaves for _ in range(leaf.size)]
+
+
 def deviations_of(model: Model, prior: Mapping[str, float]) -> Float[np.ndarray, " p"]:
     """Return the prior deviation of each learned number; ValueError for an unknown path."""
-    learned = eqx.filter(model, trainable(model))
-    leaves = jax.tree_util.tree_leaves_with_path(learned)
-    names, found, used = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves], [], set()
-    for name, (_, leaf) in zip(names, leaves, strict=True):
+    names, used = paths_of(model), set()
+    found = np.full(len(names), np.inf)
+    for i, name in enumerate(names):
         chosen = [each for each in prior if name == each or name.startswith(f"{each}.")]
         used.update(chosen)
-        found.append(np.full(leaf.size, prior[max(chosen, key=len)] if chosen else np.inf))
+        found[i] = prior[max(chosen, key=len)] if chosen else np.inf
     for name in prior.keys() - used:
-        raise ValueError(f"prior: the model has no {name}; it has {', '.join(names)}")
-    return np.concatenate(found) if found else np.zeros(0)
+        raise ValueError(f"prior: the model has no {name}; it has {', '.join(dict.fromkeys(names))}")
+    return found
+
+
+def directions(search: Search, end: End, records: Sequence[Record]) -> tuple[str, ...]:
+    """Return the directions of θ, and of each start in a simulation, that change no output."""
+    p, model = len(search.theta), search.problem.model
+    lines = undetermined(np.asarray(jnp.sum(reduced(end.equations, p).equations.gram, axis=0)), paths_of(model))
+    if search.off is None:
+        sizes = [(one.name, one.tangent_size) for one in model.space.quantities]
+        names = np.array([name if size == 1 else f"{name}[{i}]" for name, size in sizes for i in range(size)])
+        free, equations = np.array(model.spread) > 0, search.local(end.theta, end.own).equations
+        for record, gram in zip(records, np.asarray(equations.gram)[..., p:, p:].sum(axis=1), strict=True):
+            own = undetermined(gram[np.ix_(free, free)], names[free].tolist())
+            lines += [f"{line} at the start of {record.name}" for line in own]
+    return tuple(lines)
+
+
+def check_rates(model: Model, records: Sequence[Record]) -> None:
+    """Raise ValueError if an output that is the rate of another one in the model has another unit in a record."""
+    random, m = np.random.default_rng(0), sum(records[0].signals[name].values.shape[1] for name in model.inputs)
+
+    def slopes(x, u):
+        of_output = {name: partial(lambda name, x: model.output(name, x, u), name) for name in model.outputs}
+        return {name: jax.jvp(y, (x,), (model.field(x, u),)) for name, y in of_output.items()}
+
+    found = [slopes(*(jnp.asarray(random.normal(size=k)) for k in (model.size, m))) for _ in range(2)]
+    for name, rate in itertools.permutations(model.outputs, 2):
+        pairs = [(each[name][1], each[rate][0]) for each in found]
+        if not all(a.shape == b.shape and jnp.allclose(a, b) for a, b in pairs):
+            continue
+        for record in records:
+            moved, measured = record.signals[name], record.signals[rate]
+            inside = (moved.t >= measured.t[0]) & (moved.t <= measured.t[-1])
+            if not inside.any():
+                continue
+            both = moved.values[inside], integral(measured, moved.t[inside], "linear")
+            a, b = (each - each.mean(axis=0, keepdims=True) for each in both)
+            gain = np.sqrt(np.sum(b * b) / max(np.sum(a * a), TINY))
+            if np.sum(a * b) > ALIKE * np.sqrt(np.sum(a * a) * np.sum(b * b)) and not 1 / FAR < gain < FAR:
+                raise ValueError(f"{record.name}: {rate} is {gain:.3g} times the rate of {name}: check their units")
 
 
 def steps_of(segment: float | None, gridded: list[Gridded], dt: float) -> int:
     longest = max(len(each.u) for each in gridded)
+    if segment is not None and segment > (longest + 1) * dt:
+        raise ValueError(f"segment must be at most the {longest * dt:.3g} s of the longest record, got {segment:.3g}")
     return max(1, round(segment / dt)) if segment is not None else -(-longest // max(1, min(CLUSTERS, longest // 10)))
 
 

@@ -91,7 +91,8 @@ def cut(
     counts = [len(each) for each in starts]
     if not sum(counts):
         span, needed = layout.dt * layout.steps, ", ".join((told, *names))
-        raise ValueError(f"{recordings[0].name}: no {span:.3g} s in flight without a gap in {needed}")
+        past = f"after {max(layout.span, WARM):.3g} s of the past"
+        raise ValueError(f"{recordings[0].name}: no {span:.3g} s in flight without a gap in {needed}, {past}")
     kept = np.unique(np.linspace(0, sum(counts) - 1, most).round().astype(int))
     signals = [each.signals[told] for each in recordings]
     root = slow_commands.root(signals)

@@ -11,6 +11,7 @@ import hybrid_jax as hj
 from hybrid_jax.dynamics.hidden import Delay, Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation.record_fit import fit_records, predict, simulate
+from hybrid_jax.estimation.record_search import check_rates
 from hybrid_jax.records import Record, on_grid
 
 NOISE, UNKNOWN = 0.01, (np.inf, np.inf)
@@ -135,8 +136,11 @@ class Twofold(hj.AbstractVectorField):
 
 
 def test_what_no_output_tells_is_named_and_has_no_interval(records):
-    fit = fit_records(model_of(Twofold(*map(jnp.array, (3.0, 4.0, 0.3, 1.0)))), records[:1], dt=0.02)
+    model = model_of(Twofold(*map(jnp.array, (3.0, 3.0, 0.3, 1.0))))
+    with pytest.warns(UserWarning, match="no sample determines .*0.71 field.a - 0.71 field.b") as warned:
+        fit = fit_records(model, records[:1], dt=0.02)
     assert set(fit.undetermined) == {"a", "b", "unused"}
+    assert len(warned) == 1
     assert float(fit.intervals["unused"].value) == 1.0
     assert np.isfinite(float(fit.intervals["damping"].high))
 
@@ -225,6 +229,9 @@ def test_the_mean_of_an_input_over_intervals_keeps_its_integral(between):
     assert found.u[0, 0] == pytest.approx({"held": 1.0, "averaged": -2.0, "linear": 0.5}[between])
 
 
+APART = Record.of("r", torque=([0.0, 1.0], [0, 1]), angle=([5.0, 6.0], [0, 1]))
+
+
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
@@ -234,6 +241,11 @@ def test_the_mean_of_an_input_over_intervals_keeps_its_integral(between):
         ({"between": "cubic"}, "between must be one of held, linear, averaged, got 'cubic'"),
         ({"robust": -1.0}, "robust must be a positive number"),
         ({"dt": 0.0}, "dt must be a positive number of seconds"),
+        ({"segment": 9.0}, r"segment must be at most the .* s of the longest record, got 9"),
+        (
+            {"records": [Record.of("r", torque=([0.0, 1.0], [0, 1]), angle=([5.0, 6.0], [0, 1]))]},
+            "r: torque, angle share less",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(records, wrong, said):
@@ -242,10 +254,39 @@ def test_what_is_wrong_is_said_in_a_line(records, wrong, said):
         fit_records(model_of(pendulum()), **options)
 
 
-def test_signals_that_share_no_time_are_refused():
-    apart = Record.of("r", torque=([0.0, 1.0], [0, 1]), angle=([5.0, 6.0], [0, 1]))
-    with pytest.raises(ValueError, match="r: torque, angle share less than dt"):
-        fit_records(model_of(pendulum()), [apart], dt=0.02)
+@pytest.mark.parametrize(("factor", "said"), [(180 / np.pi, True), (1e-3, True), (1.0, False)])
+def test_a_rate_in_another_unit_than_its_angle_is_said(records, factor, said):
+    outputs = {"angle": angle, "rate": lambda x, u: x[1]}
+    model = StateSpaceModel(pendulum(), ("torque",), outputs, (1.0, 0.0), (0.1, 0.1))
+    t = np.arange(0.0, 4.0, 0.05)
+    made = Record.of("r", torque=(t, 0 * t), angle=(t, t), rate=(t, t))
+    y = simulate(model, made, dt=0.05)[0]
+    noisy = y["angle"] + 0.02 * np.random.default_rng(0).normal(size=y["angle"].shape)
+    made = Record.of("r", torque=(t, 0 * t), angle=(t, noisy), rate=(t, factor * y["rate"]))
+    if said:
+        with pytest.raises(ValueError, match=r"r: rate is (56|0\.0009).* times the rate of angle: check their units"):
+            fit_records(model, [made], dt=0.05)
+    else:
+        check_rates(model, [made])
+
+
+class Turntable(hj.AbstractVectorField):
+    """x = [angle, rate, offset]: only the sum of angle and offset is seen."""
+
+    damping: jax.Array
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1], u[0] - self.damping * x[1], 0 * x[2]])
+
+
+def test_a_state_on_which_no_output_depends_is_named_with_its_direction(records):
+    def seen(x, u):
+        return x[0] + 2 * x[2]
+
+    model = StateSpaceModel(Turntable(jnp.array(1.0)), ("torque",), {"angle": seen}, np.zeros(3), np.full(3, 10.0))
+    with pytest.warns(UserWarning, match=r"no sample determines 0.89 x\[0\] - 0.45 x\[2\] at the start of run 1$"):
+        fit = fit_records(model, records[:1], dt=0.02)
+    assert fit.undetermined == ()
 
 
 def test_the_start_of_a_body_is_corrected_in_the_tangent_space_of_its_attitude():
