@@ -1,5 +1,6 @@
 """Ablations of the hybrid method, one choice at a time: python -m experiments.ablation --help"""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, Literal, get_args
@@ -15,13 +16,13 @@ from experiments.paper.lanes import rows_of
 from experiments.paper.study import adapted, assess, flown, pretrained, source_splits, target_splits
 from experiments.paper.tables import ablation_tables
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, label
-from experiments.reporting.plots import save_figures
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval
+from experiments.reporting.tables import Table
 from experiments.runner import command
 from experiments.runner.options import Target
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
@@ -32,8 +33,7 @@ from hybrid_jax.vehicle import IRIS
 NAME = "ablation"
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 TRUTH = {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
-HEAD = """# ablation
-
+HEAD = """\
 One choice of the hybrid method is changed at a time; everything else keeps its default. Each value is pre-trained on
 source flight and fine-tuned on N trajectories of each target: other moments of inertia, and a side wind.
 
@@ -113,7 +113,8 @@ def experiment(config: AblationConfig, console: Console) -> None:
             rows += run(other, stages).tagged(choice=choice, value=value, default=other == config)
             seconds[f"{choice}, {value}"] = sum(stages.seconds.values())
         if hosts.is_main_process():
-            write(config, rows, seconds, Console() if choice == config.over[-1] else None)
+            shown = Console() if choice == config.over[-1] else None
+            write_report(config.out / NAME, report(record_of(NAME, config, rows, seconds)), shown)
 
 
 def run(config: AblationConfig, stages: Stages) -> Results:
@@ -126,20 +127,10 @@ def run(config: AblationConfig, stages: Stages) -> Results:
     return rows
 
 
-def write(config: AblationConfig, rows: Results, seconds: dict[str, float], console: Console | None) -> None:
-    out = config.out / NAME
-    report = Report(
-        experiment=NAME,
-        config=config.described(),
-        environment=environment(seconds),
-        rows=rows,
-        figures=save_figures(out, draw(rows)),
-        notes=NOTES,
-        head=HEAD,
-        conclusion=conclusion(rows),
-        tables=ablation_tables(rows, TRUTH),
-    )
-    write_report(out, report, console)
+def report(record: Mapping[str, Any]) -> Report:
+    rows = rows_in(record)
+    tables = [*ratio_table(rows), *ablation_tables(rows, TRUTH)]
+    return Report(record, draw(rows), tables, conclusion(rows), head=HEAD, notes=NOTES)
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
@@ -167,6 +158,14 @@ def effects(rows: Results) -> dict[tuple[str, str], dict[str, Estimate]]:
                 ends = np.exp(mean_interval(errors - others, ours["seed"]))
             found.setdefault((choice, value), {})[domain] = Estimate(*map(float, ends))
     return found
+
+
+def ratio_table(rows: Results) -> list[Table]:
+    """Return the effects of the first choice, of which the figure is shown: a line for each value."""
+    found = {value: own for (choice, value), own in effects(rows).items() if choice == rows[0]["choice"]}
+    header = (str(rows[0]["choice"]), *map(label, rows.unique("domain")))
+    lines = [(value, *(each.text(".2f") for each in own.values())) for value, own in found.items()]
+    return [Table("Error after fine-tuning over the default's (95 % interval)", header, lines)] if lines else []
 
 
 def conclusion(rows: Results) -> list[str]:

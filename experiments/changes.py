@@ -1,5 +1,6 @@
 """Which method adapts to one flight of ten seconds, after seven changes: python -m experiments.changes"""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, get_args
@@ -21,13 +22,12 @@ from experiments.paper.study import EVERY, flown, pretrained, source_splits, tar
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import FINE_TUNED, HYBRID
-from experiments.reporting.plots import save_figures
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results, Row
 from experiments.runner import command
 from experiments.runner.cache import identity_of
 from experiments.runner.options import distinct
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate, extended
@@ -52,13 +52,11 @@ INSIDE = "expected_inside"  # column: see `_share_inside`
 Compared = Literal["fine_tune", "fine_tune_offset", "l2_sp"]
 METHOD, OFFSET = Auto(), 0.3
 L2_SP = FineTune(l2_sp=1e-2)
-HEAD = f"""# {NAME}
-
+HEAD = """\
 A hybrid that was trained on source flight adapts to a changed vehicle with the first N windows of 0.1 s of **one**
-flight and nothing else. `adapt(method="auto")` takes one of several candidates if these windows make it at least twenty
-times as probable as no change, where the source's own errors are counted in. Regret: the test error of the candidate
-that was taken over that of the best one in hindsight. ρ: the share of the source's test
-error that is gone. Test error: L^T_MSE over 1 s of other flights.
+flight and nothing else. `hj.adapt` takes one of several candidates, or keeps the source model. Regret: the test error
+of the candidate that it took over the error of the best one in hindsight. ρ: the share of the source's test error that
+adaptation removes. Test error: L^T_MSE over 1 s of other flights.
 
 - **source**: not adapted. **theta**: Ix, Iy and k by least squares
 - **force**, **torque**, **drag**, **efficiency**, and several of these: fitted with Ix, Iy, k; efficiency is one for
@@ -107,24 +105,15 @@ def experiment(config: ChangesConfig, console: Console) -> None:
         ("domain", "candidate", "draw", "seed"),
     )
     if hosts.is_main_process():
-        out, verdicts = config.out / NAME, evaluate_claims(CLAIMS, rows)
-        report = Report(
-            experiment=NAME,
-            config=config.described(),
-            environment=environment(stages.seconds),
-            rows=rows,
-            claims=verdicts,
-            figures=save_figures(out, draw(rows)),
-            notes=stages.notes(),
-            head=HEAD.strip(),
-            conclusion=conclusion(rows),
-            tables=[
-                verdict_table(verdicts, "Hypotheses"),
-                regret_table(rows),
-                error_table(rows),
-            ],
-        )
-        write_report(out, report, Console())
+        record = record_of(NAME, config, rows, stages.seconds, stages.notes())
+        write_report(config.out / NAME, report(record), Console())
+
+
+def report(record: Mapping[str, Any]) -> Report:
+    rows = rows_in(record)
+    verdicts = evaluate_claims(CLAIMS, rows)
+    tables = [verdict_table(verdicts, "Hypotheses"), regret_table(rows), error_table(rows)]
+    return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:

@@ -1,11 +1,11 @@
 """Every method adapts the same source model (paper, Sec. 4.7, Table 2): python -m experiments.comparison --help"""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any, get_args
 
 import numpy as np
-from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.external_force import sine_floor
@@ -15,14 +15,14 @@ from experiments.paper.config import QUICK, SMOKE, TABLE_SIZES, Config, Encoding
 from experiments.paper.figures import ranking
 from experiments.paper.lanes import Fit, fit_of, rows_of, save_models, source_of
 from experiments.paper.methods import PAST, Case, Method, adapted, source_only
-from experiments.paper.outcome import paper_report
+from experiments.paper.outcome import FLOOR, paper_report
 from experiments.paper.study import drawn_splits, flown, pretrained, source_splits
 from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER
-from experiments.reporting.plots import save_figures
-from experiments.reporting.report import write_report
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.options import Target, distinct, factors
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation.expert_augmentation import Augmentation
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
@@ -86,16 +86,14 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     if not hosts.is_main_process():
         return
     floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
-    figures = save_figures(out, draw(rows, floor))
-    notes = stages.notes()
-    true, extra = {each.name: nominal(each.vehicle) for each in DOMAINS}, {"flights": flights}
-    report = paper_report(NAME, config, stages.seconds, rows, true, figures, notes, floor, extra)
-    write_report(out, report, Console())
+    extra = {"truth_theta": {each.name: nominal(each.vehicle) for each in DOMAINS}, FLOOR: floor, "flights": flights}
+    write_report(out, report(record_of(NAME, config, rows, stages.seconds, stages.notes(), **extra)), Console())
 
 
-def draw(rows: Results, floor: float) -> dict[str, tuple[Figure, str]]:
-    caption = "Test errors of all seeds of every method (paper, Table 2)"
-    return {"standings": (ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor}), caption)}
+def report(record: Mapping[str, Any]) -> Report:
+    rows, caption = rows_in(record), "Test errors of all seeds of every method (paper, Table 2)"
+    standings = ranking(rows, TITLE, {EXTERNAL_FORCE.name: record[FLOOR]})
+    return paper_report(record, rows, {"standings": (standings, caption)})
 
 
 def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, Fit], Fit | None]:

@@ -1,5 +1,6 @@
 """How often intervals of θ_p contain the truth: python -m experiments.coverage --help"""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -20,14 +21,14 @@ from experiments.reporting import names
 from experiments.reporting.claims import Claim, Part, all_of, verdict_table
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.names import HYBRID
-from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, note, save_figures, subplots
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, note, subplots
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import EMPTY, Table, tabulate
 from experiments.runner import command
 from experiments.runner.cache import identity_of
 from experiments.runner.options import Count
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.pooling import SOURCES, combined
@@ -47,8 +48,7 @@ LEVEL, ASKED, MOST = 0.95, 0.9, 0.99  # of the intervals, and the least and larg
 WIDEST, FEW = 2.0, 20  # times what 95 % of the errors need, of which fewer flights say nothing
 METHOD = Auto(networks=False)  # the network stays as it is: else there are no intervals
 RIGHT: tuple[Change, ...] = ("parameter_shift", "external_force", "doubled_drag", "weak_rotor", "gusty_wind")
-HEAD = f"""# {NAME}
-
+HEAD = """\
 Hybrids that were trained on source flight, with different seeds, adapt to the same N windows of one flight, as
 `adapt(method="auto")` does without changing the network. The interval of each of θ_p is pooled over the sources by
 `hybrid_jax.pool`: the variance of a fit, with blocks of two seconds as clusters, and the variance between the sources.
@@ -109,22 +109,15 @@ def experiment(config: CoverageConfig, console: Console) -> None:
     if not hosts.is_main_process():
         return
     known = stages.timed("known body", lambda: coverage(config.repeats, console))
+    record = record_of(NAME, config, rows, stages.seconds, stages.notes(), known_body=known.rows)
+    write_report(config.out / NAME, report(record), Console())
+
+
+def report(record: Mapping[str, Any]) -> Report:
+    rows, known = rows_in(record), Results(record["known_body"], ("case", "noise_on", "parameter"))
     verdicts = evaluate_claims(CLAIMS, rows)
-    tables = [verdict_table(verdicts, "Hypotheses"), pooled_table(rows), known_body_table(known)]
-    report = Report(
-        experiment=NAME,
-        config=config.described(),
-        environment=environment(stages.seconds),
-        rows=rows,
-        claims=verdicts,
-        figures=save_figures(config.out / NAME, draw(rows)),
-        notes=stages.notes(),
-        head=HEAD.strip(),
-        conclusion=conclusion(rows),
-        tables=tables,
-        extra={"known_body": known.rows},
-    )
-    write_report(config.out / NAME, report, Console())
+    tables = [verdict_table(verdicts, "Hypotheses"), worst_table(rows), pooled_table(rows), known_body_table(known)]
+    return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
 
 
 def adapted(
@@ -182,6 +175,19 @@ def _compared(logs: np.ndarray, stds: np.ndarray, true: float) -> Row:
     return dict(zip(columns, numbers, strict=True))
 
 
+def worst_table(rows: Results) -> Table:
+    """Return a line for each change: of its parameters and noises, the one whose intervals are right least often."""
+    lines = []
+    for change, group in rows.where(lambda row: row["inside"] is not None).group("domain").items():
+        case, own = min(_cases(group).items(), key=lambda case: np.mean(case[1]["inside"]))
+        name, _, noise = case.split(", ")
+        shares = (f"{100 * np.mean(own[column]):.0f}" for column in ("inside", "alone"))
+        wide = f"{np.median(own.numbers('half_width')):.2f}"
+        lines.append((names.label(change), f"{name}, {noise}", str(len(own)), *shares, wide))
+    header = ("change", "lowest for", "flights", "coverage [%]", "one source [%]", "half-width [%], median")
+    return Table(f"Lowest coverage of pooled 95 % intervals of {SOURCES} sources or more", header, lines)
+
+
 def pooled_table(rows: Results) -> Table:
     def text(column: str, scale: float, form: str, statistic=np.mean):
         def of(own: Results) -> str:
@@ -234,9 +240,7 @@ def conclusion(rows: Results) -> list[str]:
     fitted = rows.where(lambda row: row["inside"] is not None)
     if not len(fitted):
         return ["No parameter was fitted, so there are no intervals."]
-    shares = {
-        " ".join(key): np.mean(own["inside"]) for key, own in fitted.group("domain", "noise", "parameter").items()
-    }
+    shares = {case: np.mean(own["inside"]) for case, own in _cases(fitted).items()}
     worst = min(shares, key=shares.__getitem__)
     trust = (
         "So they are not too narrow, after changes of these kinds."
@@ -246,25 +250,29 @@ def conclusion(rows: Results) -> list[str]:
     return [
         f"Of {len(fitted)} pooled 95 % intervals {np.mean(fitted['inside']):.0%} contain the true value, "
         f"of single sources {np.mean(fitted['alone']):.0%}.",
-        f"The fewest do for {worst} (change, noise, parameter): {shares[worst]:.0%} (required: {ASKED:.0%}). {trust}",
+        f"The fewest do for {worst}: {shares[worst]:.0%} (required: {ASKED:.0%}). {trust}",
     ]
 
 
 def _covers(rows: Results) -> Part:
     def of(name: str, own: Results) -> Part:
-        fitted = own.where(lambda row: row["inside"] is not None)
-        inside, n = fitted.numbers("inside").astype(bool), len(fitted)
+        inside, n = own.numbers("inside").astype(bool), len(own)
         share, margin = inside.mean(), 1.96 * np.sqrt(ASKED * (1 - ASKED) / n)
         holds = True if share >= ASKED else False if share < ASKED - margin else None
-        needed = np.quantile(np.abs(fitted.numbers("error")), LEVEL)
-        wide = np.median(fitted.numbers("half_width")) / needed
+        needed = np.quantile(np.abs(own.numbers("error")), LEVEL)
+        wide = np.median(own.numbers("half_width")) / needed
         too_often = share > MOST and LEVEL**n < 1 - LEVEL  # so many would seldom all hold
         measured = f"{name} {share:.2f} of {n}, {wide:.2g} times as wide as needed"
         return (False if too_often or (wide > WIDEST and n >= FEW) else holds), measured
 
-    groups = rows.group("domain", "noise", "parameter").items()
-    fitted = {key: own for key, own in groups if any(row["inside"] is not None for row in own)}
-    return all_of(of(" ".join(key), own) for key, own in fitted.items())
+    fitted = rows.where(lambda row: row["inside"] is not None)
+    return all_of(of(*case) for case in _cases(fitted).items())
+
+
+def _cases(rows: Results) -> dict[str, Results]:
+    """Return the rows of each parameter, change and noise by their names."""
+    groups = rows.group("parameter", "domain", "noise").items()
+    return {f"{names.label(*of)}, {'no noise' if noise == 'none' else 'noise'}": own for (*of, noise), own in groups}
 
 
 CLAIMS = (

@@ -9,6 +9,7 @@ from experiments.paper.config import PRESETS
 from experiments.paper.lanes import DOMAINS, MODELS, MODES, TAGS, THETA, with_rho
 from experiments.paper.outcome import paper_report
 from experiments.reporting.results import Results
+from experiments.runner.run_record import record_of
 
 TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": 8.5e-6}
 SIZES = (100, 500, 1000)
@@ -57,8 +58,9 @@ def verdicts(rows, experiment="param_shift", truth=TRUTH):
     return {verdict.id: verdict.holds for verdict in claims(rows, experiment, truth)}
 
 
-def make_report(rows, experiment="param_shift", truth=TRUTH, figures=MappingProxyType({}), **options):
-    return paper_report(experiment, PRESETS["paper"], {"training": 12.5}, rows, truth, figures, **options)
+def make_report(rows, experiment="param_shift", figures=MappingProxyType({}), notes=(), **extra):
+    record = record_of(experiment, PRESETS["paper"], rows, {"training": 12.5}, notes, truth_theta=TRUTH, **extra)
+    return paper_report(record, rows, figures)
 
 
 NUMBERS = st.none() | st.floats(min_value=0) | st.sampled_from([float("nan"), float("inf")])

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 from rich.console import Console
@@ -12,18 +13,16 @@ from experiments.closed_loop.config import PRESETS, ClosedLoopConfig
 from experiments.closed_loop.figures import draw
 from experiments.closed_loop.flights import DOMAINS, Flown, ModelSet, Scenario, fly_all, results_of
 from experiments.closed_loop.models import Trained
-from experiments.closed_loop.results import Agent, conclusion, gap_tables, speed_table, tables
+from experiments.closed_loop.results import Agent, conclusion, gap_tables, main_table, speed_table, tables
 from experiments.closed_loop.timing import call_times
 from experiments.flying.timing import on_one_core
 from experiments.paper.config import Config
-from experiments.reporting.claims import evaluate, verdict_table
-from experiments.reporting.plots import save_figures
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.claims import evaluate, verdict_table, with_recorded
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.runner import command
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation import LeastSquares
-from hybrid_jax.control import Hardware
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sweep import hosts
@@ -37,8 +36,7 @@ Places = Sequence[tuple[str, float]]  # reference, distance from home [m]
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
 DISTURBANCES = {"needed": LeastSquares(), "always": LeastSquares(disturbance=True)}
 
-HEAD = """# closed_loop
-
+HEAD = """\
 A model predictive controller flies the simulated quadrotor after a change: other moments of inertia,
 or a side wind of 4 N with a sine of 1 N. Every 0.01 s the controller plans 1 s ahead with its
 prediction model; nothing else differs between the flights of a column. {knows}
@@ -70,14 +68,15 @@ unchanged vehicle, on which the source networks were trained.
 EXACT = "It knows the true state without noise."
 
 
-def head(config: ClosedLoopConfig) -> str:
-    hardware = config.hardware()
-    if hardware == Hardware():
-        return HEAD.format(knows=EXACT).strip()
-    noise, latency, lag = config.noise, 1e3 * config.latency, 1e3 * config.rotor_lag
+def head(config: Mapping[str, Any]) -> str:
+    noise, latency, lag = (config.get(name, 0.0) for name in ("noise", "latency", "rotor_lag"))
+    if not (noise or latency or lag):
+        return HEAD.format(knows=EXACT)
     known = "controller and observer predict both"
-    knows = f"Noise of the sensors: {noise:g} times that of motion capture and a gyroscope. Latency {latency:g} ms, lag"
-    return HEAD.format(knows=f"{knows} of the rotors {lag:g} ms; {known}.").strip()
+    knows = (
+        f"Noise of the sensors: {noise:g} times that of motion capture and a gyroscope. Latency {1e3 * latency:g} ms"
+    )
+    return HEAD.format(knows=f"{knows}, lag of the rotors {1e3 * lag:g} ms; {known}.")
 
 
 def experiment(config: ClosedLoopConfig, console: Console) -> None:
@@ -134,25 +133,21 @@ def write(config: ClosedLoopConfig, trained: dict[str, Trained], flown: Sequence
     out, few, timed, rows = config.out / NAME, min(config.sizes), speeds(config, trained), results_of(flown)
     call, simulated = timed[Agent("hybrid", few).name], config.seconds * len(rows)
     spent, worked = sum(each.seconds for each in flown), sum(each.processor_seconds for each in flown)
-    clocked = call["processor_ms"], call["median_ms"], simulated, spent, worked, flown[0].devices
-    verdicts = evaluate(claims(few), FlightEvidence(rows, Speed(*clocked)))
+    clock = Speed(call["processor_ms"], call["median_ms"], simulated, spent, worked, flown[0].devices)
     notes = [f"{name}: {note}" for name, stages in training.items() for note in stages.notes()]
     notes += [f"least squares: {note}" for note in models.disturbance_counts(trained["least_squares"])]
     seconds = {f"{name}, {stage}": taken for name, own in training.items() for stage, taken in own.seconds.items()}
-    report = Report(
-        experiment=NAME,
-        config=config.described(),
-        environment=environment(seconds),
-        rows=rows,
-        claims=verdicts,
-        figures=save_figures(out, draw(rows)),
-        notes=notes,
-        extra={"speed": timed},
-        head=head(config),
-        conclusion=conclusion(rows, few),
-        tables=[verdict_table(verdicts, "Hypotheses"), *tables(rows), *gap_tables(rows), speed_table(timed)],
-    )
-    write_report(out, report, Console())
+    record = record_of(NAME, config, rows, seconds, notes, speed=timed, clock=clock._asdict())
+    write_report(out, report(record), Console())
+
+
+def report(record: Mapping[str, Any]) -> Report:
+    rows, few = rows_in(record), min(record["config"]["sizes"])
+    speed = Speed(**record["clock"]) if "clock" in record else None
+    verdicts = with_recorded(evaluate(claims(few), FlightEvidence(rows, speed)), record)
+    of_rows = [*main_table(rows, few), *tables(rows), *gap_tables(rows)]
+    made = [verdict_table(verdicts, "Hypotheses"), *of_rows, speed_table(record["speed"])]
+    return Report(record, draw(rows), made, conclusion(rows, few), verdicts, head(record["config"]))
 
 
 ABOUT = "Does ten seconds of flight improve the control of a vehicle? A predictive controller flies every model."

@@ -103,6 +103,17 @@ def _in_cm(error: float) -> str:
     return f"{100 * error:.2g} cm" if math.isfinite(error) else "a crash"
 
 
+def main_table(rows: Results, few: int) -> list[Table]:
+    """Return the position error in the wind of the source, of what adapts with few trajectories, and of the truth."""
+    adapted = [Agent(model, few, observer) for observer in (False, True) for model in ("invariant", "least_squares")]
+    shown = [Agent("invariant"), Agent("hybrid", few), *adapted, Agent("invariant", observer=True), ORACLE]
+    flown = by_agent(rows.where(domain=EXTERNAL_FORCE, distance=0.0))
+    lines = {agent.name: flown[agent] for agent in shown if agent in flown}
+    columns = {label: {"reference": name} for name, label in REFERENCES.items() if name in rows.unique("reference")}
+    title = f"Position RMSE [cm], side wind ({mean_over_seeds(rows)}; less is better)"
+    return [cross_table(title, lines, columns, number_text("position_rmse", 100.0, ".2f"))] if lines else []
+
+
 def tables(rows: Results) -> list[Table]:
     seeds = mean_over_seeds(rows)
     titles: dict[str, Cell] = {

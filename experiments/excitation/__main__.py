@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -30,12 +30,11 @@ from experiments.excitation.results import (
 from experiments.flying.changes import CHANGES
 from experiments.paper.conditions import Noise, measure
 from experiments.reporting.claims import evaluate, verdict_table
-from experiments.reporting.plots import save_figures
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results, Row
 from experiments.runner import command
 from experiments.runner.options import Count, NotNegative, Positive, Run, distinct
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 from hybrid_jax import control
 from hybrid_jax.control import Controller
@@ -55,8 +54,7 @@ NAME = "excitation"
 DT, STEPS = random_flight.DT, 10  # s, and samples of a window of 0.1 s
 BLOCKS = 10  # clusters of the covariance: a second each, as windows of one flight are correlated
 Parameter = Literal["Ix", "Iy", "k"]
-HEAD = """# excitation
-
+HEAD = """\
 Which ten seconds of flight determine the parameters best? `hj.excitation` designs a reference for the vehicle of the
 data sheet, inside a box, D-optimal for Ix, Iy and k while an unknown constant force and torque are fitted too. The
 changed vehicle then flies it, a hover and a figure-8 in the simulator with a model predictive controller that knows the
@@ -119,23 +117,16 @@ def experiment(config: ExcitationConfig, console: Console) -> None:
     rows = Results([row for found in stages.parts("fits", jobs) for row in found], ("flight", "parameter", "seed"))
     if not hosts.is_main_process():
         return
-    own = flights[DESIGNED, 0]
-    evidence = DesignEvidence(rows, margins(config.bounds, own[0]))
-    verdicts, out = evaluate(CLAIMS, evidence), config.out / NAME
-    report = Report(
-        experiment=NAME,
-        config=config.described(),
-        environment=environment(stages.seconds),
-        rows=rows,
-        claims=verdicts,
-        figures=save_figures(out, draw(rows)),
-        notes=stages.notes(),
-        head=HEAD.strip(),
-        tables=[verdict_table(verdicts, "Hypotheses"), *tables(rows), margin_table(design, evidence)],
-        extra={"design": described(design)},
-        conclusion=conclusion(rows),
-    )
-    write_report(out, report, Console())
+    extra = {"design": described(design), "flown": margins(config.bounds, flights[DESIGNED, 0][0])}
+    record = record_of(NAME, config, rows, stages.seconds, stages.notes(), **extra)
+    write_report(config.out / NAME, report(record), Console())
+
+
+def report(record: Mapping[str, Any]) -> Report:
+    rows, planned, flown = rows_in(record), record["design"]["margins"], record["flown"]
+    verdicts = evaluate(CLAIMS, DesignEvidence(rows, flown))
+    made = [verdict_table(verdicts, "Hypotheses"), *tables(rows), margin_table(planned, flown)]
+    return Report(record, draw(rows), made, conclusion(rows), verdicts, HEAD)
 
 
 def designed(config: ExcitationConfig) -> Excitation:

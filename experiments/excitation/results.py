@@ -118,11 +118,11 @@ def tables(rows: Results) -> list[Table]:
     ]
 
 
-def margin_table(design: Excitation, evidence: DesignEvidence) -> Table:
-    planned = {name: f"{left:.0%}" for name, left in design.margins.items()}
+def margin_table(planned: Mapping[str, float], flown: Mapping[str, tuple[float, float]]) -> Table:
+    shares = {name: f"{left:.0%}" for name, left in planned.items()}
     lines = [
-        (name, f"{limit:.2g}", planned.get(name.split(" ")[0], ""), f"{used:.2f}")
-        for name, (used, limit) in evidence.margins.items()
+        (name, f"{limit:.2g}", shares.get(name.split(" ")[0], ""), f"{used:.2f}")
+        for name, (used, limit) in flown.items()
     ]
     return Table("Limits", ("limit", "value", "left by the plan", "used in flight"), lines)
 

@@ -1,6 +1,8 @@
 """The vehicle changes in the air, and the controller's model adapts: python -m experiments.online"""
 
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 from rich.console import Console
 
@@ -9,17 +11,15 @@ from experiments.online.figures import draw
 from experiments.online.flights import fly_all
 from experiments.online.results import GoalEvidence, claims, conclusion, results_of, tables
 from experiments.online.timing import step_time
-from experiments.reporting.claims import evaluate, verdict_table
-from experiments.reporting.plots import save_figures
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.claims import evaluate, verdict_table, with_recorded
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.runner import command
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 
 NAME = "online"
 
-HEAD = """# online
-
+HEAD = """\
 At 4 s the simulated quadrotor changes in the air: other moments of inertia (experiment 1), a load of 20 % of its mass
 off centre, a side wind of 4 N with a sine of 1 N (experiment 2), one rotor 15 % weaker, twice the drag; or nothing. The
 controller sees samples with noise; its commands arrive 10 ms later, and the rotors follow with a lag of 30 ms, both of
@@ -43,24 +43,18 @@ then counts as infinite. The settings of filter, observer and L1 were chosen on 
 def experiment(config: OnlineConfig, console: Console) -> None:
     stages = stages_of(config, console)
     run = fly_all(config, stages)
-    rows, step = results_of(run), step_time(config.hardware(), config.controller().period)
-    evidence = GoalEvidence(rows, step, run.seconds, run.processor_seconds, len(rows))
-    verdicts = evaluate(claims(list(config.changes)), evidence)
-    out = config.out / NAME
-    report = Report(
-        experiment=NAME,
-        config=config.described(),
-        environment=environment(stages.seconds),
-        rows=rows,
-        claims=verdicts,
-        figures=save_figures(out, draw(rows)),
-        notes=[f"One step of the filter: {step:.3f} ms of processor time on one core, in a compiled loop."],
-        extra={"step_ms": step},
-        head=HEAD.strip(),
-        conclusion=conclusion(rows),
-        tables=[verdict_table(verdicts, "Goals"), *tables(rows)],
-    )
-    write_report(out, report, Console())
+    step, clock = step_time(config.hardware(), config.controller().period), (run.seconds, run.processor_seconds)
+    record = record_of(NAME, config, results_of(run), stages.seconds, step_ms=step, clock=clock)
+    write_report(config.out / NAME, report(record), Console())
+
+
+def report(record: Mapping[str, Any]) -> Report:
+    rows, step = rows_in(record), record["step_ms"]
+    evidence = GoalEvidence(rows, step, *record.get("clock", (None, None)))
+    verdicts = with_recorded(evaluate(claims(record["config"]["changes"]), evidence), record)
+    notes = [f"One step of the filter: {step:.3f} ms of processor time on one core, in a compiled loop."]
+    made = [verdict_table(verdicts, "Goals"), *tables(rows)]
+    return Report(record, draw(rows), made, conclusion(rows), verdicts, HEAD, notes)
 
 
 ABOUT = "The vehicle changes in the air. How soon does the controller fly as well as one that knows the change?"

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.paper.claims import COMPARISON, claims
-from experiments.paper.config import AdaptationConfig, Config
+from experiments.paper.config import AdaptationConfig
 from experiments.paper.figures import scores
 from experiments.paper.flight_figures import parted, predictions
 from experiments.paper.lanes import BANDS, BASELINES, bands, by_domain, save_models
@@ -17,11 +17,10 @@ from experiments.paper.tables import altitudes, by_size, conclusion, meaning, pa
 from experiments.reporting import names
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import FINE_TUNED, PHYSICS_ONLY, label
-from experiments.reporting.plots import save_figures
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import over_seeds
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.integrate import compact
 from hybrid_jax.rollouts import predict
@@ -70,59 +69,50 @@ def adapt_and_report(experiment: str, domain: Domain, floor: float, config: Adap
     found = study(domain, IRIS, config, console)
     if not hosts.is_main_process():
         return
-    out, truth, rows = config.out / experiment, nominal(domain.vehicle), found.rows
-    save_models(out / "models", found.lanes, rows)
+    out = config.out / experiment
+    save_models(out / "models", found.lanes, found.rows)
     lowest = bands(found.target.splits["test"])
     counted = ", ".join(f"{np.sum(lowest == i)} {band}" for i, band in enumerate(BANDS.values()))
     notes = [*found.notes, f"Test windows by lowest altitude: {counted}."]
-    extra: dict[str, Any] = {"flights": {"source": found.source.metadata, "target": found.target.metadata}}
-    extra |= {FLOOR: floor} if floor else {}
-    extra |= paths(found)
-    figures = save_figures(out, draw(rows, extra))
-    report = paper_report(experiment, config, found.seconds, rows, truth, figures, notes, floor, extra)
-    write_report(out, report, Console())
+    extra: dict[str, Any] = {"truth_theta": nominal(domain.vehicle)}
+    extra |= {"flights": {"source": found.source.metadata, "target": found.target.metadata}}
+    extra |= ({FLOOR: floor} if floor else {}) | paths(found)
+    record = record_of(experiment, config, found.rows, found.seconds, notes, **extra)
+    write_report(out, report(record), Console())
+
+
+def report(record: Mapping[str, Any]) -> Report:
+    rows = rows_in(record)
+    return paper_report(record, rows, draw(rows, record), [] if record["experiment"] != "param_shift" else [RATE_NOTE])
 
 
 def paper_report(
-    experiment: str,
-    config: Config,
-    seconds: Mapping[str, float],
-    rows: Results,
-    truth: Mapping[str, Any] | None,
-    figures: Mapping[str, str],
-    notes: Sequence[str] = (),
-    floor: float = 0.0,
-    extra: Mapping[str, Any] | None = None,
+    record: Mapping[str, Any], rows: Results, figures: Mapping[str, tuple[Figure, str]], notes: Sequence[str] = ()
 ) -> Report:
-    """Build an experiment's report; `truth`: the true θ_p, by domain if there are several."""
-    verdicts = claims(rows, experiment, truth, quick=config.preset == "quick")
+    """Build the report of an experiment of the paper; `truth_theta` is by domain if there are several."""
+    experiment, truth, floor = record["experiment"], record["truth_theta"], record.get(FLOOR, 0.0)
+    verdicts = claims(rows, experiment, truth, quick=record["config"]["preset"] == "quick")
     headline = ranking if experiment == COMPARISON else by_size
     altitude = altitudes(rows) if experiment != COMPARISON else []
-    rate = [RATE_NOTE] if experiment == "param_shift" else []
     sine = f"About {floor:.3g} of a test error in the wind is due to its sine, which no model without a clock can see."
     return Report(
-        experiment=experiment,
-        config=config.described(),
-        environment=environment(seconds),
-        rows=rows,
-        claims=verdicts,
-        figures=figures,
-        notes=[*run_notes(rows), *notes, *rate, *([sine] if floor else [])],
-        extra={"truth_theta": truth, **(extra or {}), **({FLOOR: floor} if floor else {})},
-        head=introduction(experiment, rows),
-        conclusion=[*conclusion(rows), *meaning(verdicts)],
-        tables=[*headline(rows), verdict_table(verdicts, "Claims of the paper"), *altitude, *parameters(rows, truth)],
+        record,
+        figures,
+        [*headline(rows), verdict_table(verdicts, "Claims of the paper"), *altitude, *parameters(rows, truth)],
+        [*conclusion(rows), *meaning(verdicts)],
+        verdicts,
+        introduction(rows),
+        [*run_notes(rows), *notes, *([sine] if floor else [])],
     )
 
 
-def introduction(experiment: str, rows: Results) -> str:
+def introduction(rows: Results) -> str:
     domains = list(by_domain(rows))
     sizes = ", ".join(str(n) for n in sorted({*rows["n_train"]} - {0})) or "none"
     where = f" in each of {len(domains)} targets ({', '.join(map(label, domains))})" if len(domains) > 1 else ""
     seen = {*rows["model"], *rows["mode"]}
     baselines = ", or of the source-only hybrid for a method that adapts it" if seen & {*BASELINES} else ""
     parts = [
-        f"# {experiment}",
         "How well can a model trained on flights from before a quadrotor changed predict flights after it, given a "
         f"little new flight? Question and protocol are those of {PAPER}.",
         f"{len(rows)} trained models: N of {sizes} target trajectories, {over_seeds(rows)} each{where}.",

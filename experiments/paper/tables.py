@@ -35,6 +35,10 @@ def error_text(rows: Results) -> str:
     return spread_text(rows.spread("test_mse")) + " *" * ("capped" in rows.unique("status"))
 
 
+def capped(rows: Results) -> str:
+    return "; *: the cap on epochs ended a run" * ("capped" in rows.unique("status"))
+
+
 def rho_text(rows: Results) -> str:
     """0.912 ± 0.010, or −∞ as in `error_text`."""
     values = rows.spread(gain)
@@ -56,9 +60,8 @@ def by_size(rows: Results) -> list[Table]:
             for model in MODELS
             if len((trained or group).where(model=model, mode=seen))
         }
-        capped = "; *: the cap on epochs ended a run" * ("capped" in group.unique("status"))
         for own, title, text in (
-            (group, f"Test error L^T_MSE{place} ({of}; less is better{capped})", error_text),
+            (group, f"Test error L^T_MSE{place} ({of}; less is better{capped(group)})", error_text),
             (trained, f"Improvement ρ over source-only{place} ({of}; 1 is perfect)", rho_text),
         ):
             sizes = own.sort(n_train=None).group("n_train")
@@ -143,7 +146,7 @@ def ranking(rows: Results) -> list[Table]:
                 paper = shown, _ratio(error, quoted[PHYSICS][0], kind)
             smallest = f"{values.smallest:.3g}".replace("inf", "∞")
             lines.append((method_label(cell), str(cell[2] or EMPTY), smallest, error_text(of_cell), own, *paper))
-        of = f"experiment {[*PAPER].index(domain) + 1} of the paper; {over_seeds(group)}; less is better"
+        of = f"experiment {[*PAPER].index(domain) + 1} of the paper; {over_seeds(group)}; less is better{capped(group)}"
         tables.append(Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, lines, labels=2))
     return tables
 
@@ -196,7 +199,7 @@ def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> 
             for n in adapted_sizes(rows_of_choice)
             for group in rows_of_choice.group("value").values()
         }
-        title = f"{choice.capitalize()} (L_MSE, {over_seeds(rows_of_choice)}; less is better)"
+        title = f"{choice.capitalize()} (L_MSE, {over_seeds(rows_of_choice)}; less is better{capped(rows_of_choice)})"
         tables.append(tabulate(title, groups, columns, ("target, N", choice)))
     return tables
 

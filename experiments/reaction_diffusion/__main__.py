@@ -1,6 +1,8 @@
 """Partial differential equations from one trajectory: python -m experiments.reaction_diffusion --help"""
 
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 from rich.console import Console
 
@@ -9,18 +11,16 @@ from experiments.reaction_diffusion.config import PRESETS, Config
 from experiments.reaction_diffusion.figures import draw
 from experiments.reaction_diffusion.report import claims, conclusion, tables
 from experiments.reporting.claims import evaluate, verdict_table
-from experiments.reporting.plots import save_figures
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.cache import identity_of
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 
 NAME = "reaction_diffusion"
 SELECTIONS = ("preset", "parts", "cases", "shifts", "seeds", "sizes")  # options that say which jobs, not how
-HEAD = f"""# {NAME}
-
+HEAD = """\
 Partial differential equations on a periodic grid of 32 × 32 points, 2048 states, learned from **one** trajectory.
 
 - **Forecasts**: FitzHugh–Nagumo as in APHYNITY (Yin et al. 2021): u_t = aΔu + u − u³ − k − v, v_t = bΔv + u − v.
@@ -60,21 +60,15 @@ def experiment(config: Config, console: Console) -> None:
         rows += shifted.study(config, kept)
     if "gray_scott" in config.parts:
         rows += gray_scott.study(config, kept)
-    results, out = Results(rows), config.out / NAME
-    verdicts = evaluate(claims(results), results)
-    report = Report(
-        experiment=NAME,
-        config=config.described(),
-        environment=environment(stages.seconds),
-        rows=results,
-        claims=verdicts,
-        figures=save_figures(out, draw(results)),
-        notes=stages.notes(),
-        head=HEAD.strip(),
-        conclusion=conclusion(results),
-        tables=[verdict_table(verdicts, "Goals, and the paper's claims for a PDE"), *tables(results)],
-    )
-    write_report(out, report, Console())
+    record = record_of(NAME, config, Results(rows), stages.seconds, stages.notes())
+    write_report(config.out / NAME, report(record), Console())
+
+
+def report(record: Mapping[str, Any]) -> Report:
+    rows = rows_in(record)
+    verdicts = evaluate(claims(rows), rows)
+    made = [verdict_table(verdicts, "Goals, and the paper's claims for a PDE"), *tables(rows)]
+    return Report(record, draw(rows), made, conclusion(rows), verdicts, HEAD)
 
 
 ABOUT = (

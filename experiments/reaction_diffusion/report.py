@@ -73,7 +73,7 @@ def _forecasts(rows: Results) -> Table:
         "seeds": lambda own: str(len(own)),
     }
     table = tabulate("Forecasts of 2.5 s from one trajectory of FitzHugh–Nagumo", groups, columns)
-    return table._replace(lines=[*table.lines, *((*line, "") for line in PUBLISHED)])
+    return table._replace(lines=[*((*line, "") for line in PUBLISHED), *table.lines])
 
 
 def _shift(name: str, rows: Results) -> Table:

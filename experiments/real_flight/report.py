@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import product
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -13,12 +14,12 @@ from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.study import ADAPTED, BASELINES, LEARNED, MODELS, Fold
 from experiments.reporting import names, plots
 from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evaluate, every, verdict_table
-from experiments.reporting.plots import METHODS, PAGE, STYLE, Line, dots, save_figures, subplots
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.plots import METHODS, PAGE, STYLE, Line, dots, subplots
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval, spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, spread_text, tabulate
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages
 from hybrid_jax.cli import errors
 from hybrid_jax.cli.learning import LEVEL
@@ -35,8 +36,7 @@ LABELS = names.LABELS | {
 }
 SHOWN = (None, names.NOMINAL, names.FINE_TUNED, names.SOURCE_ONLY)  # modes, in reports of an earlier program
 Cell = tuple[str, int]  # model, n_train
-HEAD = f"""# {NAME}
-
+HEAD = """\
 Flights held out are predicted open loop with the recorded motors, by models that the calls of `hybrid-jax fit` and
 `hybrid-jax adapt` made of the other flights.
 
@@ -57,28 +57,25 @@ def write(
     rows: Results,
     stages: Stages,
 ) -> None:
-    out, found = config.out / NAME, cells(rows)
-    best = max((cell for cell in found if cell[0] in (ADAPTED, LEARNED)), key=lambda cell: cell[1])
-    claims = verdicts(found, best)
-    tables = [expected_table(found), *score_tables(rows, found, config.dt), verdict_table(claims, "Hypotheses")]
-    tables += [by_flight_table(found, best, max(config.horizon)), parameter_table(found)]
     split = [{"train": [*map(flight_of, fold.train)], "test": [*map(flight_of, fold.test)]} for fold in folds]
     said = [f"{name}: {line}" for name, each in sets.items() for line in each.said]
     flown = ", ".join(f"{len(each.logs)} {name} ({each.seconds:.0f} s)" for name, each in sets.items())
-    made = Report(
-        experiment=NAME,
-        config=config.described(),
-        environment=environment(stages.seconds),
-        rows=rows,
-        claims=claims,
-        figures=save_figures(out, draw(rows)),
-        notes=[*stages.notes(), *said],
-        extra={"folds": split},
-        head=f"{HEAD}\n\nFlights: {flown}, in {len(folds)} folds.",
-        tables=[table for table in tables if table.lines],
-        conclusion=conclusion(found, best, config.dt),
-    )
-    write_report(out, made, Console())
+    record = record_of(NAME, config, rows, stages.seconds, [*stages.notes(), *said], folds=split, flown=flown)
+    write_report(config.out / NAME, report(record), Console())
+
+
+def report(record: Mapping[str, Any]) -> Report:
+    rows, config = rows_in(record), record["config"]
+    if "mode" in rows[0]:  # of an earlier program
+        return Report(record, draw(rows))
+    found = cells(rows)
+    best = max((cell for cell in found if cell[0] in (ADAPTED, LEARNED)), key=lambda cell: cell[1])
+    claims = verdicts(found, best)
+    tables = [expected_table(found), *score_tables(rows, found, config["dt"]), verdict_table(claims, "Hypotheses")]
+    tables += [by_flight_table(found, best, max(config["horizon"])), parameter_table(found)]
+    head = f"{HEAD}\n\nFlights: {record['flown']}, in {len(record['folds'])} folds."
+    tables = [table for table in tables if table.lines]
+    return Report(record, draw(rows), tables, conclusion(found, best, config["dt"]), claims, head)
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:

@@ -1,7 +1,7 @@
 """Hypotheses about results as data, evaluated to true, false or undecided, with the numbers behind it."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 from experiments.reporting.tables import Table
@@ -58,6 +58,17 @@ def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verd
             return Verdict(claim.id, claim.text, None, str(why), lacks_data=True)
 
     return [verdict(claim) for claim in claims]
+
+
+def with_recorded(verdicts: Sequence[Verdict], record: Mapping[str, Any]) -> list[Verdict]:
+    """Replace verdicts that lack data, such as times that were not kept, by those that the record has."""
+    known = {each["id"]: each for each in record.get("claims", ())}
+    return [
+        replace(each, holds=known[each.id]["holds"], measured=known[each.id]["measured"], lacks_data=False)
+        if each.lacks_data and each.id in known
+        else each
+        for each in verdicts
+    ]
 
 
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:

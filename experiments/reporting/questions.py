@@ -43,13 +43,13 @@ QUESTIONS = {
             "Keep the network from reading the horizontal position and yaw.",
             "Reduce the noise of the flights before the change: nothing else harms as much.",
         ),
-        "Residual",
+        "Error after fine-tuning over",
         "residual.png",
     ),
     "closed_loop": Asked(
         "Does adaptation make a vehicle fly better?",
         ("Yes in a steady wind, with a network that does not read the position; add a disturbance observer.",),
-        "less is better), side wind",
+        "side wind (",
         "gap_external_force.png",
     ),
     "online": Asked(

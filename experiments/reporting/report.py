@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.text import Text
 
 from experiments.reporting import claims
 from experiments.reporting.claims import Verdict
+from experiments.reporting.plots import save_figures
 from experiments.reporting.questions import QUESTIONS, Asked
 from experiments.reporting.results import Results, leaves
 from experiments.reporting.tables import Table, markdown, narrowed, plain, print_table
@@ -27,32 +29,30 @@ MEANINGLESS = "The smoke preset only shows that everything works: its numbers me
 
 @dataclass(frozen=True)
 class Report:
-    """The content of a report in any format; `figures` maps a path relative to the report to its caption."""
+    """What is said of a record, which `record_of` makes: sentences, tables, and figures with captions by name."""
 
-    experiment: str
-    config: Mapping[str, Any]
-    environment: Mapping[str, Any]
-    rows: Results
-    claims: Sequence[Verdict] = ()
-    figures: Mapping[str, str] = field(default_factory=dict)
-    notes: Sequence[str] = ()
-    extra: Mapping[str, Any] = field(default_factory=dict)
-    head: str = ""
+    record: Mapping[str, Any]
+    figures: Mapping[str, tuple[Figure, str]] = field(default_factory=dict)
     tables: Sequence[Table] = ()
     conclusion: Sequence[str] = ()
-    warnings: Sequence[str] = ()
+    claims: Sequence[Verdict] = ()
+    head: str = ""
+    notes: Sequence[str] = ()  # that follow from the rows, before those in the record
 
     @property
     def meaningless(self) -> bool:
-        return self.config.get("preset") == "smoke"
+        return self.record["config"].get("preset") == "smoke"
 
     @property
     def asked(self) -> Asked:
-        return QUESTIONS.get(self.experiment, Asked(self.experiment))
+        return QUESTIONS.get(self.record["experiment"], Asked(self.record["experiment"]))
+
+    def captions(self) -> dict[str, str]:
+        return {f"{name}.png": caption for name, (_, caption) in self.figures.items()}
 
     def ordered(self) -> list[tuple[str, str]]:
         """Path and caption of each figure, the main one first."""
-        return sorted(self.figures.items(), key=lambda figure: figure[0] != self.asked.figure)
+        return sorted(self.captions().items(), key=lambda figure: figure[0] != self.asked.figure)
 
     def conclusions(self) -> list[str]:
         return [MEANINGLESS] if self.meaningless else [*self.conclusion, *claims.summary(self.claims)]
@@ -68,15 +68,15 @@ class Report:
 
     def page(self, folder: Path) -> Page:
         """Lay out question, answer, one figure, one small table and their meaning; the rest is folded."""
-        asked, (_, _, introduction) = self.asked, self.head.partition("\n")
-        said = [" ".join(re.sub(r"^- |[*`]", "", each).split()) for each in re.split(r"\n\s*\n|\n- ", introduction)]
+        asked, record = self.asked, self.record
+        said = [" ".join(re.sub(r"^- |[*`]", "", each).split()) for each in re.split(r"\n\s*\n|\n- ", self.head)]
         found = self.main()
         main = narrowed(found) if found else None
         answer, *more = self.conclusions() or [""]
         tables = [Cells("More results", ("",), [(each,) for each in more])]
         tables += [Cells("The question, the models and the measures", ("",), [(each,) for each in said if each])]
         tables += [_cells(table) for table in self.shown() if table != main]
-        for name, each in {"Environment": self.environment, "Configuration": self.config}.items():
+        for name, each in {"Environment": record["environment"], "Configuration": record["config"]}.items():
             lines = [(key, json.dumps(value, ensure_ascii=False)) for key, value in leaves(each, ", ")]
             tables.append(Cells(name, ("", ""), lines))
         pictures = [(caption, (folder / path).read_bytes()) for path, caption in self.ordered()]
@@ -85,9 +85,9 @@ class Report:
             answer,
             _cells(main) if main else None,
             pictures,
-            [*self.warnings, *asked.meaning],
+            asked.meaning,
             details=[table for table in tables if table.lines],
-            notes=self.notes,
+            notes=[*self.notes, *record["notes"]],
         )
 
 
@@ -97,8 +97,9 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
     A headline, the first lines of the main table and the report's path are printed to the console, if any.
     """
     out, record = Path(out), lines_of(to_json(report))
+    save_figures(out, report.figures)
     page = report.page(out)
-    contents = {CSV_NAME: report.rows.to_csv(), PAGE_NAME: markdown_page(page, report)}
+    contents = {CSV_NAME: rows_in(report.record).to_csv(), PAGE_NAME: markdown_page(page, report)}
     contents |= {HTML_NAME: document(page), JSON_NAME: record}
     for name, content in {name: content.encode() for name, content in contents.items()}.items():
         write_atomic(out / name, content)
@@ -106,18 +107,16 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
         console.print(Text(" ".join(report.conclusions()[:1])))
         if (main := report.main()) and not report.meaningless:
             print_table(console, main, PRINTED)
-        for line in report.warnings:
-            console.print(Text(line))
         console.print(Text(f"Report: {out / HTML_NAME}"), soft_wrap=True)
 
 
+def rows_in(record: Mapping[str, Any]) -> Results:
+    return Results(record["rows"], record.get("tags") or ())
+
+
 def to_json(report: Report) -> dict[str, Any]:
-    own = {"format": FORMAT, "experiment": report.experiment, "config": report.config}
-    own |= {"environment": report.environment, "tags": report.rows.tags, "rows": report.rows.rows}
-    own |= claims.to_json(report.claims) | {"figures": report.figures, "notes": report.notes}
-    if taken := sorted(report.extra.keys() & own.keys()):
-        raise ValueError(f"extra must not take the report's own keys, got {', '.join(taken)}")
-    return json_value(own | dict(report.extra))
+    judged = claims.to_json(report.claims)
+    return json_value({"format": FORMAT, **report.record, **judged, "figures": report.captions()})
 
 
 def lines_of(record: dict[str, Any]) -> str:
@@ -142,13 +141,16 @@ def markdown_page(page: Page, report: Report) -> str:
         for each in page.details
     }
     more |= {"More figures": "\n\n".join(figures[1:]), "Notes": _bullets(page.notes)}
+    record, made = report.record, report.record["environment"]
+    by = f"made on {made['date'][:10]} with hybrid_jax {made['versions']['hybrid_jax']}"
     parts = [
         f"# {page.question}",
         f"**{plain(page.answer)}**" * bool(page.answer),
+        record.get("earlier", ""),  # how the program that made the record differs from this one
         *figures[:1],
         f"## {plain(page.table.title)}\n\n{markdown(page.table)}" if page.table else "",
         f"## What this means for you\n\n{_bullets(page.meaning)}" if page.meaning else "",
-        f"## Details\n\nThis is the report of `experiments.{report.experiment}`{_made(report.environment)}.",
+        f"## Details\n\nThis is the report of `experiments.{record['experiment']}`, {by}.",
         *(
             f'<details markdown="1"><summary>{plain(title)}</summary>\n\n{content}\n\n</details>'
             for title, content in more.items()
@@ -156,12 +158,6 @@ def markdown_page(page: Page, report: Report) -> str:
         ),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def _made(environment: Mapping[str, Any]) -> str:
-    if "date" not in environment:
-        return ""
-    return f", made on {environment['date'][:10]} with hybrid_jax {environment['versions']['hybrid_jax']}"
 
 
 def _bullets(lines: Sequence[str]) -> str:

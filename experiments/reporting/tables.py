@@ -18,7 +18,7 @@ from experiments.reporting.statistics import Spread
 EMPTY = "–"
 SMALLEST, LARGEST = -3, 5  # powers of ten between which numbers are written without an exponent
 BETWEEN = 3  # characters between two printed columns
-FEW = 6  # columns of the table that a page shows first
+FEW, SHORT = 6, 8  # columns and lines of the table that a page shows first
 Cell = Callable[[Results], str]  # the text of a cell, of the rows that belong to it
 
 
@@ -100,7 +100,8 @@ def mean_over_seeds(results: Results) -> str:
 
 
 def narrowed(table: Table) -> Table:
-    return table._replace(header=table.header[:FEW], lines=[line[:FEW] for line in table.lines])
+    title = table.title + f" ({SHORT} of {len(table.lines)} lines)" * (len(table.lines) > SHORT)
+    return table._replace(title=title, header=table.header[:FEW], lines=[line[:FEW] for line in table.lines[:SHORT]])
 
 
 def markdown(table: Any) -> str:

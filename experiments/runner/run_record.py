@@ -2,13 +2,13 @@
 
 import hashlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from experiments.reporting.results import leaves
+from experiments.reporting.results import Results, leaves
 from experiments.runner.options import Run
 from hybrid_jax import kernels
 from hybrid_jax.cli.command import ChecksFailed, Explained
@@ -31,6 +31,14 @@ def environment(stages: Mapping[str, float]) -> dict[str, Any]:
         "hardware": hardware(),
         "seconds": {stage: round(float(seconds), 3) for stage, seconds in stages.items()},
     }
+
+
+def record_of(
+    experiment: str, config: Run, rows: Results, seconds: Mapping[str, float], notes: Sequence[str] = (), **more: Any
+) -> dict[str, Any]:
+    """Return all that a report is made of, as JSON values: what report.json keeps, but verdicts and captions."""
+    record = {"experiment": experiment, "config": config.described(), "environment": environment(seconds)}
+    return json_value(record | {"tags": rows.tags, "rows": rows.rows, "notes": notes, **more})
 
 
 class OtherRun(Explained):

@@ -1,5 +1,6 @@
 """Is an adapted model ever worse than its source, in our own worlds and others: python -m experiments.worlds"""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -9,11 +10,10 @@ from rich.console import Console
 from experiments.paper.config import BOTH_ENDS, ONE_FLIGHT, SMOKE, preset_like
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
-from experiments.reporting.plots import save_figures
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.run_record import environment
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 from experiments.worlds.cases import WORLDS, WorldsConfig, adapted
 from experiments.worlds.verdicts import (
@@ -28,8 +28,7 @@ from experiments.worlds.verdicts import (
 from hybrid_jax.sweep import hosts
 
 NAME = "worlds"
-HEAD = f"""# {NAME}
-
+HEAD = """\
 A hybrid that was trained on usual flight of a vehicle adapts by `hj.adapt` to one flight after a change, or after none,
 and is tested over 1 s of usual flights after it. Ratio: its test error L^T_MSE over that of the source. Seeds are of
 sources, draws of flights to adapt to. For some changes other methods adapt to the same ten seconds:
@@ -69,20 +68,15 @@ def experiment(config: WorldsConfig, console: Console) -> None:
         ("world", "change", "flight", "draw", "seed", "method"),
     )
     if hosts.is_main_process():
-        verdicts = evaluate_claims(CLAIMS, rows)
-        report = Report(
-            experiment=NAME,
-            config=config.described(),
-            environment=environment(stages.seconds),
-            rows=rows,
-            claims=verdicts,
-            notes=stages.notes(),
-            head=HEAD.strip(),
-            conclusion=conclusion(rows),
-            figures=save_figures(config.out / NAME, draw(rows)),
-            tables=[verdict_table(verdicts, "Hypotheses"), *(table(rows) for table in TABLES)],
-        )
-        write_report(config.out / NAME, report, Console())
+        record = record_of(NAME, config, rows, stages.seconds, stages.notes())
+        write_report(config.out / NAME, report(record), Console())
+
+
+def report(record: Mapping[str, Any]) -> Report:
+    rows = rows_in(record)
+    verdicts = evaluate_claims(CLAIMS, rows)
+    tables = [verdict_table(verdicts, "Hypotheses"), *(table(rows) for table in TABLES)]
+    return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
 
 
 TABLES = ratio_table, coverage_table, expectation_table, method_table

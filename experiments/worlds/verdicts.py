@@ -46,7 +46,7 @@ def conclusion(rows: Results) -> list[str]:
     return [
         f"In {sum(map(_sound, cases.values()))} of {len(cases)} cases the adapted model is never worse than its "
         f"source: at most {MEAN} times its error in the mean, {EACH} times in a single adaptation.",
-        f"The worst case is {label(*worst)}: {own.numbers('ratio').max():.3g} times.",
+        f"The worst case is {label(*worst)}: {own.numbers('ratio').max():.3g} times its error.",
     ]
 
 

@@ -73,7 +73,7 @@ def rows(online=1.1, unchanged=1.0, inside=0.95, crash=False):
 
 
 def judged(rows, step_ms=0.1, seconds=1.0):
-    evidence = GoalEvidence(rows, step_ms, seconds, processor_seconds=1.0, flights=18)
+    evidence = GoalEvidence(rows, step_ms, seconds, processor_seconds=1.0)
     return {each.id: each.holds for each in evaluate(claims(["wind", "nothing"]), evidence)}
 
 
