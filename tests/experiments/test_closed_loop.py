@@ -110,8 +110,8 @@ def test_hardware_is_off_by_default_and_the_controller_knows_it():
     assert (exact.hardware(), exact.controller()) == (Hardware(), CONTROLLER)
     assert late.hardware() == Hardware(0.02, 0.03, (0.002, 0.004, 0.04, 0.04))
     assert late.controller().rotor_lag == 0.03
-    assert "without noise" in head(exact)
-    assert "Latency 20 ms, lag of the rotors 30 ms" in head(late)
+    assert "without noise" in head(exact.described())
+    assert "Latency 20 ms, lag of the rotors 30 ms" in head(late.described())
     with pytest.raises(ValueError, match="latency must be a multiple"):
         ClosedLoopConfig(latency=0.015)
 
