@@ -87,11 +87,11 @@ def flight_of(recording: Recording, field: Actuated) -> FlightLog:
 
 
 def windows_of(recordings, field: Actuated, stride: int = STRIDE) -> hj.Trajectories:
-    return cut_windows([flight_of(each, field) for each in recordings], STEPS, stride).windows
+    return cut_windows([flight_of(each, field) for each in recordings], STEPS, stride)
 
 
 def tests_of(recording: Recording, field: Actuated) -> hj.Trajectories:
-    return cut_windows([flight_of(recording, field)], PAST + STEPS, STRIDE).windows
+    return cut_windows([flight_of(recording, field)], PAST + STEPS, STRIDE)
 
 
 @eqx.filter_jit

@@ -15,13 +15,13 @@ from experiments.runner.stages import Found, Stages, rows_of
 from hybrid_jax.adaptation import Adaptation, adapt
 from hybrid_jax.cli import errors
 from hybrid_jax.cli.learning import Learned, adapted, learn
-from hybrid_jax.cli.logs import STEPS, Flights, lagged, windows_of
+from hybrid_jax.cli.logs import STEPS, Flights, lagged
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.log import FlightLog, segments
-from hybrid_jax.flights.windows import flight_of, folds, manoeuvre_of
+from hybrid_jax.flights.windows import cut_windows, flight_of, folds, manoeuvre_of
 
 LEARNED, ADAPTED = "learned", "adapted"
 BASELINES = (names.HOLD, names.THRUST, names.LINEAR_RESIDUAL)
@@ -115,7 +115,7 @@ def of_fold(
             rows.append(row)
 
     if seed == 0:
-        fitted = windows_of(train, STEPS, STEPS, LINEAR)
+        fitted = cut_windows(train, STEPS, STEPS, LINEAR)
         linear = adapt(rigid, fitted, method=names.LINEAR_RESIDUAL).field
         for name, field in zip(BASELINES, (HoldState(), FrozenRates(physics), linear), strict=True):
             score(name, field)

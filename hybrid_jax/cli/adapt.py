@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from hybrid_jax.adaptation import Adaptation, Parameter
+from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
 from hybrid_jax.cli.identified import KEEP
@@ -20,7 +20,6 @@ from hybrid_jax.io.models import load, save
 from hybrid_jax.trajectories import Trajectories
 
 __all__ = ["LISTS", "Options", "run"]
-Change = tuple[str, float, Parameter]  # a name, its value before, and after
 UNLIKELY = 0.05  # probability that nothing changed, below which the vehicle is another one
 SHOWN = 5  # parameters beside the answer
 DIFFER = "These flights differ from the model, but do not determine which of its parameters changed."
@@ -70,18 +69,14 @@ def run(options: Options) -> int:
     return 0 if different else NOTHING_CHANGED
 
 
-def _changes(known: Known, found: Adaptation) -> list[Change]:
-    """Return the change of each parameter, the most significant first."""
-    before = named_parameters(without_past(known.field))
-    names = [*found.changed, *(name for name in found.parameters if name not in found.changed)]
-    # A term that was not there was 0, an efficiency 1.
-    return [(name, float(before.get(name, name.startswith("efficiency"))), found.parameters[name]) for name in names]
-
-
 def _page(
     options: Options, known: Known, flights: Flights, field: AbstractVectorField, found: Adaptation, different: bool
 ) -> page.Page:
-    changes, learned = _changes(known, found), named_parameters(without_past(known.field))
+    learned = named_parameters(without_past(known.field))
+    names = [*found.changed, *(name for name in found.parameters if name not in found.changed)]
+    # A term that was not there was 0, an efficiency 1.
+    priors = {name: float(learned.get(name, name.startswith("efficiency"))) for name in names}
+    changes = [(name, priors[name], found.parameters[name]) for name in names]
     changed = changes[: len(found.changed)]
     own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
     fields = {"before": known.field} | ({"adapted": field} if different else {})

@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 
 from hybrid_jax import trajectories
 from hybrid_jax.adaptation import Adaptation
-from hybrid_jax.cli.logs import windows_of
 from hybrid_jax.cli.page import STYLE, Table
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.estimation import observe
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import flight_errors
-from hybrid_jax.flights.windows import sequences
+from hybrid_jax.flights.windows import cut_windows, sequences
 
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
 BASELINE = (
@@ -50,7 +49,7 @@ def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[n
         cut = [trajectories.windows_of(seen, np.asarray(each.u[0]), each.dt, steps=steps) for each, seen in parts]
         windows = trajectories.concatenate(cut)
     else:
-        windows = windows_of([log], steps, steps)
+        windows = cut_windows([log], steps, steps)
     places = np.arange(-(-len(windows) // MOST) * MOST) % len(windows)  # so that flights share a program
     return np.stack(flight_errors(field, windows[places], chunk=MOST), axis=-1)[: len(windows)]
 

@@ -75,7 +75,11 @@ class Options(FlightOptions):
 def run(options: Options) -> int:
     dt = DT if options.dt is None else options.dt
     checks.positive("--dt", dt)
-    path = options.vehicle or _written(replace(options, dt=dt))
+    path = options.vehicle or options.out / "vehicle.toml"
+    if options.vehicle is None:
+        with step("estimating a vehicle file, as none is given"):
+            seen = inspected(paths_of(options.before)[0], None, replace(options, dt=dt))
+            write_vehicle(path, seen, options.before)
     model = load_vehicle_model(path)
     model = replace(model, learn=options.learn or model.learn)
     if not model.learn:
@@ -97,14 +101,6 @@ def run(options: Options) -> int:
     told |= {"model": options.output, "adaptation": found.physics.to_dict()}
     page.write(options.out, "fit", _page(options, flights, found, dt), told)
     return 0
-
-
-def _written(options: Options) -> Path:
-    """Write a vehicle file estimated from the logs into the folder of the page."""
-    path = options.out / "vehicle.toml"
-    with step("estimating a vehicle file, as none is given"):
-        write_vehicle(path, inspected(paths_of(options.before)[0], None, options), options.before)
-    return path
 
 
 def _identified(options: Options, model: VehicleModel) -> bool:

@@ -20,7 +20,7 @@ from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.flights.checks.consistency import Check
 from hybrid_jax.flights.checks.suitability import check_recording, failures
-from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
+from hybrid_jax.flights.recording import Recording, unit_of
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, window_errors
 from hybrid_jax.identification.recordings import Layout
@@ -188,7 +188,7 @@ def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) 
 
 
 def _unit(name: str) -> str:
-    return "rad" if name == "attitude" else AXES[name][1] if name in AXES else ROTOR_UNITS[name]
+    return "rad" if name == "attitude" else unit_of(name)
 
 
 def predicted(field: Any, recordings: Sequence[Recording], layout: Layout, what: str) -> page.Table:

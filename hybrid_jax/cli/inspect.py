@@ -20,7 +20,7 @@ from hybrid_jax.cli.vehicle_text import vehicle_text
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
 from hybrid_jax.flights.load import read_recording
-from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording, Signal
+from hybrid_jax.flights.recording import Recording, Signal, unit_of
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.vehicle import Vehicle
 
@@ -206,14 +206,10 @@ def _signals(logs: Sequence[Inspected]) -> page.Table:
             rate = f"{1 / signal.interval:.4g}" if 0 < signal.interval < math.inf else EMPTY
             gaps = signal.gaps()
             longest = f", longest {max(end - start for start, end in gaps):.3g} s" if gaps else ""
-            spread = f"{signal.values.min():.3g} … {signal.values.max():.3g} {_unit(name)}" if len(signal) else EMPTY
+            spread = f"{signal.values.min():.3g} … {signal.values.max():.3g} {unit_of(name)}" if len(signal) else EMPTY
             lines.append((log.name, name, signal.source, str(len(signal)), rate, f"{len(gaps)}{longest}", spread))
     header = ("log", "quantity", "from", "samples", "Hz", "gaps", "values")
     return page.Table("Signals at their own rates, in the library's frames and units", header, lines)
-
-
-def _unit(name: str) -> str:
-    return ROTOR_UNITS[name] if name in ROTOR_UNITS else AXES[name][1]
 
 
 def _checks(logs: Sequence[Inspected]) -> page.Table:
@@ -221,14 +217,12 @@ def _checks(logs: Sequence[Inspected]) -> page.Table:
     every = dict.fromkeys(check.name for log in logs for check in log.checks)
     lines = []
     for log in logs:
-        own = {check.name: check for check in log.checks}
-        lines.append((log.name, *(_verdict(own[name]) if name in own else EMPTY for name in every)))
+        own = dict.fromkeys(every, EMPTY)
+        for check in log.checks:
+            number = f" {check.value:.3g} {check.unit}" if check.unit and math.isfinite(check.value) else ""
+            own[check.name] = f"{SHOWN.get(check.verdict, 'ok')}{number}"
+        lines.append((log.name, *own.values()))
     return page.Table("Checks (?: cannot tell; docs/howto/logs.md explains each)", ("log", *every), lines)
-
-
-def _verdict(check: Check) -> str:
-    number = f"{check.value:.3g} {check.unit}" if check.unit and math.isfinite(check.value) else ""
-    return f"{SHOWN.get(check.verdict, 'ok')} {number}".rstrip()
 
 
 @mpl.rc_context(page.STYLE)
@@ -240,7 +234,7 @@ def _drawn(recording: Recording) -> Figure:
         panel.plot(*_broken(signal), linewidth=0.8, label=signal.axes)
         for start, end in signal.gaps():
             panel.axvspan(start, end, color="0.85")
-        panel.set_ylabel(f"{name.replace('_', chr(10))}\n[{_unit(name)}]", fontsize=8)
+        panel.set_ylabel(f"{name.replace('_', chr(10))}\n[{unit_of(name)}]", fontsize=8)
         panel.legend(loc="upper right", fontsize=8, ncols=len(signal.axes))
     panels[-1].set_xlabel("time [s]")
     return figure

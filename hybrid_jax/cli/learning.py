@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from hybrid_jax.adaptation import METHODS, Adaptation, Auto, adapt
 from hybrid_jax.cli import errors
-from hybrid_jax.cli.logs import STEPS, lagged, windows_of
+from hybrid_jax.cli.logs import STEPS, lagged
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates
 from hybrid_jax.dynamics.composition import Hybrid
@@ -20,7 +20,7 @@ from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.estimation import fit_disturbance
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.windows import sequences
+from hybrid_jax.flights.windows import cut_windows, sequences
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.training import Settings, fit, rates_by_group
@@ -68,11 +68,11 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
     found = {name: np.concatenate(each)[order] for name, each in parts.items()}
     ends = {name: each[:, -1] for name, each in found.items()}
     chosen = choose({name: np.log(ends[name] / ends[FROZEN]).mean(axis=1) for name in CANDIDATES})
-    windows = windows_of(logs, STEPS, STEPS, TRAINED)
+    windows = cut_windows(logs, STEPS, STEPS, TRAINED)
     physics = adapt(model.physics(), windows, method=PHYSICS, settings=settings)
     field = physics.field if chosen.startswith("physics") else _hybrid(physics.field, logs, seed, settings)
     field = with_past(field, logs) if chosen.endswith(PAST) else field
-    kept = windows_of(logs, STEPS, STEPS, KEPT)
+    kept = cut_windows(logs, STEPS, STEPS, KEPT)
     return Learned(field, physics, chosen, lag, found, kept, expected(np.log(ends[chosen])))
 
 
@@ -83,7 +83,7 @@ def adapted(
 
     Also return the adaptation of the model without its past.
     """
-    windows = windows_of(logs, STEPS, STEPS, most)
+    windows = cut_windows(logs, STEPS, STEPS, most)
     found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)
     if not isinstance(field, DisturbanceModel):
         return found.field, found
@@ -125,7 +125,7 @@ def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
 
 def _windows(logs: Sequence[FlightLog], count: int) -> Trajectories:
     """Select evenly spaced windows, repeated if there are fewer, so that trainings share a compiled program."""
-    windows = windows_of(logs, STEPS, 1, count)
+    windows = cut_windows(logs, STEPS, 1, count)
     return windows[np.arange(count) % len(windows)]
 
 

@@ -34,10 +34,9 @@ from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import FlightLog, unevenness
 from hybrid_jax.flights.recording import Recording
-from hybrid_jax.flights.windows import cut_windows, require_length
+from hybrid_jax.flights.windows import require_length
 from hybrid_jax.io.archive import digest
 from hybrid_jax.io.models import Model
-from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 LISTS = ("--polynomial", "--motor-order", "--topics", "--learn")
@@ -244,14 +243,6 @@ def look(
     return Looked(log, [each for each in checks if each not in excused], refusal, notes)
 
 
-def windows_of(logs: Sequence[FlightLog], steps: int, stride: int, most: int | None = None) -> Trajectories:
-    """Cut flights into windows and keep at most `most`, evenly spaced."""
-    found = cut_windows(list(logs), steps, stride).windows
-    if most is None or len(found) <= most:
-        return found
-    return found[np.round(np.linspace(0, len(found) - 1, most)).astype(int)]
-
-
 def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:
     """Apply a rotor lag [s] to the motors of flights."""
     return [lag_motors(log, lag) for log in logs] if lag else list(logs)
@@ -263,14 +254,8 @@ class Known(NamedTuple):
     field: AbstractVectorField
     vehicle: Vehicle
     about: Mapping[str, Any]
-
-    @property
-    def dt(self) -> float:
-        return self.about["dt"]
-
-    @property
-    def steps(self) -> int:
-        return self.about["steps"]
+    dt: float
+    steps: int
 
 
 def known_of(path: Path, model: Model) -> Known:
@@ -280,7 +265,7 @@ def known_of(path: Path, model: Model) -> Known:
         raise ValueError(f"{path}: was identified without states, which replay draws; hybrid-jax check predicts logs")
     if vehicle is None or not {"dt", "steps", "learned_from", "motion", "windows"} <= model.about.keys():
         raise ValueError(f"{path}: is not a model written by hybrid-jax fit or adapt")
-    return Known(model.field, vehicle, model.about)
+    return Known(model.field, vehicle, model.about, model.about["dt"], model.about["steps"])
 
 
 def flights_for(known: Known, folder: Path, options: FlightOptions, changed: bool, unseen: bool = True) -> Flights:

@@ -17,7 +17,8 @@ from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.learning import without_past
-from hybrid_jax.cli.logs import LISTS, FlightOptions, flights_for, known_of, windows_of
+from hybrid_jax.cli.logs import LISTS, FlightOptions, flights_for, known_of
+from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.io.models import load
@@ -60,7 +61,7 @@ def run(options: Options) -> int:
     if len(logs) > 1:
         raise ValueError(f"{options.flight}: has {len(logs)} flights; give one of them")
     steps, every = max(1, round(options.ahead / first.dt)), max(1, round(1 / SHOWN / first.dt))
-    windows = windows_of(logs, steps, every)[: max(1, round(options.seconds * SHOWN))]
+    windows = cut_windows(logs, steps, every)[: max(1, round(options.seconds * SHOWN))]
     with step(f"predicting and drawing {len(windows)} pictures"):
         forecasts = {
             str(path): np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt))[..., POSITION]

@@ -5,7 +5,7 @@
 Its steps can be taken one by one. Split by flight before cutting, since windows of one flight share samples and wind:
 
     train, test = hold_out(load_logs("flights/"), ["flight_07"])
-    windows = cut_windows(train, steps=10).windows
+    windows = cut_windows(train, steps=10)
 """
 
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
@@ -16,8 +16,8 @@ from hybrid_jax.flights.load import find_logs, load_log, load_logs, read_recordi
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
-from hybrid_jax.flights.windows import LogWindows, cut_windows, folds, hold_out, load_windows
+from hybrid_jax.flights.windows import cut_windows, folds, hold_out, load_windows
 
-__all__ = ["Check", "Cleaning", "FlightErrors", "FlightLog", "LogWindows", "Recording", "Signal"]
+__all__ = ["Check", "Cleaning", "FlightErrors", "FlightLog", "Recording", "Signal"]
 __all__ += ["check_log", "check_recording", "clean", "cut_windows", "find_logs", "flight_errors", "folds", "hold_out"]
 __all__ += ["load_log", "load_logs", "load_windows", "read_recording", "to_flight"]

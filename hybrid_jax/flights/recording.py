@@ -20,6 +20,10 @@ ROTOR_UNITS = {"rotor_speed": "rad/s", "command": "1"}  # one axis for each roto
 QUANTITIES = (*AXES, *ROTOR_UNITS)
 
 
+def unit_of(quantity: str) -> str:
+    return ROTOR_UNITS[quantity] if quantity in ROTOR_UNITS else AXES[quantity][1]
+
+
 def axes_of(quantity: str, count: int) -> tuple[str, ...]:
     """Name the axes of `count` columns of a quantity; a single column of three axes is the last."""
     return AXES[quantity][0][-count:] if quantity in AXES else tuple(map(str, range(count)))

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -19,24 +18,6 @@ from hybrid_jax.vehicle import Vehicle
 Split = tuple[list[FlightLog], list[FlightLog]]  # training, held out
 _SUFFIX = re.compile(r"(\.csv|\.csv\.gz|\.ulg|\.mcap|\.db3|\.bag|\.bbl|\.bfl|\.gz)$", re.IGNORECASE)
 _RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class LogWindows:
-    """Windows of several flights.
-
-    Attributes:
-        windows: in float32, ordered by flight.
-        sizes: number of windows of each flight.
-        stride: samples between the starts of two windows.
-    """
-
-    windows: Trajectories
-    sizes: list[int]
-    stride: int
-
-    def __len__(self) -> int:
-        return len(self.windows)
 
 
 def load_windows(
@@ -93,7 +74,7 @@ def load_windows(
     require_common_interval(logs)
     if motor_time_constant:
         logs = [lag_motors(log, motor_time_constant) for log in logs]
-    return cut_windows(logs, steps, stride).windows
+    return cut_windows(logs, steps, stride)
 
 
 def flight_of(log: FlightLog) -> str:
@@ -174,13 +155,17 @@ def sequences(logs: Sequence[FlightLog], steps: int) -> list[Trajectories]:
     return [jax.tree.map(lambda leaf: leaf.astype(np.float32), each) for each in found]
 
 
-def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWindows:
+def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: int | None = None) -> Trajectories:
     """Cut logs into windows of `steps` intervals without gaps; logs shorter than a window are left out.
 
     Args:
         logs: evenly sampled flights.
         steps: intervals per window.
         stride: samples between the starts of two windows.
+        most: largest number of windows, of which evenly spaced ones are kept; by default all are.
+
+    Returns:
+        Windows in float32, ordered by flight.
 
     Raises:
         ValueError: all logs are shorter than a window, or samples are not evenly spaced.
@@ -191,7 +176,9 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWi
         cut = [windows_of(log.x[p], log.u[p][:-1], log.dt, steps=steps, stride=stride) for p in long]
         parts.append(concatenate(cut))
     windows = jax.tree.map(lambda leaf: leaf.astype(np.float32), concatenate(parts))
-    return LogWindows(windows, [len(part) for part in parts], stride)
+    if most is None or len(windows) <= most:
+        return windows
+    return windows[np.round(np.linspace(0, len(windows) - 1, most)).astype(int)]
 
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:

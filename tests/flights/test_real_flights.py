@@ -32,7 +32,7 @@ def test_real_flights_pass_all_checks(file):
         assert check.verdict == OK, check
     # The payload set is shifted to the gyro, the nanodrone set is only good to ±1.5 samples from run to run.
     assert abs(lag.value) < (2 if file.parent.name in ("bare", "payload") else 25)
-    cut = cut_windows([log], 50, 50).windows
+    cut = cut_windows([log], 50, 50)
     assert np.isfinite(cut.x).all()
     assert len(cut) == (len(log) - 1) // 50
 
@@ -53,7 +53,7 @@ HELD_OUT = {"hold": (0.0903, 0.282, 0.145, 1.534), "thrust": (0.0144, 0.0661, 0.
 def test_baseline_errors_are_close_to_published_ones(name):
     vehicle = load_vehicle(FOLDER / "crazyflie_payload" / "vehicle.toml", "payload")
     field = {"hold": HoldState(), "thrust": FrozenRates(rigid_body(vehicle, ()))}[name]
-    windows = cut_windows([load_log(file) for file in FILES if file.parent.name == "payload"], 10, 10).windows
+    windows = cut_windows([load_log(file) for file in FILES if file.parent.name == "payload"], 10, 10)
     found = np.sqrt([np.mean(part[:, 9] ** 2) for part in flight_errors(field, windows)])
     np.testing.assert_allclose(found[:2], HELD_OUT[name][:2], rtol=0.15)
     assert (np.abs(np.log(found / HELD_OUT[name])) < np.log(2)).all()
