@@ -265,7 +265,8 @@ def fit_and_linearise(
     z, found, jacobian, (unit, _) = end.best
     mse = jnp.sum(jnp.square(found)) / (len(windows) * (windows.horizon if weigh is None else found.shape[1]))
     theta = jnp.where(jnp.isfinite(mse), theta_at(z, unit), start)
-    blind = (free is None) & jnp.all(unit == 0) & (end.status == Status.OK)  # nothing that is fitted has an effect
+    fitted = True if free is None else jnp.any(free)
+    blind = fitted & jnp.all(unit == 0) & (end.status == Status.OK)  # nothing that is fitted has an effect
     status = jnp.where(blind, Status.STALLED, end.status)
     return LeastSquaresFit(unravel(theta), mse, end.steps, status), jacobian, found
 

@@ -130,6 +130,12 @@ def test_windows_whose_squares_overflow_diverge_before_a_step(fit):
         json.dumps(result.to_dict(), allow_nan=False)
 
 
+@pytest.mark.parametrize("disturbance", ["auto", False])
+def test_a_fit_of_what_has_no_effect_has_not_converged(disturbance):
+    still = replace(swings(20), dt=1e-30)
+    assert adapt(pendulum(), still, method=LeastSquares(disturbance=disturbance)).status == Status.STALLED
+
+
 WIDE = replace(swings(40), u=np.zeros((40, 8, 2), np.float32))
 OTHERS = {
     "another dt": ("validation", replace(swings(40), dt=0.1), "dt must be 0.05, as in the other windows, got 0.1"),
