@@ -1,6 +1,7 @@
 """A folder of logs is described, checked and drawn, and becomes a vehicle file with the numbers that the logs tell."""
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -92,12 +93,14 @@ def test_what_a_log_does_not_tell_is_a_placeholder(commanded, tmp_path):
 
 def test_a_folder_is_described_whatever_is_in_it(tmp_path, called):
     folder = write(tmp_path / "flights", LOGS[:2])
-    (folder / "broken.csv").write_text("t,px\n0,0\n")
+    # What a picture would take for mathematics, a terminal for a colour, and nobody for UTF-8.
+    (folder / "chirp_run1.csv.gz").rename(folder / "cost_$5_or_$^6\x1b[31m.csv.gz")
+    (folder / os.fsdecode(b"broken\xff.csv")).write_text("t,px\n0,0\n")
     (folder / "notes.txt").write_text("windy")
     (tmp_path / "v.toml").write_text(vehicle_toml(IRIS))
     _, said, _ = called("inspect", folder, "--vehicle", tmp_path / "v.toml", "--out", tmp_path)
-    assert "broken.csv: not read: row 1, field py" in said
-    assert "chirp_run1.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
+    assert r"broken\udcff.csv: not read: row 1, field py" in said
+    assert r"cost_$5_or_$^6\x1b[31m.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
     assert "2 of 3 logs are ready for a model" in said
     page = (tmp_path / "report.html").read_text()
     titles = ("Signals at their own rates", "Checks (?: cannot tell;", "What to do")
@@ -162,7 +165,9 @@ def test_motors_that_lead_the_gyro_are_borne_where_the_lag_is_known(tmp_path):
 def test_of_a_folder_with_mistakes_what_is_sound_is_used(tmp_path, called, capsys):
     """A file that cannot be read is left out; a flight under two names, and of another vehicle, is refused."""
     folder = write(tmp_path / "flights", LOGS[:2])
-    (folder / "broken.csv").write_text("t,px\n0,0\n")
+    # What a picture would take for mathematics, a terminal for a colour, and nobody for UTF-8.
+    (folder / "chirp_run1.csv.gz").rename(folder / "cost_$5_or_$^6\x1b[31m.csv.gz")
+    (folder / os.fsdecode(b"broken\xff.csv")).write_text("t,px\n0,0\n")
     flights = read_flights(folder, IRIS, DT, FlightOptions())
     assert [len(flights.logs), flights.still] == [2, False]
     assert "left out: " in flights.said[0]
