@@ -6,7 +6,6 @@ takes its result n and returns z and the weights W, γ and β besides ẋ; see c
 """
 
 import contextlib
-from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from hybrid_jax.dynamics.batching import batch_norms
@@ -50,23 +48,17 @@ class Kernel:
 
     def weights(self, field: PyTree) -> Array:
         """Concatenate the weights of a field."""
-        return _joined(self.forward, jax.tree.leaves(eqx.filter(field, _is_array)))
+        return self.forward.joined(jax.tree.leaves(eqx.filter(field, _is_array)))
 
     def apart(self, weights: Array) -> list[Array]:
         """Split the weights into arrays."""
-        shapes = self.forward.shapes
-        parts = jnp.split(weights, self.forward.places()[1:]) if shapes else []
-        return [part.reshape(one.shape) for part, one in zip(parts, shapes, strict=True)]
+        parts = zip(self.forward.places(), self.forward.shapes, strict=True)
+        return [weights[begin : begin + one.size].reshape(one.shape) for begin, one in parts]
 
     def back_weights(self, weights: Array) -> Array:
         """Compute the weights of the backward pass."""
         assert self.back is not None
-        return _joined(self.back, self.apart(weights))
-
-
-def _joined(apart: Split, arrays: Sequence[Array]) -> Array:
-    found = jaxpr_as_fun(apart.weights)(*arrays)
-    return jnp.concatenate([jnp.zeros(0, jnp.float32), *(jnp.ravel(one) for one in found)])
+        return self.back.joined(self.apart(weights))
 
 
 def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
@@ -106,8 +98,8 @@ def _name(field: Any) -> str:
 
 def _made(field: PyTree, sizes: Sizes, training: bool, name: str) -> Kernel:
     """Make the kernel of a field whose arrays are replaced by shapes."""
-    shapes, structure = jax.tree.flatten(eqx.filter(field, _is_shape))
-    rest, norms = eqx.filter(field, _is_shape, inverse=True), batch_norms(field) if training else []
+    arrays, rest = eqx.partition(field, lambda leaf: isinstance(leaf, Shape))
+    (shapes, structure), norms = jax.tree.flatten(arrays), batch_norms(field) if training else []
     if len(norms) > 1 or not all(isinstance(norm, BatchNorm) for norm in norms):
         raise ValueError("it has more than one batch normalisation, or another than BatchNorm")
     epsilon, units = (norms[0].epsilon, norms[0].gain.size) if norms else (0.0, 0)  # pyright: ignore[reportAttributeAccessIssue]
@@ -168,7 +160,3 @@ def _check_methods(node: Any, method: str) -> None:
 
 def _is_array(leaf: Any) -> bool:
     return isinstance(leaf, np.ndarray) or eqx.is_array(leaf)
-
-
-def _is_shape(leaf: Any) -> bool:
-    return isinstance(leaf, Shape)

@@ -48,8 +48,7 @@ def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, axis: int, training: b
         return None
     if x0.shape[axis] != u.shape[axis] or x0.shape[axis] < VECTOR or library.obstacle() is not None:
         return None
-    arrays = jax.tree.leaves(eqx.filter(field, eqx.is_inexact_array))
-    if any(leaf.dtype != jnp.float32 for leaf in (*arrays, x0, u)):
+    if any(leaf.dtype != jnp.float32 for leaf in (*jax.tree.leaves(eqx.filter(field, eqx.is_inexact_array)), x0, u)):
         return None
     return kernel_of(field, x0.shape[1 + axis], u.shape[2 + axis], training)
 
@@ -117,10 +116,7 @@ def _lowered(context, *arrays, target, results, plain):
 def _batched(arrays, axes, *, target, results, plain):
     """Make one call for all lanes, which are the first axis of all arrays."""
     (lanes,) = {array.shape[axis] for array, axis in zip(arrays, axes, strict=True) if axis is not None}
-    whole = [
-        jnp.broadcast_to(array, (lanes, *array.shape)) if axis is None else jnp.moveaxis(array, axis, 0)
-        for array, axis in zip(arrays, axes, strict=True)
-    ]
+    whole = [batching.bdim_at_front(array, axis, lanes) for array, axis in zip(arrays, axes, strict=True)]
     wide = tuple(jax.ShapeDtypeStruct((lanes, *one.shape), one.dtype) for one in results)
     return _CALL.bind(*whole, target=target, results=wide, plain=jax.vmap(plain)), [0] * len(results)
 
@@ -131,15 +127,10 @@ batching.primitive_batchers[_CALL] = _batched
 
 def _forward(kernel_and_dt: tuple[Kernel, float], *arrays: Array):
     (d, _, _, units), (x0, u) = kernel_and_dt[0].sizes, arrays[-2:]
-    each = _whole(x0.shape[1]) * (d + units + 1) + _whole(units)  # see cpp/rollout.h
-    kept = len(u) * 4 * each + VECTOR
+    windows, scales = (-(-count // VECTOR) * VECTOR for count in (x0.shape[1], units))  # in whole vectors
+    kept = len(u) * 4 * (windows * (d + units + 1) + scales) + VECTOR  # see cpp/rollout.h
     states, saved = _called(kernel_and_dt, kept, *arrays)
     return states, (*arrays, saved)
-
-
-def _whole(count: int) -> int:
-    """Round a count up to whole vectors."""
-    return -(-count // VECTOR) * VECTOR
 
 
 def _backward(kernel_and_dt: tuple[Kernel, float], saved: tuple[Array, ...], d_states: Float[Array, "t d b"]):

@@ -4,8 +4,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
 Shape = jax.ShapeDtypeStruct
 Products = dict[int, list[tuple[int, int]]]  # output → rows and columns of each product in its sum
@@ -22,6 +23,10 @@ class Split(NamedTuple):
     def places(self) -> list[int]:
         """Return where each weight begins in the concatenation of all."""
         return np.cumsum([0, *(one.size for one in self.shapes)])[:-1].tolist()
+
+    def joined(self, parameters: Sequence[Any]) -> jax.Array:
+        """Compute the weights, concatenated."""
+        return jnp.concatenate([jnp.zeros(0, jnp.float32), *map(jnp.ravel, jaxpr_as_fun(self.weights)(*parameters))])
 
     def place(self, output: int) -> int:
         """Return where an output begins among all weights, 0 if it is empty; ValueError if it is not a weight."""

@@ -155,8 +155,8 @@ class Own(RigidBody):
 
 
 OTHERS = {
-    "physics of one's own": (Hybrid(Own(THETA, IRIS), FIELD.residual), {}),
-    "few windows": (FIELD, {"b": 9}),
+    "physics of one's own": (Hybrid(Own(THETA, IRIS), FIELD.residual), 16),
+    "few windows": (FIELD, 9),
 }
 
 
@@ -174,19 +174,14 @@ def test_the_reason_is_told_why_a_field_has_no_kernel():
     assert "not for Sorting: its operation 'sort'" in kernels.status()
 
 
-@pytest.mark.parametrize(("field", "options"), OTHERS.values(), ids=OTHERS)
-def test_others_are_plain_jax(field, options):
-    x0, u, _ = windows(FIELD, **{"b": 16} | options)
-    assert not calls(trained, field, x0, u)
-
-
 @pytest.mark.parametrize("name", ["the paper's", *OTHERS])
-def test_fusion_emitters_are_spared_where_kernels_serve(name):
-    field, options = OTHERS.get(name, (FIELD, {}))
+def test_others_are_plain_jax_and_fusion_emitters_are_spared_where_kernels_serve(name):
+    field, b = OTHERS.get(name, (FIELD, 16))
+    served = name not in OTHERS and library.obstacle() is None
+    assert calls(trained, field, *windows(FIELD, b)[:2]) == served
     x0, u, states = (np.moveaxis(part, -1, 0) for part in windows(FIELD, 40))
-    settings = Settings(batch_size=options.get("b", 16))
-    found = compiler_options(field, Trajectories(x0, u, states, DT), settings)
-    assert found == (FAST_COMPILE if name not in OTHERS and (library.obstacle() is None) else {})
+    found = compiler_options(field, Trajectories(x0, u, states, DT), Settings(batch_size=b))
+    assert found == (FAST_COMPILE if served else {})
 
 
 @pytest.mark.parametrize("solver", [RK4(substeps=2), RK4(scanned=True)])
