@@ -21,20 +21,17 @@ STEPS, FAULT = 24 * SECOND, slice(12 * SECOND, None)
 MAIN = """
 #include "adaptation.h"
 #include <stdio.h>
-#include <stdlib.h>
+static float one[%d], two[%d], given[3];
 int main(void) {
-    float *one = malloc(%d * sizeof(float)), *two = malloc(%d * sizeof(float)), given[3];
+    float *now = one, *next = two;
     if (fread(given, sizeof(float), 1, stdin) != 1) return 2;
-    adaptation_begin(given, one);
+    adaptation_begin(given, now);
     while (fread(given, sizeof(float), 3, stdin) == 3) {
-        adaptation_update(one, given, given + 1, given[2], two);
-        fwrite(two, sizeof(float), %d, stdout);
-        float *old = one;
-        one = two;
-        two = old;
+        adaptation_update(now, given, given + 1, given[2], next);
+        fwrite(next, sizeof(one), 1, stdout);
+        now = next;
+        next = now == one ? two : one;
     }
-    free(one);
-    free(two);
     return 0;
 }
 """
@@ -85,7 +82,7 @@ def program(request, tmp_path_factory):
     folder, adaptation = tmp_path_factory.mktemp("filter"), filter_of(request.param)
     source = export_adaptation_c(folder, adaptation, state_size=1, input_size=1)[1]
     size = ravel_pytree(adaptation.begin(jnp.zeros(1)))[0].size
-    (folder / "main.c").write_text(MAIN % (size, size, size))
+    (folder / "main.c").write_text(MAIN % (size, size))
     flags = ("-std=c99", "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     subprocess.run(["gcc", *flags, folder / "main.c", source, "-o", folder / "main", "-lm"], check=True)
     return request.param, folder / "main"
