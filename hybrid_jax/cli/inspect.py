@@ -163,10 +163,11 @@ def printable(text: str) -> str:
 def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> page.Page:
     ready = sum(log.result == "ready" for log in logs)
     mends = [(log.name, c.name, c.suggestion) for log in logs for c in log.checks if c.verdict in (FAILS, WARNS)]
-    mends += [(log.name, "no flight", log.refusal) for log in logs if log.refusal]
+    mends += [(log.name, "no flight", log.refusal) for log in logs if log.refusal and not log.failed]
     learn = f"Learn from them: hybrid-jax fit {options.folder} -o source.npz --vehicle {options.vehicle or 'v.toml'}"
     read = [(log, log.recording) for log in logs if log.recording is not None]
-    less = [log.name for log, raw in read if raw.rotors and "quantities" in {check.name for check in log.failed}]
+    failed = {log.name: {check.name for check in log.failed} for log in logs}
+    less = [log.name for log, raw in read if raw.rotors and {"quantities"} <= failed[log.name] <= {*BORNE}]
     worst = sorted(logs, key=lambda log: log.result == "ready")
     every = [(log.name, log.result, *(*_facts(log), (EMPTY,) * 6)[0]) for log in logs]
     return page.Page(
@@ -179,7 +180,7 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
             *([LESS.format(", ".join(less))] if less else []),
             *([NOT_RUN] if options.vehicle is None and read else []),
         ],
-        [learn] if ready else grouped(mends)[:LINES],
+        [learn] * bool(ready or less) + grouped(mends)[:LINES] * (not ready),
         [
             page.Table("All logs", ("log", "result", "format", "vehicle", "airframe", "program", "s", "motors"), every),
             page.Table("What to do", ("log", "check", "what it found, and what mends it"), mends),

@@ -85,7 +85,7 @@ def _header_complaint(name: str, names: list[str], header: str, delimiter: str) 
             return f"row 1: the fields are separated by {other!r}, not {delimiter!r}; {advice}"
     named = [each for each in names if each]  # a table's index has no name
     found = ", ".join(named[:20])[:200].encode("unicode_escape").decode()
-    return f"row 1, field {name}: no such column among {found}; rename a column or use a column map"
+    return f"row 1, field {name}: no such column among {found}; rename a column, or name it in a column map, columns=…"
 
 
 def _numbers(lines: list[str], row: int, names, picked, delimiter: str) -> Float[np.ndarray, "n c"]:
