@@ -50,6 +50,8 @@ def test_intervals_hold_and_widen_as_measurements_are_lost():
         result = hj.adapt(pendulum(0.7), masked(WHOLE, share), level=0.99)
         found = result.parameters["log_length"]
         assert found.low < np.log(LENGTH) < found.high
+        assert result.not_measured == pytest.approx(share, abs=0.05)
+        assert ("Not measured" in result.report()) == (share > 0)
         widths.append(found.high - found.low)
         assert all(np.isfinite(each).all() for of in result.expected.values() for each in of.values())
     assert widths[0] < widths[1] < widths[2]

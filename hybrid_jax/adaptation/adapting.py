@@ -162,6 +162,7 @@ def adapt(
         status=status,
         level=level,
         set_aside=(given - len(windows)) * windows.horizon,
+        not_measured=float(np.isnan(windows.x).mean()),
         outside=shares_outside(*ranges) if ranges else {},
         **choice,
         **_parameters(field, adapted, train, settings, level, without, solution.choice),

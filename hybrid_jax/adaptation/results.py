@@ -68,6 +68,7 @@ class Adaptation:
         degrees: degrees of freedom of the covariance, one less than the clusters of adjacent windows, or None.
         changed: parameters that differ significantly from the source's, the most significant first.
         set_aside: number of samples in windows with outliers, which were not used.
+        not_measured: share of the states of the windows, 0 to 1, that are NaN, which counts as not measured.
         candidates: "auto" only: probability of each change by name, 0 to 1; the network's is relative to the one taken.
         chosen: "auto" only: name of the chosen candidate.
         refused: "auto" only: candidates that would be more probable than the chosen one if the source had no errors.
@@ -92,6 +93,7 @@ class Adaptation:
     degrees: int | None = None
     changed: tuple[str, ...] = ()
     set_aside: int = 0
+    not_measured: float = 0.0
     candidates: dict[str, float] = attribute(default_factory=dict)
     chosen: str | None = None
     refused: tuple[str, ...] = ()
@@ -114,6 +116,8 @@ class Adaptation:
         yield f"Adapted to {self.windows} windows by {self.method}: {self.status.message}{after}."
         if self.set_aside:
             yield f"Set aside: {self.set_aside} samples, in windows with outliers."
+        if self.not_measured:
+            yield f"Not measured: {self.not_measured:.1%} of the states, which are NaN; they count as no error."
         yield f"Mean squared prediction error: {self.mse_before:.3g} before, {self.mse_after:.3g} after."
         if self.chosen is not None:
             known = sorted(self.candidates.items(), key=lambda one: -one[1])
