@@ -78,6 +78,9 @@ def _page(
     priors = {name: float(learned.get(name, name.startswith("efficiency"))) for name in names}
     changes = [(name, priors[name], found.parameters[name]) for name in names]
     changed = changes[: len(found.changed)]
+    effective: dict[str, dict[str, None]] = {}  # why → names without their indices
+    for name, why in ((name, one.effective) for name, _, one in changes if one.effective):
+        effective.setdefault(why, {})[name.partition("[")[0]] = None
     own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
     fields = {"before": known.field} | ({"adapted": field} if different else {})
     curves = {name: errors.rmse_by_flight(each, flights.logs, known.steps) for name, each in fields.items()}
@@ -114,7 +117,7 @@ def _page(
             *([f"Of the model before, {ALONE}"] if found.alone else []),
             *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
             *errors.unknown(found),
-            *(f"Effective means: {why}." for why in dict.fromkeys(each.effective for _, _, each in changes) if why),
+            *(f"The values of {', '.join(names)} are effective: {why}." for why, names in effective.items()),
             *[STILL] * flights.still,
             *unlike(known, flights),
             *flights.warnings,
