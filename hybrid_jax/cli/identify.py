@@ -15,11 +15,11 @@ from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import ChecksFailed, in_flags, step
 from hybrid_jax.cli.compared import compared, unlearned_drag
-from hybrid_jax.cli.logs import recordings_of
+from hybrid_jax.cli.logs import grouped, recordings_of
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
-from hybrid_jax.flights.checks.consistency import Check
-from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.flights.checks.consistency import FAILS, Check
+from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.recording import Recording, unit_of
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, window_errors
@@ -67,7 +67,7 @@ def layout_of(fits: Mapping[str, Any]) -> Layout:
 
 
 def checked(options: Any, path: Path, model: VehicleModel) -> Read:
-    """Read the logs of a folder and check them against the vehicle file; raise ChecksFailed without --anyway."""
+    """Read the logs of a folder and leave out those that fail checks, except with --anyway; one must pass."""
     if LAG in model.learn:
         mend = _learn(model.learn, (LAG,))
         raise ValueError(f"{path}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
@@ -80,23 +80,25 @@ def read_checked(
 ) -> Read:
     """Read and check the logs of a folder like `checked`, for the field that `start` makes for them."""
     raws, contents, said = recordings_of(folder, options)
-    logs = [*raws.values()]
-    notes = [f"{name}: {note}" for name, log in raws.items() for note in log.notes]
-    failed: list[str] = []
+    failed: list[tuple[str, str, str]] = []  # a log, a check and what it says
 
     def require(checks_of: Callable[[Recording], list[Check]]) -> None:
-        kept = {name: [each for each in checks_of(log) if each.name not in NOT_NEEDED] for name, log in raws.items()}
-        failed.extend(line for name, each in kept.items() for line in failures(each, name))
-        if failed and not options.anyway:
-            raise ChecksFailed(*failed, MEND)
+        for name, log in [*raws.items()]:
+            fails = [each for each in checks_of(log) if each.verdict == FAILS and each.name not in NOT_NEEDED]
+            failed.extend((name, each.name, each.suggestion) for each in fails)
+            if fails and not options.anyway:
+                del raws[name], contents[name]
+        if not raws:
+            raise ChecksFailed(*grouped(failed), MEND)
 
     require(lambda log: check_recording(log, vehicle))
-    field = start(logs)
+    field = start([*raws.values()])
     require(lambda log: compared(log, field, learn))
-    failed = list(map(in_flags, failed))
-    for line in (*notes, *failed):
+    lines = [in_flags(": ".join(each)) for each in failed]
+    said += [f"{name}: {note}" for name, log in raws.items() for note in log.notes] + lines * (not options.anyway)
+    for line in lines:
         print(f"  {line}", file=sys.stderr)
-    return Read(logs, contents, field, said + notes, failed)
+    return Read([*raws.values()], contents, field, said, lines * options.anyway)
 
 
 def identified(read: Read, layout: Layout) -> Identified:

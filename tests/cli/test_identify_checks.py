@@ -54,8 +54,16 @@ MENDS = {"anyway": ({"anyway": True}, ["motor order"]), "mended": ({"motor_order
 @pytest.mark.parametrize(("more", "failed"), MENDS.values(), ids=MENDS)
 def test_it_goes_on_when_asked_or_mended(folder, more, failed):
     write(folder / "logs", [SWAPPED])
-    lines = checked(Options(folder / "logs", folder / "m.npz", **more), folder / "v.toml", VehicleModel(IRIS)).failed
+    read = checked(Options(folder / "logs", folder / "m.npz", **more), folder / "v.toml", VehicleModel(IRIS))
+    lines = read.failed
     assert [line.split(": ")[1].split(" against")[0] for line in lines] == failed
+
+
+def test_a_log_that_fails_is_left_out_where_another_passes(folder):
+    write(folder / "logs", [SWAPPED, LOGS[1]])
+    read = checked(Options(folder / "logs", folder / "m.npz"), folder / "v.toml", VehicleModel(IRIS))
+    assert [*read.contents] == ["chirp_run2.csv.gz"]
+    assert (read.failed, "motor order against roll and pitch" in read.said[-1]) == ([], True)
 
 
 @pytest.mark.parametrize(("learn", "rest"), [("Ix,curve,delay", "Ix"), ("curve", "Ix Iy")])
