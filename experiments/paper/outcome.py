@@ -117,7 +117,7 @@ def introduction(rows: Results) -> str:
         f"little new flight? Question and protocol are those of {PAPER}.",
         f"{len(rows)} trained models: N of {sizes} target trajectories, {over_seeds(rows)} each{where}.",
         "\n".join(f"- **{label(name)}**: {about}" for name, about in ABOUT.items() if name in seen),
-        "L^T_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² is the test MSE on flights from after the change, x̂ integrated from the "
+        "The test error, L^T_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², is of flights from after the change, x̂ integrated from the "
         "window's first state with the recorded rotor speeds; ρ = (L^S − L^T) / L^S, where L^S is the same error of "
         f"the source-only model of the same seed{baselines}.",
     ]

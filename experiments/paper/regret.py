@@ -98,7 +98,7 @@ CLAIMS: Sequence[Claim[Results]] = (
 def conclusion(rows: Results) -> list[str]:
     gains = {domain: 1 - over(own, "source").mean() for domain, own in rows.group("domain").items()}
     sentence = (
-        f"`adapt` removes {min(gains.values()):.0%} to {max(gains.values()):.0%} of the source's error, by change"
+        f"`hj.adapt` removes {min(gains.values()):.0%} to {max(gains.values()):.0%} of the source's error, by change"
     )
     if "fine_tune" not in rows.unique("candidate"):
         return [f"{sentence}."]
@@ -119,7 +119,8 @@ def regret_table(rows: Results) -> Table:
         texts = (f"{number:{form}}" for number, form in zip(numbers, (".0%", ".3f", ".3f", ".3f", ".3f"), strict=True))
         lines.append((names.label(domain), *texts, taken))
     header = ("change", f"regret ≤ {NEAR}", "median", "largest", "mean ρ", "worst ρ", "taken, number of cases")
-    return Table("The candidate that is taken", header, lines)
+    title = "Error over the best candidate's (regret), and the share ρ of the source's error that is removed"
+    return Table(title, header, lines)
 
 
 def error_table(rows: Results) -> Table:
@@ -129,7 +130,7 @@ def error_table(rows: Results) -> Table:
         return f"{of_each_case(own, name).mean():.3g}"
 
     lines = [(name, *(text(own, name) for own in groups.values())) for name in (AUTO, *rows.unique("candidate"))]
-    return Table("Mean test error L^T_MSE (less is better)", ("method", *map(names.label, groups)), lines)
+    return Table("Mean test error (less is better)", ("method", *map(names.label, groups)), lines)
 
 
 @mpl.rc_context(STYLE)

@@ -61,7 +61,7 @@ def by_size(rows: Results) -> list[Table]:
             if len((trained or group).where(model=model, mode=seen))
         }
         for own, title, text in (
-            (group, f"Test error L^T_MSE{place} ({of}; less is better{capped(group)})", error_text),
+            (group, f"Test error{place} ({of}; less is better{capped(group)})", error_text),
             (trained, f"Improvement ρ over source-only{place} ({of}; 1 is perfect)", rho_text),
         ):
             sizes = own.sort(n_train=None).group("n_train")
@@ -79,7 +79,7 @@ def conclusion(rows: Results) -> list[str]:
         best = next(iter(own))
         if not math.isfinite(own[best].spread("test_mse").mean):
             continue
-        sentence = f"With N = {n}{place}, {label(*best[:2])} has the smallest test error, {error_text(own[best])}"
+        sentence = f"With N = {n}{place}, {method_label(best)} has the smallest test error, {error_text(own[best])}"
         source = own.get((HYBRID, SOURCE_ONLY, 0))
         before = f"; without adaptation it is {spread_text(source.spread('test_mse'))}" if source else ""
         gone = {model: own.get((model, FINE_TUNED, n)) for model in (HYBRID, NO_PHYSICS)}
@@ -147,7 +147,7 @@ def ranking(rows: Results) -> list[Table]:
             smallest = f"{values.smallest:.3g}".replace("inf", "∞")
             lines.append((method_label(cell), str(cell[2] or EMPTY), smallest, error_text(of_cell), own, *paper))
         of = f"experiment {[*PAPER].index(domain) + 1} of the paper; {over_seeds(group)}; less is better{capped(group)}"
-        tables.append(Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, lines, labels=2))
+        tables.append(Table(f"Test error, {label(domain)} ({of})", header, lines, labels=2))
     return tables
 
 

@@ -96,7 +96,7 @@ def _choices(rows: Results) -> Table:
     def chosen(own: Results) -> str:
         return ", ".join(f"{name} {len(same)}" for name, same in own.group("chosen").items())
 
-    return cross_table("What `auto` chose, and in how many seeds", groups, columns, chosen, "change")
+    return cross_table("What hj.adapt (auto) chose, and in how many seeds", groups, columns, chosen, "change")
 
 
 def _environments(rows: Results) -> Table:

@@ -93,7 +93,7 @@ def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.
     """Draw the lines, the first on top, and the attainable error (`floor`), if it is not 0."""
     limits = _limits([line.errors for line in lines], floor)
     axes.set(xscale="log", xlim=limits, title=title)
-    axes.set_xlabel("test error $L^T_{MSE}$  (state in SI units, squared; log scale)")
+    axes.set_xlabel("test error $L^T_{MSE}$  (state in SI units, squared; log scale; lower is better)")
     name_lines(axes, [line.name for line in lines])
     tick_errors(axes.xaxis, *limits)
     for y, line in enumerate(lines):

@@ -146,7 +146,7 @@ def markdown_page(page: Page, report: Report) -> str:
     parts = [
         f"# {page.question}",
         f"**{plain(page.answer)}**" * bool(page.answer),
-        record.get("earlier", ""),  # how the program that made the record differs from this one
+        record.get("remark", ""),  # how the run differs from others, or its program from this one
         *figures[:1],
         f"## {plain(page.table.title)}\n\n{markdown(page.table)}" if page.table else "",
         f"## What this means for you\n\n{_bullets(page.meaning)}" if page.meaning else "",

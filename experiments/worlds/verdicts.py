@@ -16,6 +16,7 @@ from hybrid_jax.dynamics.rigid_body import LEARNED
 MEAN, EACH = 1.05, 1.2  # times the source's error: in the mean of a case, and of a single adaptation
 HELD, EXPECTED = (0.9, 0.99), (0.7, 0.9)  # shares of 95 % and of 80 % intervals that hold
 LEVEL = 0.95
+CALLED = {AUTO: "hj.adapt", "source": "not adapted"}
 CASE = "world", "change", "flight"
 
 
@@ -64,7 +65,7 @@ def coverage_table(rows: Results) -> Table:
             effective = int(np.sum(known(own, f"{name}_effective")))
             numbers = (100 * np.abs(known(own, f"{name}_{column}")) for column in ("error", "half_width"))
             medians = (f"{np.median(v):.2g}" if len(v) else EMPTY for v in numbers)
-            lines.append((label(world), method, name, share, f"{effective or EMPTY}", *medians))
+            lines.append((label(world), CALLED.get(method, method), name, share, f"{effective or EMPTY}", *medians))
     header = (
         "world",
         "method",
@@ -91,7 +92,9 @@ def method_table(rows: Results) -> Table:
         for key, each in own.group("world", "change", "method").items() if len(own.unique("method")) > 1 else ():
             ratio = each.numbers("ratio")
             numbers = each.numbers("test_mse").mean(), ratio.mean(), ratio.max(), np.median(each.numbers("seconds"))
-            lines.append((*map(label, key), *(f"{number:.3g}" for number in numbers)))
+            world, change, method = key
+            names = label(world), label(change), CALLED.get(method, method)
+            lines.append((*names, *(f"{number:.3g}" for number in numbers)))
     header = ("world", "change", "method", "test error", "over the source's", "worst", "processor time [s], median")
     return Table("Methods on the same ten seconds", header, lines)
 
