@@ -1,5 +1,6 @@
 """The console script as a user meets it: help, refusals, and fit, adapt and check on logs that tests write."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from cli_logs import simulated
 from PIL import Image
+from smoke import ROOT
 
 from experiments.real_flight.simulated import csv_of, vehicle_toml
 from hybrid_jax.adaptation import Adaptation
@@ -94,6 +96,9 @@ def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_chang
     assert code == 0
     assert "These flights show no change; physics alone predicts" in said
     assert (tmp_path / "adapted.npz").exists()
+    keys = {*json.loads((tmp_path / "report.json").read_text())} - {"format", "verb", "answer", "notes"}
+    (listed,) = re.findall(r"^- `adapt`:(.*?)^- ", (ROOT / "docs/howto/tool.md").read_text(), re.MULTILINE | re.DOTALL)
+    assert keys <= {*re.findall(r"`(\w+)`", listed)}
 
 
 @pytest.mark.slow
