@@ -30,7 +30,7 @@ from hybrid_jax.dynamics.disturbance import (
     without_zeros,
 )
 from hybrid_jax.dynamics.rigid_body import uncorrected
-from hybrid_jax.estimation.least_squares import Solver
+from hybrid_jax.estimation.least_squares import Solver, solver_errors
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters, sandwich
 from hybrid_jax.extrapolation import features_of, shares_outside
 from hybrid_jax.integrate import checked, compact
@@ -123,7 +123,8 @@ def adapt(
     if overlap(windows):
         warnings.warn(OVERLAP, stacklevel=3)
     keep_programs("adapt", windows.x.shape)
-    given, errors = len(windows), np.asarray(_errors(field, windows, compact(solver)))
+    with solver_errors(solver):
+        given, errors = len(windows), np.asarray(_errors(field, windows, compact(solver)))
     good = ~outliers(errors, windows)
     if good.sum() >= max(FEWEST, given / 2):
         windows, errors = (windows, errors) if good.all() else (windows[good], errors[good])
@@ -139,7 +140,8 @@ def adapt(
     load_lapack()
     keep_programs("adapt", windows.x.shape)
     diverged = Solution(field, status=Status.DIVERGED) if overflows(windows) or overflows(held_out) else None
-    solution = diverged or method.solve(field, train, held_out, settings, **motion)
+    with solver_errors(solver):
+        solution = diverged or method.solve(field, train, held_out, settings, **motion)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
     adapted = solution.field

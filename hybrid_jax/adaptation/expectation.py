@@ -23,6 +23,7 @@ def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, f
     blocks = len(squares)
     with warnings.catch_warnings(action="ignore"):  # a state that is measured at no end
         squares = np.where(np.isnan(squares), np.nanmean(squares, axis=0), squares)
+    squares = np.where(np.isfinite(squares), squares, np.nan)  # a diverged one has no RMSE
     reach = scipy.special.stdtrit(blocks - 1, (1 + LEVEL) / 2) * np.sqrt(2 * ALIKE / blocks) if blocks > 1 else np.inf
 
     def around(group: slice, factor: float, horizon: int) -> tuple[float, float, float]:

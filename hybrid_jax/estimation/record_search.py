@@ -192,25 +192,21 @@ def directions(search: Search, end: End, records: Sequence[Record]) -> tuple[str
 def check_rates(model: Model, records: Sequence[Record]) -> None:
     """Raise ValueError if an output that is the rate of another one in the model has another unit in a record."""
     random, m = np.random.default_rng(0), sum(records[0].signals[name].values.shape[1] for name in model.inputs)
+    x, u = (jnp.asarray(random.normal(size=(2, k))) for k in (model.size, m))
 
-    def slopes(x, u):
-        of_output = {name: partial(lambda name, x: model.output(name, x, u), name) for name in model.outputs}
-        return {name: jax.jvp(y, (x,), (model.field(x, u),)) for name, y in of_output.items()}
+    def slopes(name):
+        return jax.vmap(lambda x, u: jax.jvp(lambda x: model.output(name, x, u), (x,), (model.field(x, u),)))(x, u)
 
-    found = [slopes(*(jnp.asarray(random.normal(size=k)) for k in (model.size, m))) for _ in range(2)]
-    for name, rate in itertools.permutations(model.outputs, 2):
-        pairs = [(each[name][1], each[rate][0]) for each in found]
-        if not all(a.shape == b.shape and jnp.allclose(a, b) for a, b in pairs):
-            continue
-        for record in records:
+    found = {name: slopes(name) for name in model.outputs}
+    for name, rate in itertools.permutations(found, 2):
+        same = found[name][1].shape == found[rate][0].shape and jnp.allclose(found[name][1], found[rate][0])
+        for record in records if same else ():
             moved, measured = record.signals[name], record.signals[rate]
             inside = (moved.t >= measured.t[0]) & (moved.t <= measured.t[-1])
-            if not inside.any():
-                continue
             both = moved.values[inside], integral(measured, moved.t[inside], "linear")
-            a, b = (each - each.mean(axis=0, keepdims=True) for each in both)
-            gain = np.sqrt(np.sum(b * b) / max(np.sum(a * a), TINY))
-            if np.sum(a * b) > ALIKE * np.sqrt(np.sum(a * a) * np.sum(b * b)) and not 1 / FAR < gain < FAR:
+            a, b = (each - each.sum(axis=0) / max(inside.sum(), 1) for each in both)
+            sizes = np.linalg.norm(a) + TINY, np.linalg.norm(b)
+            if np.sum(a * b) > ALIKE * sizes[0] * sizes[1] and not 1 / FAR < (gain := sizes[1] / sizes[0]) < FAR:
                 raise ValueError(f"{record.name}: {rate} is {gain:.3g} times the rate of {name}: check their units")
 
 

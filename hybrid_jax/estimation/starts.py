@@ -31,7 +31,7 @@ class Starts(NamedTuple):
         x0: the smoothed start.
         jump: measured minus smoothed start, over scale.
         effect: derivative of each state of the window with respect to the start, both over scale.
-        inverse: inverse of the start's normal equations, see `Sums`.
+        inverse: inverse of the start's normal equations.
         trust: weight of a measured start's square relative to a prediction's; the measured start is used if the field's
             errors are larger than the measurements', for example after a large change.
     """
@@ -41,29 +41,6 @@ class Starts(NamedTuple):
     effect: Float[Array, "*n t d d"]
     inverse: Float[Array, "*n d d"]
     trust: Float[Array, "*n"]
-
-
-class Sums(NamedTuple):
-    """Normal equations of the start of adjacent windows, and its `effect` on the last state."""
-
-    effect: Float[Array, "d d"]
-    gram: Float[Array, "d d"]
-    score: Float[Array, " d"]
-    square: Float[Array, ""]
-
-    @staticmethod
-    def of(jump: Float[Array, " d"], trust: Float[Array, ""]) -> "Sums":
-        one, trust = jnp.eye(len(jump), dtype=jump.dtype), trust.astype(jump.dtype)
-        return Sums(one, trust * one, trust * jump, trust * jump @ jump)
-
-    def and_those(self, r: Float[Array, "t d"], effect: Float[Array, "t d d"]) -> "Sums":
-        """Add the errors of a window that begins where the last one ended."""
-        rows = effect @ self.effect
-        flat, r = rows.reshape(-1, rows.shape[-1]), r.ravel().astype(rows.dtype)
-        return Sums(rows[-1], self.gram + flat.T @ flat, self.score + flat.T @ r, self.square + r @ r)
-
-    def unexplained(self) -> Float[Array, ""]:
-        return jnp.maximum(self.square - self.score @ solve(self.gram, self.score), 0.0)
 
 
 def smoothed(
@@ -104,9 +81,9 @@ def smoothed(
 
     def start(each):
         effect, r = each
-        sums = Sums.of(jnp.zeros_like(r[0]), trust).and_those(r, effect)
-        inverse = solve(sums.gram, jnp.eye(d, dtype=r.dtype))
-        return inverse @ sums.score, inverse
+        one, flat = jnp.eye(d, dtype=r.dtype), effect.reshape(-1, d)
+        inverse = solve(trust.astype(r.dtype) * one + flat.T @ flat, one)
+        return inverse @ (flat.T @ r.ravel()), inverse
 
     change, inverse = jax.lax.map(start, (effect, r))
     many = jnp.broadcast_to(trust, len(windows))

@@ -222,15 +222,11 @@ class DisturbanceSelection(eqx.Module):
 
     Attributes:
         fit: the better of the two fits, with a disturbance of zero if none is needed.
-        needed: whether the windows need a disturbance: the gain is more than its standard error.
-        gain: by how much a disturbance lowers L_MSE of left-out windows, mean over windows.
-        standard_error: standard error of the gain.
+        needed: whether it lowers L_MSE of left-out windows, in their mean, by more than the standard error of that.
     """
 
     fit: LeastSquaresFit
     needed: Bool[Array, ""]
-    gain: Float[Array, ""]
-    standard_error: Float[Array, ""]
 
 
 @entry
@@ -276,7 +272,6 @@ def select_disturbance(
 def _selection(fits: list[LeastSquaresFit], equations: list[NormalEquations], horizon: int) -> DisturbanceSelection:
     disturbed, plain = fits
     gains = left_out(equations[1], horizon) - left_out(equations[0], horizon)
-    gain, error = jnp.mean(gains), jnp.std(gains, ddof=1) / jnp.sqrt(len(gains))
-    needed = gain > error  # False where one of them is not finite
+    needed = jnp.mean(gains) > jnp.std(gains, ddof=1) / jnp.sqrt(len(gains))  # False where one of them is not finite
     kept = jax.tree.map(lambda a, b: jnp.where(needed, a, b) if eqx.is_array(a) else a, disturbed, plain)
-    return DisturbanceSelection(kept, needed, gain, error)
+    return DisturbanceSelection(kept, needed)

@@ -18,10 +18,8 @@ from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
-from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import POSITION, QUATERNION, VELOCITY
-from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
@@ -167,15 +165,6 @@ def test_a_learned_mass_is_that_of_a_heavier_vehicle():
     x, u = samples()
     expected = one_by_one(rigid_body(heavier, (), KNOWN), x, u)
     np.testing.assert_allclose(one_by_one(learned, x, u), expected, rtol=1e-13, atol=1e-13)
-
-
-def test_the_mass_of_a_payload_is_found_where_the_thrust_is_known():
-    x0, u = samples(20)
-    u = jnp.broadcast_to(u.T[:, None], (20, 10, 4))
-    loaded = rigid_body(replace(IRIS, mass=1.2 * IRIS.mass), ())
-    windows = Trajectories(x0.T, u, rollout_batch(loaded, x0.T, u, 0.01), 0.01)
-    found = fit_least_squares(rigid_body(IRIS, ("mass",)), windows).field
-    np.testing.assert_allclose(found.theta()["mass"], 1.2 * IRIS.mass, rtol=1e-6)
 
 
 def test_it_survives_a_file_and_its_states_are_checked(tmp_path):

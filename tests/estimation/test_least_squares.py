@@ -11,6 +11,7 @@ import pytest
 from pendulum import LENGTH, log_lengths, pendulum, swings
 from pushes import Push, pushes
 
+from hybrid_jax.adaptation import adapt
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.composition import Hybrid
@@ -20,6 +21,7 @@ from hybrid_jax.estimation.uncertainty import covariance_of
 from hybrid_jax.integrate import RK4, rollout_batch
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import residual_network
+from hybrid_jax.training import Settings
 from hybrid_jax.trajectories import Trajectories
 
 _mse, _flown = eqx.filter_jit(rollout_mse), eqx.filter_jit(rollout_batch)
@@ -101,10 +103,18 @@ def test_a_step_that_biases_a_parameter_is_said(substeps, biased):
     assert float(found.discretisation) == pytest.approx(off, rel=0.5) if biased else found.discretisation < 0.1
 
 
-def test_an_implicit_solver_that_finds_no_step_ends_in_a_line():
+@pytest.mark.parametrize(
+    "fit",
+    [
+        lambda field, windows, solver: fit_least_squares(field, windows, solver=solver),
+        lambda field, windows, solver: adapt(field, windows, settings=Settings(solver=solver)),
+    ],
+    ids=["least squares", "adapt"],
+)
+def test_an_implicit_solver_that_finds_no_step_ends_in_a_line(fit):
     windows = Trajectories(np.zeros((2, 1)), np.ones((2, 3, 1)), np.zeros((2, 3, 1)), 0.01)
     with pytest.raises(ValueError, match="solver: ImplicitEuler finds no step where the search went") as said:
-        fit_least_squares(Coil(jnp.array(-1e3)), windows, solver=diffrax.ImplicitEuler())
+        fit(Coil(jnp.array(-1e3)), windows, diffrax.ImplicitEuler())
     assert len(str(said.value).splitlines()) == 1
 
 
