@@ -34,9 +34,10 @@ def fit_disturbance(
     of the errors in each part left out as it alters predictions of the earlier data (after Mallows, 1973). So noise in
     a hover does not change them.
 
-    Example:
+    For example, after the last state of each window:
+
         model = hj.fit_disturbance(result.field, flights)
-        state = hj.observe(model, past)[:, -1]  # at the end of each window
+        state = hj.observe(model, past)[:, -1]
         x = hj.rollout_batch(model, state, u, dt)[..., :d]
 
     Args:
