@@ -94,11 +94,12 @@ def covariance_of(
         ValueError: malformed windows, or no more than parameters; an unknown kind, or homoscedastic with an `error`.
     """
     windows = least_squares.check_windows(field, windows, missing=True)
-    measured = jnp.sum(~jnp.isnan(windows.x))
+    traced = checks.is_traced(windows.x)  # else NumPy counts, which keeps no program for each size
+    measured = jnp.sum(~jnp.isnan(windows.x)) if traced else jnp.asarray(np.count_nonzero(~np.isnan(windows.x)))
     fitted = ravel_parameters(field)[0].size if free is None else jnp.sum(free)
     if not checks.is_traced(fitted):
         # White noise makes each number of a window an observation; otherwise each window is one.
-        numbers = windows.x.size if checks.is_traced(measured) else int(measured)
+        numbers = windows.x.size if traced else int(measured)
         n = numbers if kind == "homoscedastic" else len(windows)
         check_determined(field, n, int(fitted))
     checks.count("chunk", chunk)
