@@ -95,13 +95,13 @@ def covariance_of(
     """
     windows = least_squares.check_windows(field, windows, missing=True)
     traced = checks.is_traced(windows.x)  # else NumPy counts, which keeps no program for each size
-    measured = jnp.sum(~jnp.isnan(windows.x)) if traced else jnp.asarray(np.count_nonzero(~np.isnan(windows.x)))
+    measured = jnp.sum(~jnp.isnan(windows.x)) if traced else np.count_nonzero(~np.isnan(windows.x))
     fitted = ravel_parameters(field)[0].size if free is None else jnp.sum(free)
     if not checks.is_traced(fitted):
         # White noise makes each number of a window an observation; otherwise each window is one.
-        numbers = windows.x.size if traced else int(measured)
+        numbers = windows.x.size if traced else measured
         n = numbers if kind == "homoscedastic" else len(windows)
-        check_determined(field, n, int(fitted))
+        check_determined(field, int(n), int(fitted))
     checks.count("chunk", chunk)
     checks.count("cluster", cluster)
     if kind not in Kind.__args__:
@@ -112,7 +112,7 @@ def covariance_of(
     seen = has_effect(equations, windows, scale)
     equations = masked(equations, seen if free is None else free & seen)
     unknown = ~seen if free is None else free & ~seen
-    found = _covariance(equations, kind, measured, fitted, cluster)
+    found = _covariance(equations, kind, jnp.asarray(measured), fitted, cluster)
     return found + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
 
 
