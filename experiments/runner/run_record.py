@@ -57,7 +57,7 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
     if config.fresh:
         _move_aside(folder, say)
     known = path.exists()
-    found = read_json(path) if known else {"state": None}
+    found: Any = read_json(path) if known else {"state": None}
     if known and not (isinstance(found, dict) and {"state", "started", *FIXED, *MACHINE} <= found.keys()):
         raise ValueError(f"{path}: not the record of a run; --restart starts anew and moves it aside")
     if found["state"] == "unfinished":
