@@ -15,7 +15,7 @@ from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import BAD_INPUT, in_flags
 from hybrid_jax.cli.estimates import estimate
-from hybrid_jax.cli.logs import LISTS, SpeedOptions, content_of, grouped, look, paths_of
+from hybrid_jax.cli.logs import LISTS, SpeedOptions, content_of, grouped, look, paths_of, printable
 from hybrid_jax.cli.vehicle_text import vehicle_text
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
@@ -153,11 +153,6 @@ def trusted(logs: Sequence[Inspected]) -> list[Recording]:
     if left:
         print(f"left out of the vehicle file, as checks failed: {', '.join(left)}")
     return kept
-
-
-def printable(text: str) -> str:
-    """Escape characters of a text that may not be printable, for example in a file name."""
-    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
 def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> page.Page:

@@ -148,6 +148,11 @@ def paths_of(folder: Path) -> tuple[list[Path], list[str]]:
     return paths, left
 
 
+def printable(text: str) -> str:
+    """Escape characters of a text that may not be printable, for example in a file name."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
+
+
 def recordings_of(folder: Path, options: LogOptions) -> tuple[dict[str, Recording], dict[str, str], list[str]]:
     """Read the logs of a folder, or one log, by file name: recordings, their digests, and a line for each other file.
 
@@ -163,7 +168,7 @@ def recordings_of(folder: Path, options: LogOptions) -> tuple[dict[str, Recordin
     if not found:
         raise ValueError(unread[0].removeprefix("left out: "))
     for line in unread:
-        print(f"  {in_flags(line)}", file=sys.stderr)
+        print(f"  {printable(in_flags(line))}", file=sys.stderr)
     contents = {name: content_of(log) for name, log in found.items()}
     require_distinct([*contents.items()])
     return found, contents, said + unread
@@ -200,7 +205,7 @@ def read_flights(
             why = f"; or are they of another vehicle than {vehicle.name}?" * other
             raise ChecksFailed(*short, f"no log passed its checks; correct them as said above, or use --anyway{why}")
         for line in short:
-            print(f"  {in_flags(line)}", file=sys.stderr)
+            print(f"  {printable(in_flags(line))}", file=sys.stderr)
         found = Flights(logs, contents, said, list(map(in_flags, grouped(warned))), not moving)
         done(f"{len(logs)} of {len(raws)} flights, {found.seconds:.0f} s in the air")
     return found

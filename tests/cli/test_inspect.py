@@ -171,16 +171,16 @@ def test_of_a_folder_with_mistakes_what_is_sound_is_used(tmp_path, called, capsy
     flights = read_flights(folder, IRIS, DT, FlightOptions())
     assert [len(flights.logs), flights.still] == [2, False]
     assert "left out: " in flights.said[0]
-    assert "broken.csv: row 1, field py" in capsys.readouterr().err
+    assert r"broken\udcff.csv: row 1, field py" in capsys.readouterr().err
     with pytest.raises(ChecksFailed) as failed:
         read_flights(folder, replace(IRIS, mass=9 * IRIS.mass), DT, FlightOptions())
     assert [line.split(": ")[1] for line in failed.value.args[:-1]] == ["specific force over thrust per mass"]
     assert "(and 1 more of the logs)" in failed.value.args[0]
     assert failed.value.args[-1].endswith("or are they of another vehicle than iris?")
-    write(folder, [replace(LOGS[0], name="copy.csv")])
+    write(folder, [replace(LOGS[1], name="copy.csv")])
     _, said, _ = called("inspect", folder, "--out", tmp_path)
-    assert "the same flight as chirp_run1.csv.gz; leave one of the two out" in said
-    with pytest.raises(ValueError, match=r"copy\.csv\.gz: the same flight as chirp_run1\.csv\.gz"):
+    assert "the same flight as chirp_run2.csv.gz; leave one of the two out" in said
+    with pytest.raises(ValueError, match=r"copy\.csv\.gz: the same flight as chirp_run2\.csv\.gz"):
         read_flights(folder, IRIS, DT, FlightOptions())
 
 

@@ -125,7 +125,7 @@ REFUSED = {
     "param_shift": [
         (("--preset", "nonsense"), "--preset must be one of paper, quick, smoke, got 'nonsense'"),
         (("--n-target", "10"), "--n-target must each be at least --batch-size 20"),
-        (("--seeds", "many"), "--seeds: invalid literal"),
+        (("--seeds", "many"), "--seeds must be an integer, got many"),
         (("--no-such-option", "1"), "--no-such-option"),
     ],
     "comparison": [
