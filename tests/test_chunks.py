@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax.chunks import in_chunks, in_chunks_of_distinct
+from hybrid_jax.chunks import in_chunks
 
 
 def norms(values):
@@ -17,8 +17,8 @@ def norms(values):
 @pytest.mark.parametrize("size", [1, 4, 5, 7, 9])
 def test_results_do_not_depend_on_the_size_of_chunks(size):
     values = np.random.default_rng(0).normal(size=(7, 2)).astype(np.float32)
-    for found in (in_chunks(norms, values, size), in_chunks_of_distinct(norms, values, size)):
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), found, norms(values))
+    found = in_chunks(norms, values, size)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), found, norms(values))
 
 
 @pytest.mark.parametrize("distinct", [1, 3, 7])
@@ -27,5 +27,5 @@ def test_values_that_repeat_are_evaluated_once(distinct):
     values = np.random.default_rng(0).normal(size=(distinct, 2)).astype(np.float32)
     repeated = values[np.arange(7) % distinct]
     poisoned = np.where(np.arange(7)[:, None] < -(-distinct // 3) * 3, repeated, np.nan)
-    found = jax.jit(lambda many: in_chunks_of_distinct(norms, poisoned, 3, many))(jnp.array(distinct))
+    found = jax.jit(lambda many: in_chunks(norms, poisoned, 3, many))(jnp.array(distinct))
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), found, norms(repeated))

@@ -15,7 +15,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.chunks import in_chunks_of_distinct
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_learned
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
@@ -205,8 +205,7 @@ def fit_and_linearise(
     def linearised(theta: Theta):
         if compressed:
             return _triangle(errors, theta, windows)
-        one = partial(_linearised, errors, theta)
-        jacobian, found = in_chunks_of_distinct(one, windows, TOGETHER, distinct)
+        jacobian, found = in_chunks(partial(_linearised, errors, theta), windows, TOGETHER, distinct)
         found, push = jax.linearize(own, found)
         return jax.vmap(push, -1, -1)(jacobian), found
 
