@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from importlib import import_module
 from itertools import takewhile
-from typing import Any, NoReturn, TypeVar, cast, get_type_hints
+from typing import Any, TypeVar, cast, get_type_hints
 
 import tyro
 
@@ -148,12 +148,19 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
-        message = str(error) if isinstance(error, Explained) else " ".join(str(error).split())
-        _end(program, [_option(command, in_flags(message, command))], BAD_INPUT)
+        message = in_flags(str(error) if isinstance(error, Explained) else " ".join(str(error).split()), command)
+        if command in VERBS:  # an argument at the start is one of its options
+            message = re.sub(r"^([a-z_]+)(?=(\[\d\])? must )", lambda found: _flag(found[1]), message)
+        lines, code = [message], BAD_INPUT
     except ChecksFailed as failed:
-        _end(program, [in_flags(line, command) for line in failed.args], FAILED_CHECKS)
+        lines, code = [in_flags(line, command) for line in failed.args], FAILED_CHECKS
     except KeyboardInterrupt as stop:
-        _end(program, [interrupted], 128 + (stop.args[0] if stop.args else signal.SIGINT))
+        lines, code = [interrupted], 128 + (stop.args[0] if stop.args else signal.SIGINT)
+    else:
+        return
+    for line in lines:
+        print(f"{program}: {line}", file=sys.stderr)
+    sys.exit(code)
 
 
 class _Output(io.FileIO):
@@ -172,24 +179,13 @@ class _Output(io.FileIO):
             return memoryview(text).nbytes
 
 
-def _end(program: str, lines: Sequence[str], code: int) -> NoReturn:
-    for line in lines:
-        print(f"{program}: {line}", file=sys.stderr)
-    sys.exit(code)
-
-
 def _meant(word: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(word, list(known), 1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _option(command: str, message: str) -> str:
-    """Replace an argument at the start of a message, `argument must …`, by the option of a verb."""
-    found = re.match(r"([a-z_]+)(?=(\[\d\])? must )", message)
-    if found is None or command not in VERBS:
-        return message
-    name = "learn" if found[1] == "parameters" else found[1]
-    return f"--{name.replace('_', '-')}{message[found.end() :]}"
+def _flag(argument: str) -> str:
+    return f"--{'learn' if argument == 'parameters' else argument.replace('_', '-')}"
 
 
 def in_flags(message: str, command: str = READ_LOGS[0]) -> str:

@@ -21,7 +21,6 @@ from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
-from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.export import casadi_function, export_adaptation_c, export_c, export_program
 from hybrid_jax.export.program import sizes_of, vehicle_in
 from hybrid_jax.integrate import rollout_batch
@@ -32,13 +31,12 @@ from hybrid_jax.online import OnlineAdaptation
 from hybrid_jax.state import BODY_RATES, SENSOR_NOISE, STATE_SIZE, VELOCITY
 
 __all__ = ["LISTS", "Options", "run"]
-LISTS = ("--to", "--noise", "--process", "--prior", "--disturbance")
-FILTER = ("period", "noise", "process", "prior", "disturbance")
+LISTS = ("--to", "--noise")
 RESPONSE, FASTER = 0.2, 1.05  # of the figure: seconds, and factor on the speed of the first rotor
 UNITS = "velocity [m/s]", "body rates [rad/s]"
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
 PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.md
-PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
+DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
 STATES = "x: position [m], quaternion w x y z, velocity [m/s], body rates [rad/s]; u: rotor speeds [rad/s]."
 WITHOUT = "The model is written without its past: in a program you would have to filter its errors yourself."
 
@@ -69,21 +67,10 @@ class Options:
     """Length of a step [s]; by default the sample interval of the training flights."""
     out: Path = Path("runs/export")
     """Folder of the page."""
-    period: Annotated[float | None, RARE] = None
-    """Filter: time between two samples [s]; by default the length of a step."""
     noise: Annotated[tuple[float, ...], RARE] = ()
     """Filter: standard deviation of the measurements: position [m], quaternion, velocity [m/s] and body rates
     [rad/s], by default 0.001 0.002 0.02 0.02; or one number for all states, or one for each. A system other than a
-    rigid body has no default, and no filter without it."""
-    process: Annotated[tuple[float, ...], RARE] = ()
-    """Filter: standard deviation of the white process noise of these states [1/sqrt(s)]; by default 0 0 0.003 0.005 for
-    a rigid body, else 0."""
-    prior: Annotated[tuple[str, ...], RARE] = ()
-    """Filter: standard deviation of the change of each parameter (for a rigid body mostly of its logarithm): one number
-    for all, or for example Ix=0.3 k=0.2; by default 0.3."""
-    disturbance: Annotated[tuple[float, ...], RARE] = ()
-    """Filter: standard deviation of a constant disturbance of a rigid body: three accelerations [m/s^2] and three
-    angular accelerations [rad/s^2], by default 3 3 3 5 5 5, or one number for all; 0 for none."""
+    rigid body has no default, and no filter without it. For other settings of the filter see docs/howto/c.md."""
     state_size: Annotated[int | None, RARE] = None
     """Size of x, if the model is not of a rigid body."""
     input_size: Annotated[int | None, RARE] = None
@@ -96,11 +83,10 @@ def run(options: Options) -> int:
     if dt is None:
         raise ValueError(f"--dt is needed: {options.model} does not say how long the steps of its flights were")
     checks.positive(f"{options.model}: dt" if options.dt is None else "--dt", dt, "a positive number of seconds")
-    if "c" not in options.to and any(getattr(options, name) for name in FILTER):
-        raise ValueError(f"--{', --'.join(FILTER)} need --to c: the filter is only written as C")
-    for name in ("smooth", "period"):
-        if (value := getattr(options, name)) is not None:
-            checks.positive(f"--{name}", value)
+    if options.noise and "c" not in options.to:
+        raise ValueError("--noise needs --to c: the filter is only written as C")
+    if options.smooth is not None:
+        checks.positive("--smooth", options.smooth)
     d, m = sizes_of(field, options.state_size, options.input_size)
     sizes: dict[str, Any] = {"state_size": d, "input_size": m}
     own: dict[str, Any] = sizes | {"smooth": options.smooth}
@@ -169,51 +155,24 @@ def _response(field: AbstractVectorField, dt: float) -> list[tuple[str, Figure]]
 
 
 def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> OnlineAdaptation | str:
-    """Make the filter, or say why there is none; raise ValueError if the options do not match the model."""
+    """Make the filter, or say why there is none; raise ValueError if the noise does not match the model."""
     rigid = state_space(field) == RIGID_BODY_SPACE and d == STATE_SIZE
     try:
         ravel_parameters(field)
     except ValueError as error:  # it has no parameters
-        if any(getattr(options, name) for name in FILTER):
+        if options.noise:
             raise
         return str(error)
-    if not (sensors := options.noise or SENSOR_NOISE * rigid):
+    if not (noise := options.noise or SENSOR_NOISE * rigid):
         return "--noise must say how exactly the states are measured"
-    if options.disturbance and not rigid:
-        raise ValueError("--disturbance needs the model of a rigid body")
-    noise, process = (
-        _of_states("noise", sensors, d),
-        _of_states("process", options.process or PROCESS * rigid or (0,), d),
-    )
-    disturbance = options.disturbance or DISTURBANCE * rigid
-    if len(disturbance) not in (0, 1, 6):
-        raise ValueError(f"--disturbance must be 1 or 6 numbers, got {len(disturbance)}")
+    known = {1: 1, d: 1} | ({len(PARTS): PARTS} if d == STATE_SIZE else {})  # repeats of each number
+    if len(noise) not in known:
+        expected = f"1, {len(PARTS)} or {d}" if d == STATE_SIZE else f"1 or {d}"
+        raise ValueError(f"--noise must be {expected} numbers, got {len(noise)}")
     field = field if options.smooth is None else smoothed(field, options.smooth)
-    beyond = disturbance if any(disturbance) else 0.0
-    return OnlineAdaptation(field, options.period or dt, noise, _prior(options.prior, field), beyond, process=process)
-
-
-def _of_states(name: str, numbers: tuple[float, ...], d: int) -> tuple[float, ...]:
-    """Return a number for each of d states, or one for all."""
-    (checks.positive if name == "noise" else checks.not_negative)(f"--{name}", min(numbers))
-    if len(numbers) in (1, d):
-        return numbers
-    if d == STATE_SIZE and len(numbers) == len(PARTS):
-        return tuple(np.repeat(numbers, PARTS).tolist())
-    expected = f"1, {len(PARTS)} or {d}" if d == STATE_SIZE else f"1 or {d}"
-    raise ValueError(f"--{name} must be {expected} numbers, got {len(numbers)}")
-
-
-def _prior(words: tuple[str, ...], field: AbstractVectorField) -> float | dict[str, float]:
-    """Parse the standard deviation of each parameter; raise ValueError for a word that is not NAME=NUMBER."""
-    try:
-        if len(words) == 1 and "=" not in words[0]:
-            return float(words[0])
-        named = {name: float(value) for name, value in (word.split("=") for word in words)}
-    except ValueError:
-        raise ValueError(f"--prior must be a number, or for example Ix=0.3, got {' '.join(words)}") from None
-    groups = {name.partition("[")[0] for name in named_parameters(field)} - {"disturbance"}
-    return dict.fromkeys(groups, PRIOR) | named
+    beyond, process = (DISTURBANCE, np.repeat(PROCESS, PARTS)) if rigid else (0.0, 0.0)
+    noise = np.repeat(noise, known[len(noise)])
+    return OnlineAdaptation(field, dt, noise, disturbance=beyond, process=process)
 
 
 def _change(field: AbstractVectorField, beta: float) -> str:

@@ -51,13 +51,13 @@ def run(options: Any, path: Path, model: VehicleModel) -> int:
     for name in ("steps", "windows"):
         checks.count(f"--{name}", getattr(options, name))
     fits = {name: getattr(options, name) for name in FITS} | {"dt": options.dt or Layout.dt}
-    read = checked(options, path, model)
-    found = identified(read, layout_of(fits))
-    about = {"dt": fits["dt"], "learned_from": read.contents, "parameters": values_of(found)}
-    about |= {"identified": fits, "covariance": found.covariance}
-    save(options.output, found.field, json_value(about))
-    shown = _page(options, found, read, layout_of(fits))
-    page.write(options.out, "fit", shown, {"parameters": about["parameters"], "model": options.output})
+    read, layout = checked(options, path, model), layout_of(fits)
+    found = identified(read, layout)
+    values = values_of(found)
+    about = {"dt": layout.dt, "learned_from": read.contents, "parameters": values, "identified": fits}
+    save(options.output, found.field, json_value(about | {"covariance": found.covariance}))
+    shown = _page(options, found, read, layout, values)
+    page.write(options.out, "fit", shown, {"parameters": values, "model": options.output})
     return 0
 
 
@@ -141,8 +141,7 @@ def _learn(names: Sequence[str], without: Sequence[str]) -> str:
     return f"give --learn {' '.join(name for name in names if name not in without) or 'Ix Iy'}"
 
 
-def _page(options: Any, found: Identified, read: Read, layout: Layout) -> page.Page:
-    values = values_of(found)
+def _page(options: Any, found: Identified, read: Read, layout: Layout, values: Mapping[str, Any]) -> page.Page:
     lines = [(name, *(f"{one[end]:.4g}" for end in ENDS), one["unit"]) for name, one in values.items()]
     unseen = [name for name, one in values.items() if not np.isfinite(one["high"])]
     header = ("parameter", "estimate", "from", "to", "unit")

@@ -96,7 +96,7 @@ class OnlineAdaptation(AbstractEstimator):
     ):
         checks.positive("dt", dt, "a positive number of seconds")
         for name, numbers, check in (("noise", noise, checks.positive), ("process", process, checks.not_negative)):
-            for number in np.ravel(numbers):
+            for number in np.ravel(numbers).tolist():
                 check(name, number)
         check_callable(field)
         tuning = Tuning() if tuning is None else tuning

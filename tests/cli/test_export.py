@@ -53,11 +53,12 @@ def test_c_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, ca
 
 def test_the_filter_that_is_written_is_that_of_the_options(tmp_path, called):
     hj.save(tmp_path / "model.npz", hj.rigid_body(hj.IRIS), {"dt": 0.02})
-    options = "--double --period 0.01 --noise 0.1,0.2,0.3,0.4 --process 0.5 --prior Ix=0.6 --disturbance 0"
+    options = "--double --noise 0.1,0.2,0.3,0.4"
     _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--out", tmp_path, *options.split())
-    assert "model_adaptation adapts Ix, Iy, k, with a sample every 0.01 s" in said
-    noise, prior = np.repeat([0.1, 0.2, 0.3, 0.4], [3, 4, 3, 3]), {"Ix": 0.6, "Iy": 0.3, "k": 0.3}
-    wanted = hj.OnlineAdaptation(hj.rigid_body(hj.IRIS), 0.01, noise, prior, process=0.5)
+    assert "model_adaptation adapts Ix, Iy, k, disturbance, with a sample every 0.02 s" in said
+    noise, process = (np.repeat(each, [3, 4, 3, 3]) for each in ([0.1, 0.2, 0.3, 0.4], [0, 0, 0.003, 0.005]))
+    pushed = (3, 3, 3, 5, 5, 5)
+    wanted = hj.OnlineAdaptation(hj.rigid_body(hj.IRIS), 0.02, noise, disturbance=pushed, process=process)
     for path in export_adaptation_c(tmp_path / "wanted", wanted, name="model_adaptation", double=True):
         assert (tmp_path / path.name).read_text() == path.read_text()
 
@@ -83,12 +84,9 @@ def test_a_model_without_parameters_has_no_filter(tmp_path, called):
             for option, words, message in (
                 ("smooth", ["-1"], "--smooth must be"),
                 ("name", ["1"], "name must be a lower-case C identifier"),
-                ("period", ["1", "--to", "casadi"], "need --to c"),
+                ("noise", ["1", "--to", "casadi"], "needs --to c"),
                 ("noise", ["1", "2"], "--noise must be 1, 4 or 13 numbers, got 2"),
                 ("noise", ["0"], "--noise must be a positive finite number, got 0"),
-                ("disturbance", ["1", "2"], "--disturbance must be 1 or 6 numbers, got 2"),
-                ("prior", ["Ix"], "--prior must be a number, or for example Ix=0.3, got Ix"),
-                ("prior", ["m=1"], "prior: m: must be among Ix, Iy, k"),
             )
         ),
     ],
