@@ -13,8 +13,6 @@ from importlib.metadata import version
 import platformdirs
 import pytest
 
-pytest.register_assert_rewrite("any_system")
-
 # Without optimisation a third of the time to compile, and three quarters of that in one part, as suits one core. XLA
 # aborts on a flag that it does not know.
 QUICK = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"

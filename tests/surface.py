@@ -3,6 +3,7 @@
 import os
 import warnings
 from fractions import Fraction
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -50,23 +51,17 @@ def is_finite(tree):
     return all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array)))
 
 
-def with_number(number):
-    def spoil(array, place):
-        spoiled = np.array(array, float)
-        if spoiled.size:
-            spoiled.flat[place % spoiled.size] = number
-        return spoiled
-
-    return spoil
+def with_number(number, array, place):
+    spoiled = np.array(array, float)
+    if spoiled.size:
+        spoiled.flat[place % spoiled.size] = number
+    return spoiled
 
 
-def with_quaternion(size):
-    def spoil(array, place):
-        spoiled = np.array(array)
-        spoiled[..., 3:7] *= size
-        return spoiled
-
-    return spoil
+def with_quaternion(size, array, _):
+    spoiled = np.array(array)
+    spoiled[..., 3:7] *= size
+    return spoiled
 
 
 # Name → what becomes of a sound array.
@@ -78,10 +73,10 @@ SPOILED = {
         kind: lambda array, _, kind=kind: array.astype(kind)
         for kind in ("f8", "f2", "g", "i4", "u1", "?", "c8", "O", "U9", "S9", "M8[s]")
     },
-    **{str(number): with_number(number) for number in (np.nan, np.inf, -np.inf, 1e300, 1e25, -1e5)},
-    "masked": lambda array, place: np.ma.masked_invalid(with_number(np.nan)(array, place)),
-    "no rotation": with_quaternion(0.0),
-    "long rotation": with_quaternion(1.3),
+    **{str(number): partial(with_number, number) for number in (np.nan, np.inf, -np.inf, 1e300, 1e25, -1e5)},
+    "masked": lambda array, place: np.ma.masked_invalid(with_number(np.nan, array, place)),
+    "no rotation": partial(with_quaternion, 0.0),
+    "long rotation": partial(with_quaternion, 1.3),
     "short": lambda array, _: array[:-1],
     "narrow": lambda array, _: array[..., :-1],
     "wide": lambda array, _: np.concatenate([array, array[..., :1]], axis=-1),

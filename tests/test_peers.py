@@ -11,38 +11,16 @@ from pendulum import pendulum
 from smoke import benchmark
 
 from benchmarks.subjects import make_flights, subject
-from benchmarks.training_peers import BY_HAND, COMPILED, RIVALS, TORCHDIFFEQ, ThreeEighths
+from benchmarks.training_peers import BY_HAND, COMPILED, TORCHDIFFEQ, ThreeEighths
 from hybrid_jax.integrate import RK4, rollout
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def peers(tmp_path_factory):
-    """The report of the smallest preset, and what was printed."""
-    run, report = benchmark("training_peers", tmp_path_factory.mktemp("peers"))
-    return report, run.stdout
-
-
-def test_every_rival_is_timed_or_named_with_what_would_install_it(peers):
-    report, printed = peers
-    rows = report["rows"]
-    skipped = {row["rival"]: row["skipped"] for row in rows if "skipped" in row}
-    timed = {row["program"] for row in rows if "program" in row}
-    assert timed & skipped.keys() == set()
-    assert timed | skipped.keys() >= {*RIVALS, "ours"}
-    for rival, remedy in skipped.items():
-        assert "pip install" in remedy
-        assert rival.split(", ")[-1] in printed
-
-
-def test_rivals_are_compared_on_one_core(peers):
-    if sys.platform == "linux":
-        assert peers[0]["cores_used"] == 1
-
-
-def test_the_gradient_step_of_every_rival_is_ours(peers):
-    rows = {row["program"]: row for row in peers[0]["rows"] if "program" in row}
+def test_the_gradient_step_of_every_rival_is_ours_on_one_core(tmp_path):
+    _, report = benchmark("training_peers", tmp_path)
+    assert report["cores_used"] == 1 or sys.platform != "linux"
+    rows = {row["program"]: row for row in report["rows"] if "program" in row}
     assert rows["ours without kernels"]["difference"] < 1e-5
     pytest.importorskip("torch", reason="PyTorch is of the extra `peers`")
     for rival in (BY_HAND, COMPILED) + ((TORCHDIFFEQ,) if find_spec("torchdiffeq") else ()):

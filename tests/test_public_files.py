@@ -3,7 +3,6 @@
 The generated cases are those of test_public_surface.py, for files; test_mutations.py damages and forges sound ones.
 """
 
-import dataclasses
 import io
 import json
 import os
@@ -32,26 +31,6 @@ KEY = jax.random.key(0)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("files")
-
-
-NUMBERS = ["1.0", "-1", "nan", "inf", "0", "1e400", "9" * 5000, "[1, 1, 1]", "[-1, 1, -1, 1]", "[]"]
-OTHERS = ["[" * 3000, "[[1, 1], [1, 1], [1, 1], [1, 1]]", "1 1", '"\\ud800"', '"text"', "true", "2026-01-01", "{a = 1}"]
-TOML_VALUES = st.one_of(st.sampled_from(NUMBERS), st.sampled_from(OTHERS), st.text(max_size=20))
-TOML_KEYS = st.one_of(st.sampled_from([field.name for field in dataclasses.fields(hj.Vehicle)]), st.text(max_size=5))
-
-
-@cases(0.08)
-@given(st.dictionaries(TOML_KEYS, TOML_VALUES), st.text(max_size=8))
-def test_a_vehicle_file_is_read_or_refused(folder, values, name):
-    base = {field.name: json.dumps(getattr(hj.IRIS, field.name)) for field in dataclasses.fields(hj.Vehicle)}
-    lines = [
-        f"[{'vehicle' if len(name) < 6 else name}]",
-        *(f"{key} = {value}" for key, value in (base | values).items()),
-    ]
-    path = folder / "vehicle.toml"
-    path.write_bytes("\n".join(lines).encode("utf-8", "surrogatepass"))
-    found = outcome(hj.load_vehicle, path, naming=str(path))
-    assert found is None or found.mass > 0
 
 
 ABOUT = st.recursive(
@@ -130,10 +109,7 @@ HOSTILE = {
     "array of negative size": lambda folder: {"a.npy": npy(shape="(-1, -2)")},
     "shape that is code": lambda folder: {"a.npy": npy(shape=f"(__import__('os').mkdir('{folder / 'sprung'}'),)")},
     "array of objects": lambda folder: {"a.npy": npy(descr="|O")},
-    "array of records": lambda folder: {"a.npy": npy(descr=[("a", "<f8")])},
-    "array of text": lambda folder: {"a.npy": npy(descr="<U2")},
     "another version of .npy": lambda folder: {"a.npy": npy(version=3)},
-    "wrong magic": lambda folder: {"a.npy": b"\x94" + npy()[1:]},
     "nested header": lambda folder: {"header.json": b"[" * 100_000},
     "header with NaN": lambda folder: {"header.json": b'{"format": "%s", "metadata": NaN}'},
     "header without end": lambda folder: {"header.json": b'{"format": "%s", "metadata": '},

@@ -25,9 +25,8 @@ def test_the_example_prints_what_it_shows(tmp_path):
     expected, found = (dict(re.findall(r"(.+): (\S+) mrad", text)) for text in (shown, said))
     assert found.keys() == expected.keys()
     for name, number in found.items():
-        assert float(number) == pytest.approx(float(expected[name]), rel=0.5), (
-            name
-        )  # another processor rounds differently
+        # Another processor rounds differently.
+        assert float(number) == pytest.approx(float(expected[name]), rel=0.5), name
 
 
 def test_the_names_that_it_gives_are_there():

@@ -9,11 +9,7 @@ from pathlib import Path
 import pytest
 from browser import BROWSER, PREFIX, visit
 from smoke import LEFT, ROOT, script
-
-PACKAGES = [
-    "hybrid_jax",
-    *sorted(f"hybrid_jax.{path.parent.name}" for path in (ROOT / "hybrid_jax").glob("*/__init__.py")),
-]
+from test_documentation import PACKAGES
 
 
 @pytest.fixture(scope="module")
@@ -23,15 +19,8 @@ def site(tmp_path_factory):
     if LEFT is not None:
         return Path(LEFT) / "site"
     folder = tmp_path_factory.mktemp("site")
-    script(
-        "-m",
-        "mkdocs",
-        "build",
-        "--strict",
-        "--site-dir",
-        folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "HYBRID_JAX_EXECUTE": "false", "SITE_URL": f"http://host{PREFIX}"},
-    )
+    more = {"PYTHONPATH": str(ROOT), "HYBRID_JAX_EXECUTE": "false", "SITE_URL": f"http://host{PREFIX}"}
+    script("-m", "mkdocs", "build", "--strict", "--site-dir", folder, env=os.environ | more)
     return folder
 
 

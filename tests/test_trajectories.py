@@ -64,12 +64,6 @@ def test_concatenate_takes_any_iterable_of_windows_and_nothing_else():
             concatenate(other)
 
 
-@pytest.mark.filterwarnings("error")
-def test_dt_may_be_a_number_of_numpy():
-    dt = np.mean(np.diff(np.arange(24) / 4))
-    assert type(windows_of(*flight(), dt, steps=STEPS).dt) is float
-
-
 def test_windows_are_picked_by_slices_and_by_traced_indices():
     cut = windows()
     np.testing.assert_array_equal(cut[1:3].u, cut.u[1:3])

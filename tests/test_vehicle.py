@@ -1,6 +1,5 @@
 """A vehicle file is read, with its terms and what is to be learned, or refused in one line that says what is wrong."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -10,7 +9,7 @@ from hybrid_jax import rigid_body
 from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
-from hybrid_jax.vehicle import IRIS, load_vehicle
+from hybrid_jax.vehicle import load_vehicle
 
 GOOD = {
     "mass": "1.5",
@@ -61,12 +60,8 @@ THREE = "[0.1, -0.2], [-0.1, 0.2], [0.1, 0.2]"
 POSITIVE = ("mass", "thrust_coefficient", "torque_coefficient", "max_rotor_speed", "gravity")
 MALFORMED = {key: ["-1.0", "0", "nan", "inf", '"heavy"', "[1.0]", "true"] for key in POSITIVE} | {
     "inertia": ["[0.1, 0.1]", "[0.1, -0.1, 0.1]", "[0.1, nan, 0.1]", "0.1"],
-    "rotor_positions": [
-        *(f"[{THREE}{fourth}]" for fourth in ("", ", [0.1]", ", [nan, 0.1]", ', ["a", 0.1]')),
-        "[0.1, -0.1, 0.2, -0.2]",
-    ],
+    "rotor_positions": [f"[{THREE}{fourth}]" for fourth in ("", ", [0.1]", ", [nan, 0.1]", ', ["a", 0.1]')],
     "spin": ["[0, -1, 1, 1]", "[-1, -1, 1]", '["cw", "cw", "ccw", "ccw"]', "1"],
-    "rotor_radius": ["-0.1", "nan"],
 }
 
 
@@ -78,10 +73,6 @@ def test_malformed_constants_are_named(written, key):
 
 IMPOSSIBLE = {
     "mm": ({"rotor_positions": "[[100, -200], [-100, 200], [100, 200], [-100, -200]]"}, "rotor_positions must be in m"),
-    "cm": (
-        {"rotor_positions": "[[4, -4], [-4, 4], [4, 4], [-4, -4]]", "inertia": "[2e-5, 2e-5, 3e-5]"},
-        "inertia must",
-    ),
     "one point": ({"rotor_positions": "[[0, 0], [0, 0], [0, 0], [0, 0]]"}, "rotor_positions must not all be one point"),
     "g cm²": ({"inertia": "[2.9e5, 3.0e5, 5.5e5]"}, "inertia in kg m² (1 g cm² is 1e-7)"),
     "no body": ({"inertia": "[0.029, 0.03, 0.55]"}, "inertia must be (Ix, Iy, Iz) in kg m² of one body"),
@@ -139,8 +130,6 @@ def test_what_is_unknown_is_refused_with_what_is_known(written):
 
 
 def test_other_files_are_refused(tmp_path):
-    assert "readable TOML" in refusal(tmp_path / "none.toml")
-    assert "readable TOML" in refusal(tmp_path)
     path = tmp_path / "vehicle.toml"
     for content in (b"mass: 1.5", b"\xff\xfe"):
         path.write_bytes(content)
@@ -148,12 +137,6 @@ def test_other_files_are_refused(tmp_path):
     for content in ("[boat]\nmass = 1.5\n", "vehicle = 3\n"):
         path.write_text(content)
         assert "[vehicle]" in refusal(path)
-
-
-def test_hover_speed_carries_the_weight():
-    lift = 4 * IRIS.thrust_coefficient * IRIS.hover_speed**2
-    assert math.isclose(lift, IRIS.mass * IRIS.gravity, rel_tol=1e-12)
-    assert 655 < IRIS.hover_speed < 657  # the paper's figure is about 656 rad/s
 
 
 def test_vehicle_without_terms_is_the_rigid_body_of_the_paper(written):

@@ -21,17 +21,6 @@ def test_every_choice_has_its_default_once(choice):
     assert len({str(other) for other in changed}) == len(changed) > 2
 
 
-@pytest.mark.parametrize(("most", "sizes"), [(40, [40]), (1000, [300, 1000]), (5000, [300, 1000, 3000, 5000])])
-def test_source_flights_are_at_most_those_asked_for(most, sizes):
-    config = replace(PRESETS["smoke"], source_train=most)
-    assert [other.source_train for other in varied("source", config).values()] == sizes
-
-
-def test_initial_guess_in_a_range_ignores_perturbed_by():
-    config = replace(PRESETS["paper"], perturbed_by=0.3)
-    assert [other.perturbed_by for other in varied("start", config).values()] == [None, 0.2, 0.5, 1.0]
-
-
 def test_contradictory_values_are_refused_before_any_flight(tmp_path):
     config = replace(PRESETS["smoke"], batch_size=1, norm="none", over=("weight", "norm"), out=tmp_path)
     with pytest.raises(ValueError, match="--batch-size must be at least 2 with --norm batch"):

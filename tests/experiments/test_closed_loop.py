@@ -1,7 +1,5 @@
 """Closed-loop flight: the simulation of scenarios, and the experiment from its command line in the smallest preset."""
 
-import json
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,11 +7,8 @@ import numpy as np
 import pytest
 from choices import slow
 from rich.console import Console
-from smoke import command, experiments
 
 import hybrid_jax as hj
-from experiments.closed_loop.__main__ import head
-from experiments.closed_loop.config import ClosedLoopConfig
 from experiments.closed_loop.flights import Scenario, fly_all
 from experiments.closed_loop.models import as_stack, fused, true_field
 from experiments.closed_loop.results import Agent
@@ -89,9 +84,7 @@ def test_a_flight_of_a_scenario_equals_the_flight_alone(models, flights):
 def test_true_model_tracks_better_than_the_nominal_one_and_predicts_its_cost(flights):
     rows = {row["model"]: row for row in flights.rows()}
     assert rows["oracle"]["position_rmse"] < rows["nominal"]["position_rmse"]
-    # Plans have steps of 0.05 s, the simulation of 0.01 s.
-    assert abs(rows["oracle"]["excess"]) < 0.02
-    assert not rows["oracle"]["crashed"]
+    assert abs(rows["oracle"]["excess"]) < 0.02  # plans have steps of 0.05 s, the simulation of 0.01 s
 
 
 @pytest.mark.slow
@@ -103,35 +96,3 @@ def test_sensors_and_rotors_act_with_a_noise_for_each_seed(models, flights, tmp_
     exact, first, second = (each.states(Agent("hybrid"), i) for each, i in ((flights, 0), (found, 0), (found, 1)))
     assert np.abs(first - exact)[-1].max() > 1e-3
     assert np.abs(first - second)[-1].max() > 1e-3
-
-
-def test_hardware_is_off_by_default_and_the_controller_knows_it():
-    exact, late = ClosedLoopConfig(), ClosedLoopConfig(noise=2.0, latency=0.02, rotor_lag=0.03)
-    assert (exact.hardware(), exact.controller()) == (Hardware(), CONTROLLER)
-    assert late.hardware() == Hardware(0.02, 0.03, (0.002, 0.004, 0.04, 0.04))
-    assert late.controller().rotor_lag == 0.03
-    assert "without noise" in head(exact.described())
-    assert "Latency 20 ms, lag of the rotors 30 ms" in head(late.described())
-    with pytest.raises(ValueError, match="latency must be a multiple"):
-        ClosedLoopConfig(latency=0.015)
-
-
-@pytest.mark.slow
-def test_the_command_flies_every_model_and_a_second_run_trains_and_flies_nothing(tmp_path):
-    (run,) = experiments("closed_loop", "closed_loop", folder=tmp_path)
-    assert run.returncode == 0, run.stderr
-    first = json.loads((tmp_path / "out" / "closed_loop" / "report.json").read_text())
-    # Nominal, oracle; 20 of physics, no-physics, least squares; source and 20 of two hybrids; and six with observers.
-    # On the unchanged vehicle nominal, oracle, two sources, and three with observers.
-    assert len(first["rows"]) == 2 * (2 + 1) * 15 + 2 * 7
-    assert {claim["id"] for claim in first["claims"] + first["not_judged"]} >= {"R1a", "R6b", "R7", "R8"}
-    assert set(first["speed"]) == {"nominal physics", "hybrid, N = 20", "invariant hybrid, N = 20"}
-    less = ("--references", "hover", "--away-references", "hover", "--calls", "1")
-    again = command("closed_loop", *less, folder=tmp_path, out=tmp_path / "again")
-    assert again.returncode == 0, again.stderr
-    # Four models: pre-training, of the invariant one in three stages, and two adaptations each.
-    assert again.stderr.count("as found in the cache") == 4 * 3 + 2, again.stderr
-    assert ": training " not in again.stderr
-    assert "flights" not in again.stderr
-    second = json.loads((tmp_path / "again" / "closed_loop" / "report.json").read_text())
-    assert second["rows"] == [row for row in first["rows"] if row["reference"] == "hover"]

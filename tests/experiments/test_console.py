@@ -45,7 +45,6 @@ def test_a_terminal_shows_a_headline_one_table_and_the_reports_path(tmp_path):
     headline, *_, path = text.getvalue().splitlines()
     assert headline.startswith("With N = 100, ")
     assert path == f"Report: {tmp_path / 'report.html'}"
-    assert "±" in text.getvalue()
     assert len(text.getvalue().splitlines()) <= 24
     report.record["config"]["preset"] = "smoke"
     text = io.StringIO()
@@ -54,7 +53,6 @@ def test_a_terminal_shows_a_headline_one_table_and_the_reports_path(tmp_path):
         assert MEANINGLESS in shown
         assert not re.search(r"✓ holds|✗ fails|– undecided", shown)
     assert "±" not in text.getvalue()
-    assert text.getvalue().splitlines()[-1] == path
 
 
 def test_a_file_says_after_a_second_what_is_being_done_and_a_terminal_at_once(monkeypatch):

@@ -1,6 +1,5 @@
 """Both experiments from their command lines, in the smallest preset: their files, and the input they refuse."""
 
-import csv
 import json
 import re
 import shutil
@@ -18,18 +17,13 @@ from smoke import ROOT, experiments, refused, smallest, unbegun
 import hybrid_jax
 from experiments.external_force import sine_floor
 from experiments.paper.config import SMOKE
-from experiments.paper.lanes import physics_in, source_of
+from experiments.paper.lanes import physics_in
 from experiments.paper.study import placeholder, study
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
 from hybrid_jax.sim.flight import SplitSpec
 from hybrid_jax.vehicle import IRIS
 
 EXPERIMENTS = ("param_shift", "external_force")
-BANDS = ("low", "middle", "high")  # of altitude
-ROW = {
-    "domain": str, "model": str, "mode": str, "n_train": int, "draw": int, "seed": int, "test_mse": float, "rho": float,
-    "val_mse": float, "epochs": int, "status": str, "theta": dict | None,
-}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -45,41 +39,14 @@ def finished(folder):
     return runs
 
 
-def record(folder, name):
-    return json.loads((folder / "out" / name / "report.json").read_text())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_report_tables_and_figures_keep_their_contract(name, folder, finished):
-    report = record(folder, name)
-    # Three models: source-only once a seed, two modes for each size and seed; and the one that is solved.
-    assert len(report["rows"]) == 3 * (1 + 2) + 1
-    source = {row["model"]: row["test_mse"] for row in report["rows"] if row["mode"] == "source_only"}
-    for row in report["rows"]:
-        of_source = {"source_mse", *(f"source_mse_{band}" for band in BANDS)} if row["mode"] == "source_only" else set()
-        assert set(row) == {*ROW, *(f"test_mse_{band}" for band in BANDS), *of_source}
-        assert all(isinstance(row[key], kind) for key, kind in ROW.items()), row
-        assert set(row["theta"] or ()) == (set() if row["model"] == "no_physics" else {"Ix", "Iy", "k"})
-        assert row["n_train"] == (0 if row["mode"] == "source_only" else 20)
-        error = source[source_of(row["model"])]
-        np.testing.assert_allclose(row["rho"], (error - row["test_mse"]) / error, rtol=1e-12)
-    out = folder / "out" / name
-    with (out / "rows.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == len(report["rows"])
-    for figure in ("scores", "predictions"):
-        assert (out / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
-    assert "Traceback" not in finished[name].stderr
-
-
 @pytest.mark.slow
 def test_every_row_has_a_model_that_loads_and_predicts(folder, finished):
     at_rest = placeholder(SplitSpec(2, 5))
-    rows = record(folder, "param_shift")["rows"]
-    assert len(list((folder / "out" / "param_shift" / "models").iterdir())) == len(rows)
+    out = folder / "out" / "param_shift"
+    rows = json.loads((out / "report.json").read_text())["rows"]
+    assert len(list((out / "models").iterdir())) == len(rows)
     for row in rows:
-        name = f"{row['model']}-{row['mode']}-{row['n_train']}-seed{row['seed']}.npz"
-        model = hybrid_jax.load(folder / "out" / "param_shift" / "models" / name)
+        model = hybrid_jax.load(out / "models" / f"{row['model']}-{row['mode']}-{row['n_train']}-seed{row['seed']}.npz")
         assert model.about["test_mse"] == row["test_mse"]
         if row["theta"] is not None:
             assert {key: float(value) for key, value in physics_in(model.field).theta().items()} == row["theta"]
@@ -120,50 +87,36 @@ def test_a_signal_saves_the_state_and_a_second_run_is_refused(sent, code, folder
     shutil.rmtree(begun)
 
 
-WITH_THREE = ("--n-target", "20", "3", "--batch-size", "3")
 REFUSED = {
     "param_shift": [
         (("--preset", "nonsense"), "--preset must be one of paper, quick, smoke, got 'nonsense'"),
-        (("--n-target", "10"), "--n-target must each be at least --batch-size 20"),
-        (("--seeds", "many"), "--seeds must be an integer, got many"),
         (("--no-such-option", "1"), "--no-such-option"),
     ],
     "comparison": [
         (("--methods", "hybrid", "hybrid"), "--methods must be at least one, each different"),
         (("--residual-inputs", "no_xy"), "--methods last_layer needs a residual that sees"),
         (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
-        (WITH_THREE, "--n-target must each be more than the 9 parameters of constant"),
-        ((*WITH_THREE, "--methods", "hybrid"), "--n-target must each be more than the 3 of θ_p"),
+        (
+            ("--n-target", "20", "3", "--batch-size", "3"),
+            "--n-target must each be more than the 9 parameters of constant",
+        ),
         (("--encoding.box", "2", "0.5"), "--encoding.box must be two factors, low < high, above 0"),
-        (("--encoding.stopping.patience", "-1"), "--encoding.stopping.patience must be an integer of at least 0"),
     ],
-    "coverage": [
-        (("--seeds", "2"), "--seeds must be at least 3, got 2"),
-        (("--repeats", "0"), "--repeats must be an integer of at least 1, got 0"),
-    ],
+    "coverage": [(("--seeds", "2"), "--seeds must be at least 3, got 2")],
     "changes": [(("--n-target", "100", "300"), "--n-target must be one number")],
     "excitation": [
         (("--change", "rain"), "--change must be one of source, parameter_shift"),
-        (("--noise", "0"), "--noise must be above 0"),
         (("--seconds", "30"), "--seconds must be from 3 to 11"),
-        (("--parameters", "k", "k"), "--parameters must be at least one, each different"),
         (("--bounds.low", "0", "0", "5"), "low must be below high, else the box is empty"),
     ],
-    "online": [
-        (("--latency", "0.015"), "latency must be a multiple"),
-        (("--seconds", "1"), "--seconds must be"),
-        (("--references", "hover", "hover"), "--references must be at least one, each different"),
-    ],
+    "online": [(("--latency", "0.015"), "latency must be a multiple")],
     "reaction_diffusion": [
         (("--points", "4"), "--points must be at least 8"),
         (("--n-target", "2", "1"), "--n-target must be in ascending order"),
-        (("--steps", "0"), "--steps must be an integer of at least 1"),
     ],
     "closed_loop": [
-        (("--references", "hover", "hover"), "--references must be at least one, each different"),
         (("--references", "hover", "--away-references", "low_pass"), "--away-references must be among --references"),
         (("--seconds", "0.2"), "--seconds must be at least 1"),
-        (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
     ],
 }
 

@@ -37,9 +37,3 @@ def test_help_has_a_screen_of_options_for_users(name, monkeypatch, capsys):
     assert 4 <= sum(line.startswith("  --") for line in said) <= 12
     assert len(said) <= 50
     assert max(map(len, said)) <= 80
-
-
-def test_all_programs_are_listed(capsys):
-    import_module("experiments.__main__").main()
-    said = capsys.readouterr().out
-    assert all(f"\n{name} " in f"\n{said}" for name in ("changes", "real_flight", "identification.nanobench"))

@@ -1,13 +1,10 @@
 """Flights in which the vehicle changes in the air: the truth, the claims, and the command."""
 
-import json
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from smoke import experiments
 
 from experiments.online.agents import CHANGES, L1, NAMES, fixed_model, nominal, online, true_theta, with_theta
 from experiments.online.hover import Hovered, adaptation_of, hover
@@ -110,16 +107,3 @@ def test_hover_is_never_worse_than_without_adapting_and_a_wind_is_found(world, n
     assert found.ratios(10, 300).max() < 1.05
     assert np.abs(found.theta[0, :300, :3]).max() < 0.1  # the calm flight; gusts move parameters that they hide
     assert found.found(300).max() <= 1  # s, in calm air and in gusts
-
-
-@pytest.mark.slow
-def test_the_command_flies_and_reports(tmp_path):
-    (run,) = experiments("online", "online", folder=tmp_path)
-    assert run.returncode == 0, run.stderr
-    out = tmp_path / "out" / "online"
-    report = json.loads((out / "report.json").read_text())
-    assert len(report["rows"]) == 6
-    assert not any(row["crashed"] for row in report["rows"])
-    assert set(report["figures"]) == {"errors.png"}
-    wind_rows = {row["agent"]: row["settled"] for row in report["rows"] if row["change"] == "wind"}
-    assert wind_rows["online"] < min(1.2 * wind_rows["oracle"], wind_rows["unadapted"] / 2)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 from reports import ODD_ROWS, TRUTH, changed, make_report, make_rows
 
 from experiments.paper.claims import DOMAINS_OF
@@ -49,31 +48,6 @@ def test_errors_by_altitude_are_means_over_the_windows_of_each_band():
     np.testing.assert_array_equal(found["test_mse_high"], [2.0, 2.0])
     np.testing.assert_array_equal(found["test_mse_middle"], [5.0, math.inf])
     assert np.isnan(found["test_mse_low"]).all()
-
-
-def test_page_has_everything_once(tmp_path):
-    rows = changed(make_rows(), "no_physics", "fine_tuned", 500, test_mse=math.inf, status="diverged")
-    report = make_report(
-        rows, figures={"scores": (Figure((1, 1)), "Scores | all")}, notes=["Odd|note.", "a < b"], wind_sine_mse=1.234e-3
-    )
-    write_report(tmp_path, report)
-    page = (tmp_path / "report.md").read_text()
-    for claim in report.claims:
-        assert page.count(f"| {claim.id} | {claim.text} |") == 1
-    assert "](scores.png)" in page
-    assert "Odd\\|note." in page
-    assert "0.00123" in page
-    assert f"3 of {len(rows)} runs have a test error that is not finite" in page
-    assert "∞ (3 of 3 seeds not finite" in page
-    first, table = page.index("](scores.png)"), page.index("## Test error")
-    assert page.index("# The inertia of a quadrotor changes") < first < table < page.index("## What this means")
-    tables = [line for line in page.splitlines() if line.startswith("|")]
-    assert all(line.endswith("|") for line in tables)
-    html = (tmp_path / "report.html").read_text()
-    assert html.index("has the smallest test error") < html.index("<img") < html.index("<table")
-    assert "<details><summary>Configuration</summary>" in html
-    assert html.count("data:image/png;base64,") == 1
-    assert "a &lt; b" in html
 
 
 def test_nothing_is_written_if_a_value_has_no_json_form(tmp_path):

@@ -1,7 +1,4 @@
-"""Any system goes from fit to file: fit, adapt by every method, save, load elsewhere, predict, export.
-
-The modules that import these tests say of which systems, in a fixture `adapted`: two, as each runs on one core.
-"""
+"""Any system, also of a user's own, goes from fit to file: fit, adapt, save, load elsewhere, predict, export."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +16,7 @@ import hybrid_jax as hj
 from hybrid_jax.export import casadi_function, export_program, load_program
 from hybrid_jax.metrics import rollout_mse
 
+pytestmark = pytest.mark.slow
 # Few epochs: what is checked is that every method goes through, not how well it does.
 METHODS = {
     name: replace(method, min_epochs=1, max_epochs=5) if isinstance(method, hj.FineTune) else method
@@ -42,15 +40,16 @@ def attempt(call, *arguments, **options):
         return str(error)
 
 
-def adapted_by_all(name):
+@pytest.fixture(scope="module", params=["car", "multirotor", "circle", "ring_dense", "ring_convolution", "wrapper"])
+def adapted(request):
     """A system, its source model and what each method made of it."""
-    system = SYSTEMS[name]()
+    system = SYSTEMS[request.param]()
     source = hj.fit(system.model, system.train, system.validation, jax.random.key(0), max_epochs=60)
     results = {
         name: attempt(hj.adapt, source.best, system.target, method=method, validation=system.validation)
         for name, method in METHODS.items()
     }
-    return SimpleNamespace(name=name, system=system, source=source, results=results)
+    return SimpleNamespace(name=request.param, system=system, source=source, results=results)
 
 
 def fields(adapted):
