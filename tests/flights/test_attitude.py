@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from surface import refusal
 
 from hybrid_jax.flights import attitude
 from hybrid_jax.flights.attitude import Frames, from_euler, mean_of_held, rotation_of
@@ -81,8 +80,3 @@ def test_held_values_are_averaged_over_intervals():
     np.testing.assert_allclose(mean_of_held(np.array([0.0, 2, 3]), at, values), [[1.5], [4], [8]])
     np.testing.assert_allclose(mean_of_held(np.array([0.5, 1.0, 1.5, 3.5]), at, values), [[1], [2], [4.5], [8]])
     np.testing.assert_allclose(mean_of_held(np.array([1.2]), at, values), [[2]])
-
-
-@pytest.mark.parametrize("wrong", [("NWU", "FLU", "world"), ("ENU", "flu", "world"), ("ENU", "FLU", "earth")])
-def test_unknown_frames_are_refused(wrong):
-    refusal(lambda: Frames(*wrong), "must be one of")

@@ -45,18 +45,14 @@ def test_mapped_log_is_the_same_flight(flight, mapped, changes, motors):
         ([('world = "NED"', 'world = "SED"')], ("world must be one of ENU, NED", "'SED'")),
         ([('world = "NED", ', "")], ("[frames]", "world: must be given")),
         ([('unit = "mm"', 'unit = "ft"')], ("[position]", "m, cm, mm", "'ft'")),
-        ([('unit = "mm"', "unit = 3")], ("[position]", "unit")),
         ([(', unit = "mm"', "")], ("[position]", "unit: must be given")),
         ([('["u", "v", "w"]', '["u", "v"]')], ("[velocity]", "3 names")),
-        ([('["u", "v", "w"]', '"uvw"')], ("[velocity]", "list of 3")),
         ([('["u", "v", "w"]', '["u", "v", "u"]')], ("'u' is named twice",)),
         ([("position =", "place =")], ("'place'", "must be one of frames, time")),
         ([('unit = "deg/s"', 'unit = "deg/s", sign = 1')], ("[body_rates]", "'sign'", "must be one of")),
         ([('"rpm"', '"command"')], ("[motors]", "polynomial")),
-        ([('"rpm"', '"rpm", polynomial = [1.0]')], ("[motors]", "polynomial")),
         ([('delimiter = ";"', 'delimiter = ";;"')], ("[format]", "delimiter")),
         ([("[format]", "[format")], ("not a readable TOML",)),
-        ([("[format]", "x = " + "[" * 2000 + "\n[format]")], ("not a readable TOML",)),
     ],
 )
 def test_a_wrong_map_is_refused(flight, mapped, tmp_path, changes, words):

@@ -8,7 +8,7 @@ from recorded import DT, LOGS, SAMPLES, write
 from surface import refusal
 
 import hybrid_jax as hj
-from hybrid_jax.flights import FlightLog, cut_windows, load_logs
+from hybrid_jax.flights import FlightLog
 from hybrid_jax.vehicle import IRIS
 
 
@@ -46,9 +46,4 @@ def test_failed_checks_are_reported(tmp_path):
 def test_invalid_arguments_are_refused(tmp_path, options, message):
     write(tmp_path, LOGS[:1])
     refusal(lambda: hj.load_windows(tmp_path, IRIS, **options), message)
-
-
-def test_a_folder_without_logs_is_refused(tmp_path):
-    refusal(lambda: load_logs(tmp_path), tmp_path, "contains no flights")
-    refusal(lambda: load_logs(tmp_path / "none"), "no such folder")
-    assert len(cut_windows([*LOGS[:2], LOGS[2][:5]], 10)) == 2 * (SAMPLES - 10)
+    refusal(lambda: hj.load_windows(tmp_path / "none", IRIS), "no such folder")
