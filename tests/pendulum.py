@@ -1,5 +1,6 @@
 """A system that is not a quadrotor: a pendulum driven by a torque, with flights of it. For the tests of learning."""
 
+from dataclasses import replace
 from functools import cache
 
 import equinox as eqx
@@ -9,8 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.structure import portable
+from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.state_space import Angle, Quantity, StateSpace
 from hybrid_jax.trajectories import Trajectories
 
@@ -65,6 +68,20 @@ class Brake(AbstractVectorField):
 
     def __call__(self, x, u):
         return jnp.stack([jnp.zeros_like(x[0]), -self.damping * x[1]])
+
+
+@cache
+def hybrid(length=0.7):
+    """A pendulum beside a small network that says little."""
+    network = residual_network(2, 1, jax.random.key(0), hidden=4, norm="none")
+    return Hybrid(pendulum(length), jax.tree.map(lambda leaf: 0.1 * leaf, network))
+
+
+def flown(truth, count=40, noise=0.003, seed=0):
+    """Windows of a field with the states and inputs of a pendulum, and white noise."""
+    start = swings(count, seed=seed)
+    x = np.asarray(eqx.filter_jit(rollout_batch)(truth, start.x0, start.u, start.dt))
+    return replace(start, x=x + noise * np.random.default_rng(seed).normal(size=x.shape).astype(np.float32))
 
 
 def log_lengths(*lengths):

@@ -5,8 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pendulum import LENGTH, pendulum, swings
-from test_auto import flown, hybrid
+from pendulum import LENGTH, flown, hybrid, pendulum, swings
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation.expectation import expected_errors, lines_of
@@ -37,6 +36,8 @@ def test_the_value_is_the_rmse_over_all_blocks():
         for i, (value, low, high) in enumerate(errors.values()):
             assert value == pytest.approx(np.sqrt(squares[:, horizon, i].mean()))
             assert low < value < high
+    ((value, low, high),) = expected_errors(np.ones((1, 2, 1)), (0.1, 0.1), LINE)["0.1 s"].values()
+    assert (value, low, high) == (1.0, 0.0, np.inf)  # one block bounds nothing
 
 
 def test_a_small_rotation_is_given_in_radians():
@@ -46,11 +47,6 @@ def test_a_small_rotation_is_given_in_radians():
     found = expected_errors(squares, (0.1, 0.1), RIGID_BODY_SPACE)
     assert found["0.1 s"]["attitude"][0] == pytest.approx(0.02, rel=1e-3)
     assert "attitude 0.02 (0.02 to 0.02) rad" in lines_of(found, dict.fromkeys(found["0.1 s"], "rad"))[0]
-
-
-def test_one_block_bounds_nothing():
-    ((value, low, high),) = expected_errors(np.ones((1, 2, 1)), (0.1, 0.1), LINE)["0.1 s"].values()
-    assert (value, low, high) == (1.0, 0.0, np.inf)
 
 
 def test_errors_after_windows_that_touch_are_those_of_one_long_prediction():

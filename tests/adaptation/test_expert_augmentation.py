@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from pendulum import LENGTH, pendulum, swings
 
-from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
-from hybrid_jax.adaptation.adapting import adapt
+from hybrid_jax import Hybrid, Settings, adapt, fit, load, residual_network, rollout, save
 from hybrid_jax.adaptation.expert_augmentation import Augmentation, expert_augmented, prediction_mse
-from hybrid_jax.integrate import rollout
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.trajectories import split
 

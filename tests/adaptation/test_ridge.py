@@ -8,23 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax import Hybrid, residual_network, rollout_batch
-from hybrid_jax.adaptation.ridge import (
-    PENALTIES,
-    fit_ridge,
-    last_layer,
-    linear_residual,
-    mean_and_scale,
-    ridge,
-)
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax import IRIS, AbstractVectorField, Hybrid, Trajectories, residual_network, rollout_batch
+from hybrid_jax.adaptation.ridge import PENALTIES, fit_ridge, last_layer, linear_residual, mean_and_scale, ridge
 from hybrid_jax.dynamics.rigid_body import perturbed
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.sweep.lanes import lane, stack
-from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS
 
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
 # Compiled once for all tests: fields and windows here have few shapes, and a penalty is an array.

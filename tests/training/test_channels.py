@@ -1,8 +1,5 @@
 """Laws of the scaled, robust loss."""
 
-import dataclasses
-import json
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -68,17 +65,9 @@ def test_a_robust_loss_does_not_follow_outliers():
 
 @pytest.mark.parametrize(
     "wrong",
-    [lambda: Channel(0, 0, 1.0), lambda: Channel(0, 1, 0.0), lambda: ChannelLoss(()),
-     lambda: ChannelLoss((Channel(0, 1, 1.0),), huber=-1.0),
+    [lambda: Channel(0, 1, 0.0), lambda: ChannelLoss(()), lambda: ChannelLoss((Channel(0, 1, 1.0),), huber=-1.0),
      lambda: ChannelLoss((Channel(0, 3, 1.0),)).prepare(TRAIN, "train")],
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"stop|scale|channels|huber|train: states"):
+    with pytest.raises(ValueError, match=r"scale|channels|huber|train: states"):
         wrong()
-
-
-def test_it_can_be_found_by_what_it_is():
-    """A cache keeps an objective as JSON values, a program by its hash."""
-    objective = ChannelLoss(CHANNELS, huber=1.0)
-    assert hash(objective) == hash(dataclasses.replace(objective))
-    json.dumps(dataclasses.asdict(objective), allow_nan=False)

@@ -9,10 +9,9 @@ from pendulum import pendulum, swings
 import hybrid_jax as hj
 from hybrid_jax.integrate import RK4
 from hybrid_jax.training.gauss_newton import PENALTIES
-from hybrid_jax.training.loss import Minibatch, residual_norm, trajectory_correlation
+from hybrid_jax.training.loss import REGULARISERS, Minibatch
 
 KEY = jax.random.key(0)
-RULES = {"residual_norm": residual_norm, "trajectory_correlation": trajectory_correlation}
 
 
 def field(norm="none"):
@@ -28,7 +27,7 @@ def test_it_goes_far_below_what_adam_reaches():
     assert found.steps <= 20
 
 
-@pytest.mark.parametrize("name", sorted(RULES))
+@pytest.mark.parametrize("name", ["residual_norm", "trajectory_correlation"])
 def test_rows_are_the_root_of_the_penalty(name):
     windows = swings(3, steps=4)
     model = hj.with_scaling(field(), windows)
@@ -39,7 +38,7 @@ def test_rows_are_the_root_of_the_penalty(name):
         own.append(float(jnp.sum(jnp.square(PENALTIES[name](model, predicted, window, RK4())))))
     batch = Minibatch(*(jnp.moveaxis(jnp.asarray(a), 0, -1) for a in (windows.x0, windows.u, windows.x)), dt=windows.dt)
     predicted = jnp.moveaxis(hj.rollout_batch(model, windows.x0, windows.u, windows.dt), 0, -1)
-    assert np.mean(own) == pytest.approx(float(RULES[name](model, batch, predicted)), rel=1e-4)
+    assert np.mean(own) == pytest.approx(float(REGULARISERS[name](model, batch, predicted)), rel=1e-4)
 
 
 def test_a_heavy_penalty_silences_the_network():
@@ -54,9 +53,7 @@ def test_a_heavy_penalty_silences_the_network():
     ("options", "message"),
     [
         ({"penalty": "l1"}, "penalty must be one of residual_norm"),
-        ({"penalty": ["l1"]}, "penalty must be one of residual_norm"),
         ({"weight": -1.0}, "weight must be"),
-        ({"max_steps": 0}, "max_steps must be"),
         ({"scale": np.ones(3)}, "scale must"),
         ({"field": hj.residual_network(2, 1, KEY, hidden=400)}, "1 to 1000 parameters expected"),
         ({"field": lambda x, u: x}, "1 to 1000 parameters expected"),

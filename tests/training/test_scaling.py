@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from systems import SYSTEMS, Gain
 
 import hybrid_jax as hj
@@ -62,22 +61,6 @@ def test_networks_inside_other_fields_are_scaled():
 def test_constant_channels_are_left_their_size():
     still = eqx.tree_at(lambda w: w.u, car().train, jnp.zeros_like(car().train.u))
     assert with_scaling(car().model, still).residual.scaling.scale[-2:] == (1.0, 1.0)
-
-
-@pytest.mark.parametrize("skip", [False, True], ids=["network", "skip"])
-def test_every_way_to_evaluate_a_scaled_network_agrees(skip):
-    field = scaled().residual
-    field = LinearSkip(jax.random.normal(KEY, (6, 8)), field) if skip else field
-    x, u = car().test.x0, car().test.u[:, 0]
-    expected = jax.vmap(field)(x, u)
-    np.testing.assert_allclose(field.infer_batch(x.T, u.T).T, expected, rtol=1e-4, atol=1e-5)
-    fused = field.fuse_for_inference()
-    assert type(fused) is not type(field)
-    np.testing.assert_allclose(jax.vmap(fused)(x, u), expected, rtol=1e-4, atol=1e-5)
-    dx, du = jnp.eye(6, 8), jnp.eye(2, 8, 6)
-    for i in range(3):
-        for a, b in zip(fused.linearize(x[i], u[i], dx, du), field.linearize(x[i], u[i], dx, du), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
 def test_training_leaves_the_scaling_and_a_file_keeps_it(tmp_path):

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from pendulum import DAMPING, LENGTH, pendulum, swings
 
-from hybrid_jax import Hybrid, Settings, residual_network
+from hybrid_jax import Hybrid, Settings, Stage, fit_in_stages, rates_by_group, residual_network
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import zero_output
 from hybrid_jax.networks.standardise import with_motion, with_scaling
 from hybrid_jax.training.fitting import make_run_config
-from hybrid_jax.training.stages import Stage, cut, fit_in_stages, rates_by_group
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
 SETTINGS = Settings(batch_size=20)
@@ -66,11 +65,3 @@ def test_the_start_is_kept_where_nothing_is_better():
     assert eqx.tree_equal(state.best, exact)
     assert (state.best_epoch, state.epochs) == (0, 5)
     assert state.field.log_length != exact.log_length
-
-
-def test_short_windows_are_the_beginning_of_long_ones():
-    for name in ("x", "u"):
-        np.testing.assert_array_equal(getattr(cut(TRAIN, 3), name), getattr(TRAIN, name)[:, :3])
-    assert cut(TRAIN, None) is TRAIN
-    with pytest.raises(ValueError, match="steps must be at most the 8 intervals"):
-        cut(TRAIN, 9)
