@@ -144,10 +144,11 @@ class Auto(Method):
             rival = None if physics is None else fits(physics, learned_from, both, *options, distinct)[1]
             larger, source = replace(self, larger, own, refit, rival)
         options = *options, jnp.array(len(train))
-        found, every, starts = fits(larger, train, both, *options)
+        (found, every, starts), fitted = fits(larger, train, both, *options), None
         for _ in range(ROUNDS):
             chosen, nothing, rows = judge(field, larger, train, found, every, source, learned_from, *options[:3])
-            found = fits(larger, train, rows, *options)[0]
+            if traced or fitted is None or (rows != fitted).any():
+                found, fitted = fits(larger, train, rows, *options)[1], rows
         return conclude(self, field, larger, train, starts, (found, chosen, source, nothing), options[:3])
 
 
@@ -191,7 +192,7 @@ def _judge(
         added = network_effect(field, train, solver, scale) if has_network(field) else 0.0
         nothing = unchanged(source.own, around, added, larger, learned_from, train)
     found = posterior(around, every, start, free, sizes, nothing.apparent)
-    return found, nothing, jnp.stack([jnp.asarray(free)[found.taken], jnp.zeros(len(start), bool)])
+    return found, nothing, jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
 
 
 def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome, options) -> Solution:

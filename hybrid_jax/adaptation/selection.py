@@ -84,15 +84,18 @@ def fit_each(
     smooth, weigh = from_starts(windows, starts)
     noise = jnp.maximum(noise, jnp.square(rounding(windows, scale)) / windows.x.size)
 
-    def one(free: Bool[Array, " p"]) -> Fit:
-        held = jnp.sqrt(noise) / sizes
-        found, jacobian, r = fit_and_linearise(field, smooth, solver, max_steps, scale, free, weigh, held, distinct)
+    def one(known, free: Bool[Array, " p"]):
+        held, given = jnp.sqrt(noise) / sizes, (field, smooth, solver, max_steps, scale)
+        found, jacobian, r = fit_and_linearise(*given, free, weigh, held, distinct, known)
         equations = jax.vmap(equations_of)(jacobian, r)
         seen = has_effect(equations, windows, scale)
         theta = ravel_parameters(found.field)[0]
-        return Fit(theta, masked(equations, seen), noise, seen, found.steps, found.converged)
+        fit = Fit(theta, masked(equations, seen), noise, seen, found.steps, found.converged)
+        return (jacobian, r, ~jnp.any(free)), fit  # where nothing is fitted, these are of the start
 
-    return jax.lax.map(one, jnp.asarray(free)), starts
+    shape = jax.eval_shape(weigh, smooth.x)
+    nothing = (*(jnp.zeros((*shape.shape, *more), shape.dtype) for more in (free.shape[1:], ())), jnp.array(False))
+    return jax.lax.scan(one, nothing, jnp.asarray(free))[1], starts
 
 
 class Unchanged(NamedTuple):

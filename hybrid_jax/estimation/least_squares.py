@@ -186,6 +186,7 @@ def fit_and_linearise(
     weigh: Callable[[Float[Array, "n t d"]], Float[Array, "n s d"]] | None = None,
     held: Theta | float = 0.0,
     distinct: Int[Array, ""] | None = None,
+    known: tuple[Array, Array, Bool[Array, ""]] | None = None,
 ) -> tuple[LeastSquaresFit, Float[Array, "n s d p"], Float[Array, "n s d"]]:
     """Run `fit_free` and return also the Jacobian of the predictions and their negative errors at the end.
 
@@ -195,6 +196,7 @@ def fit_and_linearise(
         weigh: an affine map of the errors, such as `starts.projected`.
         held: error per unit of a parameter's distance from the start.
         distinct: how many windows are distinct, if the others repeat them in order.
+        known: the Jacobian and the errors at the start, and whether they are that or must be computed.
     """
     start, unravel = ravel_parameters(field)
     compressed, own = weigh is None and len(windows) > MANY, weigh or (lambda errors: errors)
@@ -236,13 +238,14 @@ def fit_and_linearise(
         return corrected(cost_and_errors, correction, z)
 
     def evaluate(tried, state: State):
-        (z, _), (_, found, jacobian, units) = tried, state.best
+        (z, _), (before, found, jacobian, units) = tried, state.best
         if compressed:
             jacobian, found = linearised(theta_at(z, units[0]))
         else:
             z, cost = bent(tried, state)
-            at, known = theta_at(z, units[0]), (jacobian, found)
-            jacobian, found = jax.lax.cond(judged(state, cost)[0], linearised, lambda _: known, at)
+            moved = jnp.where(state.steps == 0, known is None or ~known[2], jnp.any(z != before))
+            at, last = theta_at(z, units[0]), (jacobian, found)
+            jacobian, found = jax.lax.cond(judged(state, cost)[0] & moved, linearised, lambda _: last, at)
         own = _units(jacobian, found, windows, scale, free, held)
         first = state.steps == 0
         units = jax.tree.map(partial(jnp.where, first), own, units)
@@ -258,9 +261,10 @@ def fit_and_linearise(
 
     shape = jax.eval_shape(lambda: linearised(start)[1])
     zero = jnp.zeros(start.shape)  # of JAX's default precision, as all numbers of the loop but the errors are
-    nothing = jnp.zeros(shape.shape, shape.dtype), jnp.zeros((*shape.shape, start.size), shape.dtype)
+    nothing = jnp.zeros((*shape.shape, start.size), shape.dtype), jnp.zeros(shape.shape, shape.dtype)
+    jacobian, found = nothing if known is None else known[:2]
     units = jnp.zeros(start.shape, shape.dtype), jnp.ones((), shape.dtype)
-    end = minimise(evaluate, aim, begin((zero, jnp.eye(start.size)), (zero, *nothing, units)), max_steps)
+    end = minimise(evaluate, aim, begin((zero, jnp.eye(start.size)), (zero, found, jacobian, units)), max_steps)
     z, found, jacobian, (unit, _) = end.best
     mse = jnp.sum(jnp.square(found)) / (len(windows) * (windows.horizon if weigh is None else found.shape[1]))
     theta = jnp.where(jnp.isfinite(mse), theta_at(z, unit), start)
