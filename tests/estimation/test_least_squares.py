@@ -11,18 +11,12 @@ import pytest
 from pendulum import LENGTH, log_lengths, pendulum, swings
 from pushes import Push, pushes
 
-from hybrid_jax.adaptation import adapt
+from hybrid_jax import Hybrid, Settings, Trajectories, adapt, covariance_of, fit_least_squares, residual_network
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.by_product import fixed_residual
-from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation import least_squares, levenberg_marquardt
-from hybrid_jax.estimation.least_squares import fit_least_squares
-from hybrid_jax.estimation.uncertainty import covariance_of
 from hybrid_jax.integrate import RK4, rollout_batch
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.networks.mlp import residual_network
-from hybrid_jax.training import Settings
-from hybrid_jax.trajectories import Trajectories
 
 _mse, _flown = eqx.filter_jit(rollout_mse), eqx.filter_jit(rollout_batch)
 EXACT, DAMPED = swings(40, damping=0.0), swings(40)  # of a pendulum as the model has it, and of one with damping
@@ -155,20 +149,6 @@ def test_windows_with_infinite_states_are_refused_or_leave_the_start_where_nothi
     found = eqx.filter_jit(fit_least_squares)(pendulum(0.8), spoiled)
     assert not found.converged
     assert found.field.log_length == pendulum(0.8).log_length
-
-
-class Drift(AbstractVectorField):
-    """ẋ = u: nothing in it can be learned."""
-
-    def __call__(self, x, u):
-        return u
-
-
-def test_a_field_with_nothing_to_fit_is_refused():
-    windows, _ = pushes(5, 0.1)
-    for field in (Drift(), Hybrid(Drift(), Push(jnp.ones(2)))):
-        with pytest.raises(ValueError, match="Drift, has no parameter to fit"):
-            fit_least_squares(field, windows)
 
 
 def test_a_narrow_curved_valley_takes_few_steps():

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
+from hybrid_jax import StateSpaceModel, fit_records, predict, simulate
 from hybrid_jax.dynamics.hidden import Delay, Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
-from hybrid_jax.dynamics.outputs import StateSpaceModel
-from hybrid_jax.estimation.record_fit import fit_records, predict, simulate
 from hybrid_jax.estimation.record_search import check_rates
 from hybrid_jax.records import Record, on_grid
 
-NOISE, UNKNOWN = 0.01, (np.inf, np.inf)
+NOISE = 0.01
 
 
 class Pendulum(hj.AbstractVectorField):
@@ -39,14 +38,13 @@ def record(field, start, length=8.0, samples=80, seed=0, drop=(), noise=NOISE, i
     """Inputs at intervals [s], and a noisy angle at irregular times."""
     random = np.random.default_rng(seed)
     t = np.arange(0.0, length, interval)
-    inputs = Record.of("inputs", torque=(t, 2 * random.normal(size=len(t))))
+    torque = t, 2 * random.normal(size=len(t))
     times = np.sort(random.uniform(0, length, samples))
     times = times[~((times > drop[0]) & (times < drop[1]))] if drop else times
-    both = inputs.signals["torque"], np.concatenate([[0.0], times])
-    wanted = Record.of("r", torque=(both[0].t, both[0].values), angle=(both[1], 0 * both[1]))
+    times = np.concatenate([[0.0], times])
     model = StateSpaceModel(field, ("torque",), {"angle": angle}, start, np.zeros(len(start)))
-    y = simulate(model, wanted, dt=0.01)[0]["angle"][:, 0] + noise * random.normal(size=len(both[1]))
-    return Record.of(f"run {seed}", torque=(both[0].t, both[0].values), angle=(both[1], y))
+    y = simulate(model, Record.of("r", torque=torque, angle=(times, 0 * times)), dt=0.01)[0]["angle"][:, 0]
+    return Record.of(f"run {seed}", torque=torque, angle=(times, y + noise * random.normal(size=len(times))))
 
 
 def model_of(field, d=2, **options):
@@ -91,9 +89,8 @@ def test_multiple_shooting_ends_where_the_simulation_does_from_a_worse_start(rec
 
 def test_several_starts_find_the_minimum_that_one_misses(records):
     options = {"dt": 0.02, "prior": {"field.log_length": 1.0}, "noise": {"angle": NOISE}}
-    one, several = (
-        fit_records(model_of(pendulum(0.1, 0.1)), records[:1], starts=starts, **options) for starts in (1, 5)
-    )
+    far = model_of(pendulum(0.1, 0.1))
+    one, several = (fit_records(far, records[:1], starts=starts, **options) for starts in (1, 5))
     assert one.errors["angle"] > 10 * NOISE
     assert several.errors["angle"] == pytest.approx(NOISE, rel=0.2)
 
@@ -101,11 +98,10 @@ def test_several_starts_find_the_minimum_that_one_misses(records):
 def test_what_follows_is_predicted_from_what_was_seen(fitted):
     whole = record(pendulum(), (0.3, -0.5), 6.0, 60, seed=3)
     past, future = whole.part(0, 4.0), whole.part(3.9, 9.0)
-    late = future.signals["angle"].t > 4.05
-    signal = future.signals["angle"]
-    signals = future.signals | {"angle": type(signal)(signal.t[late], signal.values[late])}
-    y = predict(fitted.model, past, Record("future", signals), dt=0.02)["angle"]
-    assert np.sqrt(np.mean((y - signals["angle"].values) ** 2)) < 2 * NOISE
+    torque, signal = future.signals["torque"], future.signals["angle"]
+    t, seen = signal.t[signal.t > 4.05], signal.values[signal.t > 4.05]
+    y = predict(fitted.model, past, Record.of("future", torque=(torque.t, torque.values), angle=(t, seen)), dt=0.02)
+    assert np.sqrt(np.mean((y["angle"] - seen) ** 2)) < 2 * NOISE
 
 
 def test_a_burst_of_outliers_is_set_aside(records):
@@ -145,17 +141,16 @@ def test_what_no_output_tells_is_named_and_has_no_interval(records):
     assert np.isfinite(float(fit.intervals["damping"].high))
 
 
+def oscillator():
+    return Oscillator(jnp.log(5.0), jnp.array(-2.0), jnp.array([0.0, 0.0, 3.0]), jnp.array([4.0]), (1,))
+
+
 @pytest.mark.parametrize(
     ("part", "extra", "at", "truth"),
     [
         (Lag(jnp.log(jnp.array([0.2])), (0,)), 1, lambda part: part.log_time_constant, np.log(0.2)),
         (Delay(jnp.log(jnp.array(0.2)), (0,), 3), 3, lambda part: part.log_delay, np.log(0.2)),
-        (
-            Oscillator(jnp.log(jnp.array(5.0)), jnp.array(-2.0), jnp.array([0.0, 0.0, 3.0]), jnp.array([4.0]), (1,)),
-            2,
-            lambda part: part.log_frequency,
-            np.log(5.0),
-        ),
+        (oscillator(), 2, lambda part: part.log_frequency, np.log(5.0)),
     ],
     ids=["lag", "delay", "oscillator"],
 )
@@ -194,10 +189,8 @@ def test_linear_dynamics_are_an_oscillator():
     w, z = 5.0, np.exp(-2.0)
     a = jnp.array([[0.0, 1.0], [-(w**2), -2 * z * w]])
     linear = LinearDynamics(a, jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0]]), jnp.array([[4.0, 0.0]]), (1,))
-    drive, gain = jnp.array([0.0, 0.0, 3.0]), jnp.array([4.0])
-    oscillator = Oscillator(jnp.log(jnp.array(w)), jnp.log(jnp.array(z)), drive, gain, (1,))
     x, u = jnp.array([0.3, -0.2, 0.1, 0.4]), jnp.array([0.7])
-    one, other = (with_hidden(pendulum(), part)(x, u) for part in (linear, oscillator))
+    one, other = (with_hidden(pendulum(), part)(x, u) for part in (linear, oscillator()))
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
@@ -229,23 +222,15 @@ def test_the_mean_of_an_input_over_intervals_keeps_its_integral(between):
     assert found.u[0, 0] == pytest.approx({"held": 1.0, "averaged": -2.0, "linear": 0.5}[between])
 
 
-APART = Record.of("r", torque=([0.0, 1.0], [0, 1]), angle=([5.0, 6.0], [0, 1]))
-
-
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
         ({"records": [Record.of("r", torque=([0, 1], [0, 1]))]}, "r: has no angle; it has torque"),
-        ({"records": []}, "records: at least one is needed"),
         ({"prior": {"field.mass": 1.0}}, "prior: the model has no field.mass"),
         ({"between": "cubic"}, "between must be one of held, linear, averaged, got 'cubic'"),
-        ({"robust": -1.0}, "robust must be a positive number"),
         ({"dt": 0.0}, "dt must be a positive number of seconds"),
         ({"segment": 9.0}, r"segment must be at most the .* s of the longest record, got 9"),
-        (
-            {"records": [Record.of("r", torque=([0.0, 1.0], [0, 1]), angle=([5.0, 6.0], [0, 1]))]},
-            "r: torque, angle share less",
-        ),
+        ({"records": [Record.of("r", torque=([0, 1], [0, 1]), angle=([5, 6], [0, 1]))]}, "torque, angle share less"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(records, wrong, said):
@@ -254,20 +239,17 @@ def test_what_is_wrong_is_said_in_a_line(records, wrong, said):
         fit_records(model_of(pendulum()), **options)
 
 
-@pytest.mark.parametrize(("factor", "said"), [(180 / np.pi, True), (1e-3, True), (1.0, False)])
-def test_a_rate_in_another_unit_than_its_angle_is_said(records, factor, said):
+@pytest.mark.parametrize("factor", [180 / np.pi, 1e-3])
+def test_a_rate_in_another_unit_than_its_angle_is_said(factor):
     outputs = {"angle": angle, "rate": lambda x, u: x[1]}
     model = StateSpaceModel(pendulum(), ("torque",), outputs, (1.0, 0.0), (0.1, 0.1))
     t = np.arange(0.0, 4.0, 0.05)
-    made = Record.of("r", torque=(t, 0 * t), angle=(t, t), rate=(t, t))
-    y = simulate(model, made, dt=0.05)[0]
+    y = simulate(model, Record.of("r", torque=(t, 0 * t), angle=(t, t), rate=(t, t)), dt=0.05)[0]
     noisy = y["angle"] + 0.02 * np.random.default_rng(0).normal(size=y["angle"].shape)
-    made = Record.of("r", torque=(t, 0 * t), angle=(t, noisy), rate=(t, factor * y["rate"]))
-    if said:
-        with pytest.raises(ValueError, match=r"r: rate is (56|0\.0009).* times the rate of angle: check their units"):
-            fit_records(model, [made], dt=0.05)
-    else:
-        check_rates(model, [made])
+    right, wrong = (Record.of("r", torque=(t, 0 * t), angle=(t, noisy), rate=(t, f * y["rate"])) for f in (1, factor))
+    check_rates(model, [right])
+    with pytest.raises(ValueError, match=r"r: rate is (56|0\.0009).* times the rate of angle: check their units"):
+        fit_records(model, [wrong], dt=0.05)
 
 
 class Turntable(hj.AbstractVectorField):

@@ -7,18 +7,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from choices import PAIRS
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.dynamics.composition import Frozen, Hybrid
 from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, Terms
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
 from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.state import QUATERNION, VELOCITY
-from hybrid_jax.vehicle import IRIS
 
 KEY = np.zeros(2, np.uint32)  # jax.random.key(0)
 SCALING = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
@@ -46,6 +45,11 @@ def moved(field, size=0.1):
 
 def network(**options):
     return moved(multirotor_network(IRIS, KEY, hidden=5, scaling=SCALING, **options))
+
+
+def solved(x, u):
+    """A function that calls LAPACK."""
+    return jnp.linalg.solve(jnp.eye(13) + jnp.outer(x, x), x)
 
 
 def plain(x, u):
@@ -87,6 +91,11 @@ FIELDS = {
     "one's own": lambda: Dragged(body(), jnp.asarray(0.3)),
     "function": lambda: plain,
 }
+
+
+SEEN = [f"residual from {inputs} to {outputs}" for inputs, outputs in (("all", "all"), ("body", "motion"))]
+SLOW = [name for name in FIELDS if name.startswith("residual") and name not in SEEN]
+SOME_SLOW = [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in FIELDS]
 
 
 @cache

@@ -7,7 +7,6 @@ QEMU counts instructions and knows nothing of cycles.
 import shutil
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from compiled import C99, Library, needs_compiler, run
@@ -15,7 +14,6 @@ from fields import KEY, samples
 
 import hybrid_jax as hj
 from hybrid_jax.export import export_adaptation_c, export_c
-from hybrid_jax.export.program import program_of
 
 BOARD = Path(__file__).parent / "board"
 TOOLS = ("arm-none-eabi-gcc", "qemu-system-arm")
@@ -40,13 +38,11 @@ def paper(tmp_path_factory):
 def header(x, u):
     """The samples as C."""
 
-    def table(rows):
-        return ", ".join("{" + ", ".join(f"{one:.9e}f" for one in row) + "}" for row in rows.astype(np.float32))
-
-    tables = (
-        f"static const float {name}[][{rows.shape[1]}] = {{{table(rows)}}};\n" for name, rows in (("X", x), ("U", u))
-    )
-    return f"enum {{ SAMPLES = {len(x)} }};\n" + "".join(tables)
+    text = f"enum {{ SAMPLES = {len(x)} }};\n"
+    for name, rows in (("X", x), ("U", u)):
+        table = ", ".join("{" + ", ".join(f"{one:.9e}f" for one in row) + "}" for row in rows.astype(np.float32))
+        text += f"static const float {name}[][{rows.shape[1]}] = {{{table}}};\n"
+    return text
 
 
 def target(processor):
@@ -54,37 +50,9 @@ def target(processor):
     return (f"-mcpu={processor}", f"-mfpu={BOARDS[processor][0]}", "-mfloat-abi=hard", "-mthumb", "-O2")
 
 
-def flash_of(compiled):
-    """Bytes of flash."""
-    return int(run("arm-none-eabi-size", compiled).splitlines()[1].split()[0])
-
-
-@pytest.mark.slow
-def test_casadis_generator_needs_more_flash(tmp_path, monkeypatch):
-    """Its matrix graph of a step and its Jacobians, beside all that we write; it generates into the working folder."""
-    ca = pytest.importorskip("casadi", reason="casadi is an extra")
-    from hybrid_jax.codegen.translation import Entries
-    from hybrid_jax.export.casadi_operations import CasadiTranslation
-
-    with jax.enable_x64(True):
-        likes = [jax.ShapeDtypeStruct((size,), float) for size in (13, 4)]
-        program = jax.make_jaxpr(program_of(HYBRID, likes, 0.01, None))(*likes)
-    x, u = ca.MX.sym("x", 13), ca.MX.sym("u", 4)
-    arguments = [Entries(one, (one.numel(),)) for one in (x, u)]
-    (step,) = map(ca.densify, CasadiTranslation().run(program, arguments))
-    monkeypatch.chdir(tmp_path)
-    flash = {}
-    for name, results in {"step": [step], "both": [step, ca.jacobian(step, x), ca.jacobian(step, u)]}.items():
-        generator = ca.CodeGenerator(name, {"casadi_real": "float", "casadi_int": "int"})
-        generator.add(ca.Function(name, [x, u], results))
-        generator.generate()
-        run("arm-none-eabi-gcc", "-std=c99", *target("cortex-m4"), "-c", f"{name}.c", "-o", f"{name}.o")
-        flash[name] = flash_of(f"{name}.o")
-    source = export_c(tmp_path, HYBRID, 0.01, name="ours")[1]
-    run("arm-none-eabi-gcc", *C99, *target("cortex-m4"), "-c", source, "-o", "ours.o")
-    flash["ours"] = flash_of("ours.o")
-    print(f"\nflash [B]: {flash}")
-    assert flash["ours"] < flash["both"] / 2
+def sizes_of(compiled):
+    """Bytes of flash, and of the two kinds of static RAM."""
+    return map(int, run("arm-none-eabi-size", compiled).splitlines()[1].split()[:3])
 
 
 @pytest.mark.parametrize("processor", BOARDS)
@@ -95,8 +63,7 @@ def test_it_fits_and_finds_the_same(processor, paper):
     link = ("-T", BOARD / "board.ld", "--specs=rdimon.specs", "-lm", "-o", program)
     run("arm-none-eabi-gcc", *target(processor), "-I", source.parent, BOARD / "main.c", compiled, *link)
 
-    sections = run("arm-none-eabi-size", compiled).splitlines()[1].split()
-    flash, *ram = (int(one) for one in sections[:3])
+    flash, *ram = sizes_of(compiled)
     assert flash + ram[0] <= FLASH
     assert sum(ram) == 0  # all is constant, or on the stack
 
@@ -123,7 +90,7 @@ def test_the_filter_of_physics_fits_on_a_stack(tmp_path):
     source = export_adaptation_c(tmp_path, adaptation)[1]
     compiled = tmp_path / "filter.o"
     run("arm-none-eabi-gcc", *C99, *target("cortex-m4"), "-fstack-usage", "-c", source, "-o", compiled)
-    flash, *ram = (int(one) for one in run("arm-none-eabi-size", compiled).splitlines()[1].split()[:3])
+    flash, *ram = sizes_of(compiled)
     stack = max(int(line.split("\t")[1]) for line in compiled.with_suffix(".su").read_text().splitlines())
     print(f"\nfilter of physics: flash {flash} B, static RAM {sum(ram)} B, {stack} B of stack")
     assert sum(ram) == 0

@@ -121,17 +121,6 @@ def test_c_is_the_filter(precise, allowed, hypotheses, tmp_path):
         assert error(unravel(jnp.asarray(flown, float)), state) < 10 * allowed
 
 
-def test_c_hardly_grows_with_causes(tmp_path):
-    """One function for all hypotheses: three more hypotheses add a few numbers, not their filters."""
-    more = tuple(hj.Hypothesis(name, {name: 0.3}) for name in ("Ix", "Iy", "disturbance[wz]"))
-
-    def size(name, hypotheses):
-        adaptation = OnlineAdaptation(hj.rigid_body(hj.IRIS), DT, 1e-3, disturbance=2.0, hypotheses=hypotheses)
-        return export_adaptation_c(tmp_path, adaptation, name=name)[1].stat().st_size
-
-    assert size("six", HYPOTHESES + more) < 1.2 * size("three", HYPOTHESES)
-
-
 def test_names_of_a_model_cannot_leave_their_comment():
     hostile = {"names": ("k*/ int main(void) {} /*", "disturbance[vx]", "β\n#error"), "dt": DT}
     state = {"trusted": jnp.zeros(1), "*/\\\n": jnp.zeros(2)}

@@ -4,12 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from choices import FEW
-from fields import FIELDS, KEY, SIZES, body, double, field_of, samples
+from fields import KEY, SIZES, SOME_SLOW, body, double, field_of, samples, solved
+from surface import refusal
 
-from hybrid_jax import Hybrid, residual_network
+from hybrid_jax import Hybrid, residual_network, rollout
 from hybrid_jax.export import casadi_function
-from hybrid_jax.integrate import rollout
 from hybrid_jax.networks import smoothed
 
 ca = pytest.importorskip("casadi")
@@ -27,11 +26,7 @@ def jacobian(function):
     return ca.Function("jacobian", [x, u], [ca.jacobian(function(x, u), ca.vertcat(x, u))])
 
 
-FEW_RESIDUALS = [f"residual from {inputs} to {outputs}" for inputs, outputs in FEW]
-SLOW = [name for name in FIELDS if name.startswith("residual") and name not in FEW_RESIDUALS]
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in FIELDS])
+@pytest.mark.parametrize("name", SOME_SLOW)
 def test_it_has_the_values_and_the_derivatives_of_the_field(name):
     """The derivatives along a random direction: one wrong entry of the Jacobian shows in it."""
     function = casadi_function(field_of(name), **SIZES)
@@ -42,15 +37,6 @@ def test_it_has_the_values_and_the_derivatives_of_the_field(name):
             value, slope = jax.jvp(field, (jnp.asarray(x), jnp.asarray(u)), (jnp.asarray(dx), jnp.asarray(du)))
             close(function(x, u), value)
             close(slopes(x, u) @ np.concatenate([dx, du]), slope)
-
-
-@pytest.mark.parametrize("name", ["hybrid, norm batch", "one's own"])
-def test_a_step_is_an_interval_of_a_rollout(name):
-    function = casadi_function(field_of(name), 0.02)
-    with jax.enable_x64(True):
-        field = double(field_of(name))
-        for x, u in zip(*samples(2), strict=True):
-            close(function(x, u), rollout(field, x, u[None], 0.02)[0])
 
 
 def test_inputs_and_outputs_have_names_and_sizes_of_another_system_too():
@@ -100,10 +86,6 @@ def test_a_field_of_one_s_own_may_use_what_casadi_has():
             np.testing.assert_allclose(np.asarray(function(x, u)).ravel(), expected, rtol=1e-12)
 
 
-def solved(x, u):
-    return jnp.linalg.solve(jnp.eye(13) + jnp.outer(x, x), x)
-
-
 def looked_up(x, u):
     return x * jnp.arange(3.0)[jnp.clip(x[0].astype(int), 0, 2)]
 
@@ -121,14 +103,5 @@ def test_an_operation_that_casadi_has_not_is_named(field, said):
 
 
 def test_what_makes_no_sense_is_refused():
-    for dt in (0.0, -1.0, float("nan")):
-        with pytest.raises(ValueError, match="dt must be a positive"):
-            casadi_function(body(), dt)
-    with pytest.raises(ValueError, match="name must be one"):
-        casadi_function(body(), name="1 f")
-    with pytest.raises(ValueError, match="field: ResidualNetwork does not take"):
-        casadi_function(residual_network(2, 1, KEY), **SIZES)
-    with pytest.raises(ValueError, match="state_size must be given: function does not know its size"):
-        casadi_function(solved)
-    with pytest.raises(ValueError, match="state_size must be"):
-        casadi_function(Hybrid(body(), body()), state_size=0)
+    refusal(lambda: casadi_function(body(), name="1 f"), "name must be one")
+    refusal(lambda: casadi_function(solved), "state_size must be given: function does not know its size")

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import surface
-from fields import SIZES, body, field_of, samples
+from fields import SIZES, body, field_of, samples, solved
 
 from hybrid_jax import rollout_batch, save
 from hybrid_jax.export import export_program, load_program
@@ -14,7 +14,6 @@ from hybrid_jax.export.stablehlo import FORMAT
 from hybrid_jax.io.archive import save_archive
 
 KINDS = ("rigid body", "multirotor, per rotor", "hybrid, norm batch", "residual from body_motion to motion", "hold")
-HYBRID = "hybrid, norm batch"
 
 
 @pytest.fixture
@@ -52,12 +51,6 @@ def test_a_program_of_steps_is_an_interval_of_a_rollout_for_a_batch_of_any_lengt
         close(program(x, u), rollout_batch(field_of(name), x, u[:, None], 0.02)[:, 0])
 
 
-def test_it_may_be_part_of_a_compiled_program(path):
-    export_program(path, body())
-    program, (x, u) = load_program(path), (part[0] for part in samples())
-    close(jax.jit(lambda x, u: 2 * program(x, u))(x, u), 2 * program(x, u))
-
-
 def test_in_double_precision_it_stays_single(path):
     single, (x, u) = body(), (part[0] for part in samples())
     with jax.enable_x64(True):
@@ -66,56 +59,22 @@ def test_in_double_precision_it_stays_single(path):
 
 
 def test_a_file_for_two_platforms_says_so(path):
-    export_program(path, field_of(HYBRID), 0.01, platforms=("cpu", "cuda"))
+    export_program(path, field_of("hybrid, norm batch"), 0.01, platforms=("cpu", "cuda"))
     assert load_program(path).platforms == ("cpu", "cuda")
 
 
 def test_equal_fields_are_equal_files_that_name_no_file_of_the_writer(path, tmp_path):
     for name in ("one.npz", "two.npz"):
-        export_program(tmp_path / name, field_of(HYBRID), 0.01, batched=True)
+        export_program(tmp_path / name, field_of("hybrid, norm batch"), 0.01, batched=True)
     content = (tmp_path / "one.npz").read_bytes()
     assert content == (tmp_path / "two.npz").read_bytes()
     assert b".py" not in content.replace(b"exported.npy", b"")
 
 
-@pytest.mark.parametrize(
-    ("batched", "shapes", "said"),
-    [
-        (False, [((12,), (4,)), ((13,), (5,)), ((2, 13), (2, 4)), ((), ())], r"x \(13,\) and u \(4,\) expected"),
-        (True, [((13,), (4,)), ((0, 13), (0, 4)), ((2, 13), (3, 4))], r"x \(b, 13\) and u \(b, 4\) expected"),
-    ],
-)
-def test_shapes_that_are_not_the_program_s_are_refused(batched, shapes, said, path):
-    export_program(path, body(), batched=batched)
-    for x, u in shapes:
-        with pytest.raises(ValueError, match=f"{said}, got"):
-            load_program(path)(np.ones(x), np.ones(u))
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"state_size": 2}, "field: RigidBody does not take"),
-        ({"state_size": 0}, "state_size must be"),
-        ({"input_size": 1.5}, "input_size must be"),
-        ({"platforms": ("abacus",)}, "platforms must be a tuple of some of cpu"),
-        ({"platforms": ()}, "platforms must be"),
-        ({"about": {"a": np.ones(2)}}, "must be JSON"),
-    ],
-    ids=str,
-)
-def test_what_makes_no_program_is_refused(options, said, path):
-    assert said in refusal(path, lambda path: export_program(path, body(), **options))
-    assert "dt must be a positive" in refusal(path, lambda path: export_program(path, body(), -0.1))
-    assert not path.exists()
-
-
-def solved(x, u):
-    return jnp.linalg.solve(jnp.eye(13) + jnp.outer(x, x), x)
-
-
-def test_a_program_that_calls_a_library_is_not_written(path):
+def test_what_makes_no_program_is_refused(path):
+    assert "must be JSON" in refusal(path, lambda path: export_program(path, body(), about={"a": np.ones(2)}))
     assert "calls lapack" in refusal(path, lambda path: export_program(path, solved, **SIZES))
+    assert not path.exists()
 
 
 def forged(path, function, *shapes, **metadata):
@@ -139,8 +98,6 @@ def test_a_forged_program_is_refused(path):
     d, m = (13,), (4,)
     assert "calls lapack" in refusal(forged(path, solved, d, m))
     assert "the program maps" in refusal(forged(path, lambda x, u: x[:2], d, m))
-    assert "the program maps" in refusal(forged(path, lambda x, u: (x,), d, m))
-    assert "the program maps" in refusal(forged(path, lambda x, u: x, (3, *d), (3, *m)))
     assert "not a program" in refusal(forged(path, lambda x: x, d))
     assert "dt must be" in refusal(forged(path, lambda x, u: x, d, m, dt="0.01"))
     assert "not a program" in refusal(forged(path, lambda x, u: x, d, m, about=3))
