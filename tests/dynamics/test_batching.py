@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from evaluations import infer_batch, train_batch
 
+from hybrid_jax import RK4, residual_network
 from hybrid_jax.dynamics import base
-from hybrid_jax.dynamics.batching import like
 from hybrid_jax.dynamics.composition import Frozen, Hybrid, check_batch_norm
-from hybrid_jax.integrate import RK4
-from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.rollouts import rollout_minibatch
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
@@ -113,11 +111,3 @@ def test_a_function_is_a_field():
     np.testing.assert_allclose(value, field(x[:, 0], u[0, :, 0]), rtol=1e-12)
     np.testing.assert_array_equal(slope, -np.eye(STATES))
     assert base.as_field(field).update_running_stats(x, u[0]) is base.as_field(field).fuse_for_inference() is field
-
-
-@pytest.mark.parametrize("start", [jnp.zeros(3), jnp.int32(2), jax.random.key(0)], ids=["zeros", "count", "key"])
-def test_what_a_loop_begins_with_is_as_it_was_and_mapped(start):
-    assert eqx.tree_equal(like(start, jnp.asarray(jnp.nan)), start)
-    jax.vmap(lambda leader: start, out_axes=None)(jnp.arange(5.0))
-    with pytest.raises(ValueError, match="out_axes"):
-        jax.vmap(lambda leader: like(start, leader), out_axes=None)(jnp.arange(5.0))

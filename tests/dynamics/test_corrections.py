@@ -12,7 +12,6 @@ from hybrid_jax.dynamics.disturbance import with_disturbance, without_zeros
 from hybrid_jax.dynamics.rigid_body import corrected, uncorrected
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.sim.domain import SOURCE
-from hybrid_jax.state import BODY_RATES, VELOCITY
 
 BODY = hj.rigid_body(hj.IRIS)
 U = jnp.array([640.0, 660.0, 650.0, 630.0])
@@ -41,13 +40,6 @@ def test_an_efficiency_is_a_factor_on_thrust_and_reaction_torque():
     weak = changed((0.85, 1, 1, 1))
     slower = U.at[0].multiply(np.sqrt(0.85))  # both go with the square of the speed
     np.testing.assert_allclose(weak(moving(), U), BODY(moving(), slower), rtol=1e-6, atol=1e-6)
-
-
-def test_drag_slows_along_the_axes_of_the_body():
-    dragged = changed(drag=0.3)
-    change = dragged(moving(), U) - BODY(moving(), U)
-    np.testing.assert_allclose(change[VELOCITY], -0.3 * moving()[VELOCITY], atol=1e-6)  # alike along all axes
-    np.testing.assert_array_equal(change[BODY_RATES], 0.0)
 
 
 @pytest.mark.parametrize(
