@@ -21,20 +21,6 @@ FIELDS = {"physics": PHYSICS, "network": NETWORK, "hybrid": Hybrid(PHYSICS, NETW
 _direct = eqx.filter_jit(rollout_batch)
 
 
-def flight(windows=3, steps=5):
-    rng = np.random.default_rng(0)
-    x0 = np.zeros((windows, 13), np.float32)
-    x0[:, 3], x0[:, 7:] = 1, rng.normal(size=(windows, 6))
-    return x0, np.asarray(rng.uniform(500, 800, (windows, steps, 4)), np.float32)
-
-
-@pytest.fixture
-def file(tmp_path):
-    path = tmp_path / "model.npz"
-    save(path, FIELDS["hybrid"], {"n_train": 100})
-    return path
-
-
 def refusal(path):
     return surface.refusal(lambda: load(path), path)
 
@@ -46,7 +32,9 @@ def test_a_loaded_model_is_the_saved_one(name, tmp_path):
     assert eqx.tree_equal(model.field, FIELDS[name])
     assert type(model.field) is type(FIELDS[name])
     assert model.about == {"seed": 3, "test_mse": 0.5}
-    x0, u = flight()
+    rng = np.random.default_rng(0)
+    x0, u = np.zeros((3, 13), np.float32), np.asarray(rng.uniform(500, 800, (3, 5, 4)), np.float32)
+    x0[:, 3], x0[:, 7:] = 1, rng.normal(size=(3, 6))
     predicted = model.predict(x0, u, 0.01)
     np.testing.assert_array_equal(predicted, _direct(FIELDS[name], x0, u, 0.01))
     # A single window sums in another order.
@@ -63,37 +51,11 @@ def test_scalars_and_precision_are_kept(tmp_path):
         assert found == field.log_length
 
 
-def test_equal_models_are_equal_files(file, tmp_path):
-    save(tmp_path / "again.npz", FIELDS["hybrid"], {"n_train": 100})
-    assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
-
-
-def test_a_flipped_bit_never_changes_a_model(file):
-    """Every 37th bit, and all of the zip's directory at the end: refused in one line, or without effect."""
-    content = file.read_bytes()
-    directory = 8 * content.index(b"PK\x01\x02")
-    unnoticed = 0
-    for bit in [*range(0, directory, 37 * 8 + 1), *range(directory, 8 * len(content), 29)]:
-        flipped = bytearray(content)
-        flipped[bit // 8] ^= 1 << bit % 8
-        file.write_bytes(flipped)
-        try:
-            model = load(file)
-        except ValueError:
-            continue
-        unnoticed += 1
-        assert eqx.tree_equal(model.field, FIELDS["hybrid"])
-        assert model.about == {"n_train": 100}
-    assert unnoticed > 0  # bits of the zip's clock and attributes change nothing
-
-
 def test_other_files_are_refused(tmp_path):
     assert "no such file" in refusal(tmp_path / "none.npz")
     other = tmp_path / "other.npz"
     save_archive(other, "hybrid_jax dataset 1", {}, {"x": np.zeros(3)})
     assert "hybrid_jax model" in refusal(other)
-    other.write_text("hello")
-    assert "not a hybrid_jax model" in refusal(other)
     for metadata in ({}, [1], {"field": 3, "about": {}}, {"field": {"array": "gone"}, "about": {}}):
         save_archive(other, models.FORMAT, metadata, {})
         assert "not a complete model" in refusal(other)
@@ -108,8 +70,3 @@ def test_a_vehicle_in_a_file_is_checked(tmp_path):
     arrays = {f"field/deviations/{name}": to_numpy(value) for name, value in PHYSICS.deviations.items()}
     save_archive(tmp_path / "model.npz", models.FORMAT, {"field": tree, "about": {}}, arrays)
     assert "mass must be a positive" in refusal(tmp_path / "model.npz")
-
-
-def test_about_is_a_mapping(tmp_path):
-    with pytest.raises(ValueError, match=r"^about must be a Mapping, got 'hello'"):
-        save(tmp_path / "model.npz", pendulum(), about="hello")
