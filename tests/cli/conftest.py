@@ -1,10 +1,6 @@
 """The script in this process, and as installed from the wheel; logs of every format; a browser that looks at pages."""
 
-import html
-import json
 import os
-import re
-import shutil
 import subprocess
 import sys
 import venv
@@ -13,6 +9,7 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from browser import BROWSER, visit
 from cli_logs import READING, of_every_format, simulated, written
 from packaging.version import Version
 from smoke import ROOT
@@ -23,16 +20,12 @@ from hybrid_jax.cli import main
 from hybrid_jax.sim import PARAMETER_SHIFT, SOURCE
 from hybrid_jax.vehicle import IRIS
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-# Errors are collected; then all is unfolded, and what is there is written down.
-BEGIN = "<script>const wrong = []; onerror = (...error) => wrong.push(String(error)); console.error = onerror</script>"
-END = """<script>addEventListener("load", () => {
-  for (const each of document.querySelectorAll("details")) each.open = true
-  const hidden = [...document.images].filter(one => one.naturalWidth * one.getBoundingClientRect().height == 0).length
-  const wide = document.documentElement.scrollWidth > innerWidth
-  parent.seen[name] = {wrong, images: document.images.length, hidden, wide}
-})</script>"""
-WIDTHS = (400, 1400)
+# All is unfolded before it is measured.
+MEASURE = """(page, window) => {
+  for (const each of page.querySelectorAll("details")) each.open = true
+  const hidden = [...page.images].filter(one => one.naturalWidth * one.getBoundingClientRect().height == 0).length
+  return {images: page.images.length, hidden, wide: page.documentElement.scrollWidth > window.innerWidth}
+}"""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -61,16 +54,12 @@ def seen(tmp_path):
     def look(pages):
         if BROWSER is None:
             pytest.skip("no Chromium")
-        frames = ""
-        for name, width in ((name, width) for name in pages for width in WIDTHS):
-            page = pages[name].replace("<head>", f"<head>{BEGIN}").replace("</body>", f"{END}</body>")
-            frames += f'<iframe name="{name} {width}" width={width} height=800 srcdoc="{html.escape(page)}"></iframe>'
-        done = """addEventListener("load", () => document.body.innerHTML = `<pre>${JSON.stringify(seen)}</pre>`)"""
-        (tmp_path / "all.html").write_text(f"<body><script>var seen = {{}}; {done}</script>{frames}</body>")
-        options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'browser'}"]
-        run = [BROWSER, *options, "--dump-dom", (tmp_path / "all.html").as_uri()]
-        found = subprocess.run(run, capture_output=True, text=True, timeout=300, check=True).stdout
-        return json.loads(html.unescape(re.findall(r"<pre>(.*?)</pre>", found, flags=re.DOTALL)[-1]))
+        (tmp_path / "browser").mkdir()
+        for name, page in {"404": "", **pages}.items():
+            (tmp_path / f"{name}.html").write_text(page)
+        found, said = visit(tmp_path, [f"{name}.html" for name in pages], [400, 1400], MEASURE, tmp_path / "browser")
+        assert said == []
+        return {(page.removesuffix(".html"), width): shown for page, width, shown in found}
 
     return look
 

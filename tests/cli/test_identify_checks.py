@@ -28,17 +28,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
-def ended(called):
-    """The exit code, and the lines on stderr."""
-
-    def end(*arguments):
-        code, _, said = called("fit", "logs", "-o", "model.npz", "--vehicle", "v.toml", *arguments)
-        return code, said.splitlines()
-
-    return end
-
-
 def test_a_check_that_fails_ends_in_what_to_type(folder):
     write(folder / "logs", [SWAPPED])
     (folder / "logs" / "notes.txt").write_text("windy")
@@ -48,15 +37,11 @@ def test_a_check_that_fails_ends_in_what_to_type(folder):
     assert "nothing was identified" in failed.value.args[-1]
 
 
-MENDS = {"anyway": ({"anyway": True}, ["motor order"]), "mended": ({"motor_order": (3, 0, 1, 2)}, [])}
-
-
-@pytest.mark.parametrize(("more", "failed"), MENDS.values(), ids=MENDS)
+@pytest.mark.parametrize(("more", "failed"), [({"anyway": True}, 1), ({"motor_order": (3, 0, 1, 2)}, 0)], ids=str)
 def test_it_goes_on_when_asked_or_mended(folder, more, failed):
     write(folder / "logs", [SWAPPED])
     read = checked(Options(folder / "logs", folder / "m.npz", **more), folder / "v.toml", VehicleModel(IRIS))
-    lines = read.failed
-    assert [line.split(": ")[1].split(" against")[0] for line in lines] == failed
+    assert len(read.failed) == failed
 
 
 def test_a_log_that_fails_is_left_out_where_another_passes(folder):
@@ -67,10 +52,11 @@ def test_a_log_that_fails_is_left_out_where_another_passes(folder):
 
 
 @pytest.mark.parametrize(("learn", "rest"), [("Ix,curve,delay", "Ix"), ("curve", "Ix Iy")])
-def test_what_speeds_do_not_tell_is_refused(folder, ended, learn, rest):
+def test_what_speeds_do_not_tell_is_refused(folder, called, learn, rest):
     """It vanished from the result."""
     write(folder / "logs", LOGS[:1])
-    code, (line,) = ended("--learn", learn)
+    code, _, said = called("fit", "logs", "-o", "model.npz", "--vehicle", "v.toml", "--learn", learn)
+    (line,) = said.splitlines()
     assert code == 2
     assert line.startswith("hybrid-jax fit: v.toml: learn: curve")
     assert line.endswith(f"has only rotor speeds: give --learn {rest}")

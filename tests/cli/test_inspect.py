@@ -18,7 +18,6 @@ from hybrid_jax.cli.vehicle_text import vehicle_text
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
-from hybrid_jax.state import STATE_NAMES, input_names
 from hybrid_jax.vehicle import IRIS, load_vehicle
 
 MASS, ARM, LAG, INERTIA = 0.5, 0.12, 0.06, (2e-3, 2.4e-3)
@@ -35,6 +34,17 @@ velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}
 body_rates = {columns = ["wx", "wy", "wz"], unit = "rad/s"}
 motors = {columns = ["u0", "u1", "u2", "u3"], unit = "dshot"}
 """
+
+
+@pytest.fixture
+def odd(tmp_path):
+    """Flights, and a file that cannot be read, with names like mathematics, like a colour, and not in UTF-8."""
+    folder = write(tmp_path / "flights", LOGS[:2])
+    (folder / "chirp_run1.csv.gz").rename(folder / "cost_$5_or_$^6\x1b[31m.csv.gz")
+    (folder / os.fsdecode(b"broken\xff.csv")).write_text("t,px\n0,0\n")
+    (folder / "notes.txt").write_text("windy")
+    (tmp_path / "v.toml").write_text(vehicle_toml(IRIS))
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -91,21 +101,12 @@ def test_what_a_log_does_not_tell_is_a_placeholder(commanded, tmp_path):
         assert "PLACEHOLDER" in line
 
 
-def test_a_folder_is_described_whatever_is_in_it(tmp_path, called):
-    folder = write(tmp_path / "flights", LOGS[:2])
-    # What a picture would take for mathematics, a terminal for a colour, and nobody for UTF-8.
-    (folder / "chirp_run1.csv.gz").rename(folder / "cost_$5_or_$^6\x1b[31m.csv.gz")
-    (folder / os.fsdecode(b"broken\xff.csv")).write_text("t,px\n0,0\n")
-    (folder / "notes.txt").write_text("windy")
-    (tmp_path / "v.toml").write_text(vehicle_toml(IRIS))
-    _, said, _ = called("inspect", folder, "--vehicle", tmp_path / "v.toml", "--out", tmp_path)
+def test_a_folder_is_described_whatever_is_in_it(tmp_path, odd, called):
+    _, said, _ = called("inspect", odd, "--vehicle", tmp_path / "v.toml", "--out", tmp_path)
     assert r"broken\udcff.csv: not read: row 1, field py" in said
     assert r"cost_$5_or_$^6\x1b[31m.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
     assert "2 of 3 logs are ready for a model" in said
-    page = (tmp_path / "report.html").read_text()
-    titles = ("Signals at their own rates", "Checks (?: cannot tell;", "What to do")
-    assert all(words in page for words in (*titles, "notes.txt: no format that is read"))
-    assert page.count("data:image/png;base64,") == 2
+    assert "notes.txt: no format that is read" in (tmp_path / "report.html").read_text()
     results = json.loads((tmp_path / "report.json").read_text())["rows"]
     assert [row["result"].split(":")[0] for row in results] == ["not read", "ready", "ready"]
 
@@ -116,17 +117,6 @@ def test_without_a_vehicle_a_log_is_checked_against_itself(tmp_path, called):
     assert "chirp_run1.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
     assert "FAILS dp/dt against v: position is in mm" in said
     assert "Without --vehicle these are not checked: number of motors, largest speed; specific force" in said
-
-
-def test_a_log_of_other_motors_hides_no_other(tmp_path, called):
-    six = replace(LOGS[1], u=np.concatenate([LOGS[1].u, LOGS[1].u[:, :2] + 1], axis=1))
-    (tmp_path / "v.toml").write_text(vehicle_toml(IRIS))
-    folder = write(tmp_path / "flights", LOGS[:1])
-    header = ",".join(["t", *STATE_NAMES, *input_names(6)])
-    np.savetxt(folder / "six.csv", np.column_stack([six.t, six.x, six.u]), "%.9g", ",", header=header, comments="")
-    _, said, _ = called("inspect", folder, "--vehicle", tmp_path / "v.toml", "--out", tmp_path)
-    assert "six.csv: CSV, unknown vehicle, 0.9 s, 6 motors: FAILS number of motors: 6 motors are logged" in said
-    assert "1 of 2 logs are ready" in said
 
 
 def test_a_log_is_ready_if_fit_takes_it(tmp_path, called):
@@ -162,26 +152,22 @@ def test_motors_that_lead_the_gyro_are_borne_where_the_lag_is_known(tmp_path):
         read_flights(tmp_path, IRIS, DT, options)
 
 
-def test_of_a_folder_with_mistakes_what_is_sound_is_used(tmp_path, called, capsys):
+def test_of_a_folder_with_mistakes_what_is_sound_is_used(tmp_path, odd, called, capsys):
     """A file that cannot be read is left out; a flight under two names, and of another vehicle, is refused."""
-    folder = write(tmp_path / "flights", LOGS[:2])
-    # What a picture would take for mathematics, a terminal for a colour, and nobody for UTF-8.
-    (folder / "chirp_run1.csv.gz").rename(folder / "cost_$5_or_$^6\x1b[31m.csv.gz")
-    (folder / os.fsdecode(b"broken\xff.csv")).write_text("t,px\n0,0\n")
-    flights = read_flights(folder, IRIS, DT, FlightOptions())
+    flights = read_flights(odd, IRIS, DT, FlightOptions())
     assert [len(flights.logs), flights.still] == [2, False]
-    assert "left out: " in flights.said[0]
+    assert any("left out: " in line for line in flights.said)
     assert r"broken\udcff.csv: row 1, field py" in capsys.readouterr().err
     with pytest.raises(ChecksFailed) as failed:
-        read_flights(folder, replace(IRIS, mass=9 * IRIS.mass), DT, FlightOptions())
+        read_flights(odd, replace(IRIS, mass=9 * IRIS.mass), DT, FlightOptions())
     assert [line.split(": ")[1] for line in failed.value.args[:-1]] == ["specific force over thrust per mass"]
     assert "(and 1 more of the logs)" in failed.value.args[0]
     assert failed.value.args[-1].endswith("or are they of another vehicle than iris?")
-    write(folder, [replace(LOGS[1], name="copy.csv")])
-    _, said, _ = called("inspect", folder, "--out", tmp_path)
+    write(odd, [replace(LOGS[1], name="copy.csv")])
+    _, said, _ = called("inspect", odd, "--out", tmp_path)
     assert "the same flight as chirp_run2.csv.gz; leave one of the two out" in said
     with pytest.raises(ValueError, match=r"copy\.csv\.gz: the same flight as chirp_run2\.csv\.gz"):
-        read_flights(folder, IRIS, DT, FlightOptions())
+        read_flights(odd, IRIS, DT, FlightOptions())
 
 
 def test_from_flights_that_hardly_move_nothing_is_learned(tmp_path, called):

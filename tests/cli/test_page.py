@@ -34,5 +34,5 @@ def test_it_needs_nothing_but_itself(page, tmp_path, capsys):
 
 
 def test_a_browser_shows_it_without_an_error(page, seen):
-    right = {"wrong": [], "images": 2, "hidden": 0, "wide": False}
-    assert seen({"page": document(page)}) == {"page 400": right, "page 1400": right}
+    right = {"images": 2, "hidden": 0, "wide": False}
+    assert seen({"page": document(page)}) == {("page", 400): right, ("page", 1400): right}
