@@ -1,13 +1,20 @@
-"""Every benchmark runs, compares what it times, and says what it found; how fast that was is nobody's business here."""
+"""Benchmarks compare what they time; rivals compute what we compute. How fast that is, nobody asks here."""
 
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from pendulum import pendulum
+from smoke import benchmark
 
 from benchmarks import timing
 from benchmarks.timing import Disagreement, Ratio, Times, agree
+from benchmarks.training_peers import BY_HAND, COMPILED, TORCHDIFFEQ, ThreeEighths
+from hybrid_jax.integrate import RK4, rollout
 
 
 @pytest.mark.parametrize(
@@ -52,3 +59,28 @@ def test_a_ratio_is_taken_within_turns():
 def test_the_preset_that_is_reported_times_each_call_ten_times():
     for name in ("grids", "training_peers"):
         assert import_module(f"benchmarks.{name}").PRESETS["full"].turns >= 10
+
+
+@pytest.mark.slow
+def test_the_gradient_step_of_every_rival_is_ours_on_one_core(tmp_path):
+    _, report = benchmark("training_peers", tmp_path)
+    assert report["cores_used"] == 1 or sys.platform != "linux"
+    rows = {row["program"]: row for row in report["rows"] if "program" in row}
+    assert rows["ours without kernels"]["difference"] < 1e-5
+    pytest.importorskip("torch", reason="PyTorch is of the extra `peers`")
+    for rival in (BY_HAND, COMPILED) + ((TORCHDIFFEQ,) if find_spec("torchdiffeq") else ()):
+        assert rows[rival]["difference"] < 5e-5  # sums in another order, in float32
+
+
+@pytest.mark.slow
+def test_the_rule_of_torchdiffeq_is_of_fourth_order_and_another():
+    with jax.enable_x64(True):
+        x0 = jnp.array([0.5, -1.0])
+
+        def end(solver, steps):
+            return rollout(pendulum(), x0, jnp.zeros((steps, 1)), 0.8 / steps, solver)[-1]
+
+        truth = end(RK4(), 512)
+        errors = [np.abs(end(ThreeEighths(), steps) - truth).max() for steps in (8, 16)]
+        assert 3.7 < np.log2(errors[0] / errors[1]) < 4.6
+        assert np.abs(end(ThreeEighths(), 8) - end(RK4(), 8)).max() > 1e-6  # far above rounding

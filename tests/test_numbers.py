@@ -6,12 +6,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from committed import committed, lines
 from smoke import ROOT
 
 from experiments.online.results import error
 from experiments.paper.regret import AUTO, of_each_case, over, regret
 from experiments.reporting.names import label
+from experiments.reporting.results import Results
 from experiments.reporting.tables import measured
 
 DOCS, README = ROOT / "docs", ROOT / "README.md"
@@ -33,6 +33,19 @@ COMPARED = {
     "source + linear residual": ("linear_residual", "fine_tuned"),
     "hj.adapt (θ_p + disturbance)": ("constant_disturbance", "fine_tuned"),
 }
+
+
+@cache
+def committed(name):
+    """The rows of a report in docs/reference."""
+    report = json.loads((REFERENCE / name / "report.json").read_text())
+    return Results(report["rows"], report.get("tags", ()))
+
+
+def lines(page):
+    """The lines of all tables of a page, each as its cells without emphasis, by the first cell."""
+    rows = [line.split("|")[1:-1] for line in (ROOT / page).read_text().splitlines() if line.startswith("| ")]
+    return {first: cells for first, *cells in ([cell.strip(" *") for cell in row] for row in rows)}
 
 
 def test_seven_changes():

@@ -1,6 +1,8 @@
-"""What the pages show is what happens, and every public name has an entry in the reference."""
+"""What the pages show is what happens, and each program of the gallery draws its picture."""
 
 import re
+import runpy
+import shutil
 import sys
 from importlib import util
 
@@ -61,3 +63,25 @@ def test_what_belongs_to_an_item_is_indented_by_four(page):
 def test_every_exercise_has_an_answer(notebook):
     text = notebook.read_text()
     assert text.count("## Exercise") == text.count("<summary>Answer") == 1
+
+
+FOLDER = DOCS / "examples"
+PROGRAMS = sorted(FOLDER.glob("*.py"))
+
+
+def test_the_gallery_shows_all_programs():
+    page = (FOLDER / "index.md").read_text()
+    names = {path.stem for path in PROGRAMS}
+    assert len(names) == 12
+    assert {*re.findall(r"\]\((\w+)\.png\)", page)} == {*re.findall(r'--8<-- "docs/examples/(\w+)\.py"', page)} == names
+    assert all((FOLDER / f"{name}.png").stat().st_size < 60_000 for name in names)
+    assert max(len(path.read_text().splitlines()) for path in PROGRAMS) <= 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.stem)
+def test_a_program_draws_its_picture(path, tmp_path, monkeypatch):
+    shutil.copy(path, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(tmp_path / path.name))
+    assert (tmp_path / f"{path.stem}.png").exists()

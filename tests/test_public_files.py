@@ -9,14 +9,10 @@ import os
 import pickle
 import zipfile
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from surface import cases, outcome
+from surface import outcome
 
 import hybrid_jax as hj
 from hybrid_jax.export import load_program
@@ -31,47 +27,6 @@ KEY = jax.random.key(0)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("files")
-
-
-ABOUT = st.recursive(
-    st.one_of(
-        st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just(b"1"), st.just(np.ones(2))
-    ),
-    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=5), inner, max_size=3)),
-    max_leaves=5,
-)
-
-
-class Anything(hj.AbstractVectorField):
-    """A field that holds any value."""
-
-    held: object
-
-    def __call__(self, x, u):
-        return x
-
-
-HELD = st.one_of(
-    ABOUT,
-    st.sampled_from([KEY, jnp.ones(2, jnp.bfloat16), np.array(["a"]), np.array([{}]), {1: np.ones(2)}, {"a/b": 1}, 1j]),
-    st.sampled_from([jax.nn.relu, len, jnp.float32, np.dtype("f4"), np.longdouble(1), eqx.nn.Identity(), (), hj.IRIS]),
-    st.just({"a": {"b": np.ones(2)}, "a/b": np.zeros(2)}),
-)
-
-
-@cases(0.05)
-@given(held=HELD, about=st.dictionaries(st.text(max_size=5), ABOUT, max_size=3))
-def test_a_value_is_saved_and_loaded_or_refused(folder, held, about):
-    path = folder / "saved.npz"
-    path.unlink(missing_ok=True)
-    problem = outcome(hj.check_savable, Anything(held))
-    outcome(hj.save, path, Anything(held), about)
-    if path.exists() and problem is None:
-        loaded, saved = (
-            jax.tree.map(lambda leaf: jnp.asarray(leaf) if eqx.is_array(leaf) else leaf, field)
-            for field in (hj.load(path).field, Anything(held))
-        )
-        assert eqx.tree_equal(loaded, saved)
 
 
 def npy(descr="<f8", shape="(2,)", data=bytes(16), version=1):

@@ -1,4 +1,4 @@
-"""What the README shows is what happens."""
+"""What the README shows is what happens, and the lowest versions are those with which CI runs the wheel."""
 
 import os
 import re
@@ -6,8 +6,10 @@ import tomllib
 from importlib import import_module
 
 import pytest
-from committed import committed
+from packaging.requirements import Requirement
+from packaging.version import Version
 from smoke import ROOT, script
+from test_numbers import committed
 
 import hybrid_jax
 from experiments.paper.regret import AUTO, of_each_case
@@ -72,3 +74,12 @@ def test_its_table_is_that_of_the_reports():
     other = committed("worlds").where(world="hummingbird", change="parameter_shift", flight="moving")
     expected.append([f"{other.where(method=own).spread('test_mse').mean:.3g}" for own in ("source", "fine_tune", AUTO)])
     assert lines[-6:] == expected
+
+
+def test_ci_installs_the_lowest_version_of_each_requirement():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pins = map(Requirement, filter(None, (line.partition("#")[0].strip() for line in (ROOT / ".ci/lowest.txt").open())))
+    installed = {pin.name: Version(next(iter(pin.specifier)).version) for pin in pins}
+    for requirement in map(Requirement, project["dependencies"] + project["optional-dependencies"]["cli"]):
+        lowest = [each.version.removesuffix(".*") for each in requirement.specifier if each.operator in (">=", "==")]
+        assert [installed[requirement.name]] == list(map(Version, lowest)), requirement.name

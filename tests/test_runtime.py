@@ -1,4 +1,4 @@
-"""How a process is set up."""
+"""How a process is set up; laws of compiled programs, optimised as users have them."""
 
 import os
 import re
@@ -10,7 +10,7 @@ import pytest
 from smoke import ROOT, script
 
 from hybrid_jax import runtime
-from hybrid_jax.runtime import EXTRA, FLAGS, PROGRAMS
+from hybrid_jax.runtime import EXTRA, FLAGS, PROGRAMS, WHOLE_LOOPS
 
 pytestmark = pytest.mark.slow  # each test starts processes
 
@@ -170,3 +170,27 @@ def test_an_interrupt_while_modules_load_is_told_in_a_line(module, program):
     assert done.returncode == 130
     assert done.stdout == ""
     assert re.fullmatch(r"(hybrid-jax: )?interrupted.*\n", done.stderr)
+
+
+# Those of rounding and of the derivative written by hand, which fusing kernels may change.
+SWEEP = (
+    "a_lane_is_the_same_run_alone",
+    "a_lane_is_a_run_by_the_plain_function",
+    "lanes_that_share_a_chunk_are_the_same_runs",
+    "every_lane_comes_to_its_own_end",
+    "a_diverged_lane_changes_no_bit_of_another",
+)
+NETWORK = (
+    "the_derivative_written_by_hand_is_that_of_the_plain_formula",
+    "the_gradient_of_a_minibatch_is_that_of_its_samples_one_by_one",
+    "what_few_samples_use_is_the_same_network_with_the_same_slopes_and_so_is_its_file",
+)
+LAWS = [
+    f"tests/{file}.py::test_{law}"
+    for file, laws in {"sweep/test_sweep": SWEEP, "networks/test_residual": NETWORK}.items()
+    for law in laws
+]
+
+
+def test_they_hold():
+    script("-m", "pytest", "-n", "0", "-p", "no:cacheprovider", *LAWS, env=os.environ | {FLAGS: WHOLE_LOOPS})

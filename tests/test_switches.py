@@ -30,15 +30,6 @@ def windows(n=12):
     return hj.Trajectories(*parts, flights.dt)
 
 
-def fitted(_):
-    result = hj.fit(hybrid(), windows(), windows(6), jax.random.key(1), max_epochs=2)
-    return result.best
-
-
-def gauss_newton(_):
-    return hj.fit_gauss_newton(hybrid(), windows(), max_steps=2).field
-
-
 def filtered(_):
     estimator = hj.OnlineAdaptation(hybrid(), windows().dt, 1e-3)
     state = estimator.begin(windows().x0[0])
@@ -51,12 +42,13 @@ def exported(folder):
     return jnp.zeros(())
 
 
-def adapted(method):
-    return lambda _: hj.adapt(hybrid(), windows(), method=method).field
-
-
-WORK = {"fit": fitted, "fit_gauss_newton": gauss_newton, "filter": filtered, "export": exported}
-WORK |= {f"adapt by {method}": adapted(method) for method in hj.METHODS}
+WORK = {
+    "fit": lambda _: hj.fit(hybrid(), windows(), windows(6), jax.random.key(1), max_epochs=2).best,
+    "fit_gauss_newton": lambda _: hj.fit_gauss_newton(hybrid(), windows(), max_steps=2).field,
+    "filter": filtered,
+    "export": exported,
+    **{method: lambda _, by=method: hj.adapt(hybrid(), windows(), method=by).field for method in hj.METHODS},
+}
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Laws of windows cut from flights."""
+"""Laws of windows cut from flights, and of the metrics on them."""
 
 from dataclasses import replace
 
@@ -6,7 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pendulum import pendulum, swings
 
+from hybrid_jax import metrics
+from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.trajectories import Trajectories, check, concatenate, windows_of
 
 STEPS = 5
@@ -96,3 +99,25 @@ def test_single_and_empty_windows_are_refused():
     for wrong, said in ((windows()[0], "must have 2, 3, 3 axes"), (windows()[:0], "is empty"), (nothing, "is empty")):
         with pytest.raises(ValueError, match=said):
             check(wrong)
+
+
+@pytest.mark.parametrize(("every", "chunk"), [(1, 250), (2, 7), (4, 250), (8, 20)])
+def test_an_error_is_the_definition_at_every_so_many_intervals(every, chunk):
+    windows, field = swings(20), pendulum(0.6)
+    predicted = np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt), np.float64)
+    squares = np.square(predicted - np.asarray(windows.x)).sum(-1)
+    rows = [i for i in range(8) if (i + 1) % every == 0]
+    found = metrics.rollout_mse(field, windows, every, chunk=chunk)
+    np.testing.assert_allclose(found, squares[:, rows].mean(), rtol=1e-5)  # float32 sums of 160 numbers
+
+
+def test_mse_by_hand():
+    truth = jnp.zeros((2, 2, 3))
+    predicted = jnp.array([[1.0, 2.0, 2.0], [0.0, 3.0, 4.0]])
+    both = metrics.mse(jnp.stack([predicted, 2 * predicted]), truth)
+    np.testing.assert_array_equal(both, [17, 68])  # squared norms, mean over time: not over the elements
+
+
+def test_an_error_beyond_float_is_not_finite():
+    lost = pendulum(damping=-1e6)
+    assert not jnp.isfinite(metrics.rollout_mse(lost, swings(20)))

@@ -5,10 +5,9 @@ from dataclasses import replace
 import pytest
 import surface
 
-from hybrid_jax import rigid_body
 from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.dynamics.terms import Terms
-from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
+from hybrid_jax.dynamics.vehicle_file import LAG, load_vehicle_model
 from hybrid_jax.vehicle import load_vehicle
 
 GOOD = {
@@ -47,7 +46,9 @@ def test_every_constant_is_read_or_has_its_default(written):
     assert vehicle.rotor_positions[1] == (-0.1, 0.2)
     assert (vehicle.rotor_radius, vehicle.gravity, vehicle.name) == (0.1, 9.8, "mine")
     hash(vehicle)  # it is part of what a compiled program is found by
-    vehicle = load_vehicle(written(rotor_radius=None, gravity=None, name=None))
+    path = written(rotor_radius=None, gravity=None, name=None)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())  # a byte order mark is passed over
+    vehicle = load_vehicle(path)
     assert (vehicle.rotor_radius, vehicle.gravity, vehicle.name) == (0.0, 9.81, "vehicle")
 
 
@@ -87,8 +88,7 @@ def test_what_no_vehicle_has_is_refused(written, changes, message):
     assert message in found
 
 
-SMALL = "[[9e-3, 0], [-9e-3, 0], [0, 9e-3], [0, 0]]"
-LARGE = "[[4, -4], [-4, 4], [4, 4], [-4, -4]]"
+SMALL, LARGE = "[[9e-3, 0], [-9e-3, 0], [0, 9e-3], [0, 0]]", "[[4, -4], [-4, 4], [4, 4], [-4, -4]]"
 FLYING = {
     "flat": {"inertia": "[1.0e-2, 1.0e-2, 2.1e-2]"},  # 1.04 and 2.08 to two digits
     "air taxi": {"mass": "600", "inertia": "[1500, 1500, 2900]", "rotor_positions": LARGE},
@@ -101,24 +101,15 @@ def test_flat_large_and_small_vehicles_are_read(written, changes):
     assert load_vehicle(written(**changes)).rotors == 4
 
 
-def test_a_byte_order_mark_is_passed_over(written):
-    path = written()
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert load_vehicle(path).mass == 1.5
-
-
 PAYLOAD = "[vehicle.payload]\nmass = 2.0\n"
 
 
-def test_variant_overrides_constants(written):
+def test_a_variant_overrides_constants_and_is_checked(written):
     path = written(below=PAYLOAD)
     assert load_vehicle(path).mass == 1.5
     assert load_vehicle(path, "payload") == replace(load_vehicle(path), mass=2.0)
-
-
-@pytest.mark.parametrize("text", ["mas = 2.0", "mass = -2.0", "[vehicle.payload.heavy]"])
-def test_all_variants_are_checked(written, text):
-    assert "[vehicle.payload]" in refusal(written(below=f"[vehicle.payload]\n{text}"))
+    for text in ("mas = 2.0", "mass = -2.0", "[vehicle.payload.heavy]"):
+        assert "[vehicle.payload]" in refusal(written(below=f"[vehicle.payload]\n{text}"))
 
 
 def test_what_is_unknown_is_refused_with_what_is_known(written):
@@ -139,12 +130,6 @@ def test_other_files_are_refused(tmp_path):
         assert "[vehicle]" in refusal(path)
 
 
-def test_vehicle_without_terms_is_the_rigid_body_of_the_paper(written):
-    found = load_vehicle_model(written())
-    assert found == VehicleModel(load_vehicle(written()))
-    assert set(found.physics().deviations) == set(rigid_body(found.vehicle).deviations)
-
-
 def test_terms_and_learned_names_are_read(written):
     terms = "[terms]\ndrag = [0.1, 0.2, 0]\nmotor_time_constant = 0.02\n"
     found = load_vehicle_model(
@@ -163,11 +148,9 @@ def test_terms_and_learned_names_are_read(written):
     ("above", "below", "message"),
     [
         ('learn = ["weight"]', "", "learn must be names of"),
-        ('learn = ["k", "k"]', "", "learn"),
         ('learn = ["k", "k_rotors"]', "", "both k and k_rotors"),
         ('learn = "k"', "", "learn must be a list"),
         ("learn = [1]", "", "learn must be a list"),
-        ("[learn]\nk = true", "", "learn must be a list"),
         ("", 'learn = ["k"]', "above all tables"),
         ('lern = ["k"]', "", "'lern'"),
         ("", "[terms]\ndarg = [1, 2, 3]", "'darg': must be one of torque_gain,"),

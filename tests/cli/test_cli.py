@@ -8,7 +8,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from PIL import Image
 from smoke import ROOT
 
 from experiments.real_flight.simulated import csv_of, vehicle_toml
@@ -86,18 +85,6 @@ def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_chang
     keys = {*json.loads((tmp_path / "report.json").read_text())} - {"format", "verb", "answer", "notes"}
     (listed,) = re.findall(r"^- `adapt`:(.*?)^- ", (ROOT / "docs/howto/tool.md").read_text(), re.MULTILINE | re.DOTALL)
     assert keys <= {*re.findall(r"`(\w+)`", listed)}
-
-
-@pytest.mark.slow
-def test_a_flight_is_shown_with_what_a_model_expects(fitted, called):
-    flight, out = fitted / "after" / "flight0.csv.gz", fitted / "replay"
-    options = ["--other", fitted / "source.npz", "--seconds", 1, "--out", out]
-    code, said, _ = called("replay", fitted / "source.npz", flight, *options)
-    assert code == 0
-    assert "0.5 s ahead it is " in said
-    assert 'src="data:image/gif;base64,' in (out / "report.html").read_text()
-    with Image.open(out / "replay.gif") as picture:
-        assert picture.n_frames == 10  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.slow

@@ -1,41 +1,35 @@
-"""A terminal and a file of any width show every word and number whole, and say at once what is being done."""
+"""A terminal and a file show every word and number whole; a committed report is what its program makes."""
 
 import io
+import json
 import re
 import time
 
+import numpy as np
+import PIL.Image
 import pytest
 from reports import make_report, make_rows
 from rich.cells import cell_len
 from rich.console import Console
-from smoke import ROOT
 
+from experiments.redraw import REFERENCE, report_of, written
+from experiments.reporting.plots import save_figures
 from experiments.reporting.report import MEANINGLESS, write_report
-from experiments.reporting.tables import Table, print_table
+from experiments.reporting.tables import print_table
 from experiments.runner.progress import Line
 
 ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
-def tables_of(page):
-    for title, block in re.findall(
-        r"^(?:## |.*<summary>)(.*?)(?:</summary>)?\n\n((?:\|.*\n)+)", page.read_text(), flags=re.MULTILINE
-    ):
-        header, _, *lines = (row[2:-2].split(" | ") for row in block.splitlines())
-        yield Table(title, header, lines)
-
-
-@pytest.mark.parametrize("name", ["param_shift", "comparison", "closed_loop", "real_flight/payload"])
-def test_no_word_or_number_is_broken(name):
-    for table in tables_of(ROOT / "docs" / "reference" / name / "report.md"):
-        for most in (0, 5):
-            text = io.StringIO()
-            print_table(Console(file=text, width=80, force_terminal=True), table, most)
-            *printed, _ = ANSI.sub("", text.getvalue().partition("Not shown")[0]).splitlines()
-            assert max(map(cell_len, printed)) <= 80
-            cells = " ".join(cell.replace(" ± ", "±") for line in [table.header, *table.lines] for cell in line)
-            words = {*cells.split(), *table.title.split()}
-            assert {word for line in printed for word in line.split() if not set(word) <= {"─"}} <= words
+def printed(table, most):
+    """The words of a table at 80 columns, and those that it may have."""
+    text = io.StringIO()
+    print_table(Console(file=text, width=80, force_terminal=True), table, most)
+    *lines, _ = ANSI.sub("", text.getvalue().partition("Not shown")[0]).splitlines()
+    assert max(map(cell_len, lines)) <= 80
+    cells = " ".join(cell.replace(" ± ", "±") for line in [table.header, *table.lines] for cell in line)
+    shown = {word for line in lines for word in line.split() if not set(word) <= {"─"}}
+    return shown, {*cells.split(), *table.title.split()}
 
 
 def test_a_terminal_shows_a_headline_one_table_and_the_reports_path(tmp_path):
@@ -68,3 +62,39 @@ def test_a_file_says_after_a_second_what_is_being_done_and_a_terminal_at_once(mo
         assert "a stage: flying, 0:00 elapsed" in text.getvalue()
         line.show_share("flying", 0.5)
         assert str(line).startswith("a stage: flying 50%, 0:0")
+
+
+FOLDERS = [
+    pytest.param(path.parent, marks=[pytest.mark.slow] * (path.parent.name == "closed_loop"))
+    for path in sorted(REFERENCE.rglob("report.json"))
+]
+of_each_report = pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: str(path.relative_to(REFERENCE)))
+
+
+@of_each_report
+def test_its_text_is_what_the_program_writes(folder):
+    """Run `python -m experiments.redraw` if a report's program has changed."""
+    report, record = report_of(folder), json.loads((folder / "report.json").read_text())
+    for name, text in written(folder, report).items():
+        assert (folder / name).read_text() == text
+    assert record["figures"] == report.captions()
+    shown = report.page(folder).table
+    assert shown is None or len(shown.lines) <= 8
+    for table in report.tables:
+        assert all(len(line) == len(table.header) for line in table.lines)
+        for most in (0, 5):
+            shown, words = printed(table, most)
+            assert shown <= words
+
+
+@pytest.mark.slow
+@of_each_report
+def test_its_pictures_are_what_the_program_draws(folder, tmp_path):
+    captions = save_figures(tmp_path, report_of(folder).figures)
+    assert {path.name for path in folder.iterdir() if path.suffix in (".png", ".gif", ".svg")} == captions.keys()
+    for name in captions:
+        assert f"]({name})" in (folder / "report.md").read_text()
+        own, committed = (PIL.Image.open(path / name).convert("RGB") for path in (tmp_path, folder))
+        assert own.size == committed.size
+        # Another version of matplotlib may draw a letter elsewhere.
+        assert np.abs(np.asarray(own, float) - np.asarray(committed, float)).mean() < 2

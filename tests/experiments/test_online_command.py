@@ -6,12 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.online.agents import CHANGES, L1, NAMES, fixed_model, nominal, online, true_theta, with_theta
+from experiments.online.agents import CHANGES, L1, NAMES, fixed_model, nominal, true_theta, with_theta
 from experiments.online.hover import Hovered, adaptation_of, hover
 from experiments.online.results import TAGS, GoalEvidence, claims, tables
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
-from hybrid_jax.control import Hardware
 from hybrid_jax.sim.forces import ground_effect, wind
 from hybrid_jax.vehicle import IRIS
 
@@ -28,11 +27,6 @@ def test_the_oracle_is_the_simulator_without_ground_effect(change):
     for x, u in zip(STATES, SPEEDS, strict=True):
         expected = eqx.filter_jit(truth.derivative)(jnp.asarray(x), jnp.asarray(u), 0.0)
         np.testing.assert_allclose(field(x, u), expected, rtol=2e-4, atol=2e-4)
-
-
-def test_names_of_parameters_are_those_of_the_filter():
-    known = [name.replace("[0]", "").replace("added_", "") for name in online(Hardware(), 0.01).names[: len(NAMES)]]
-    assert [name.split()[0] for name in NAMES] == [name.partition("[")[0] for name in known]
 
 
 def test_an_oracle_of_the_wind_expects_its_force():

@@ -1,21 +1,28 @@
-"""The presets hold the paper's tables, and the lanes made from them are what the tables say."""
+"""The presets and ablations are the tables of the paper, and lanes and flights are what these tables say."""
 
 import math
 from dataclasses import replace
 from functools import partial
+from typing import get_args
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
+from surface import refusal
 
-from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, subsets
+from experiments import ablation
+from experiments.make_flights import chosen_flights
+from experiments.paper.conditions import Noise, adaptation, fresh_fields, measured, pretraining, subsets
 from experiments.paper.config import PAPER, PRESETS, AdaptationConfig, Stopping, column
 from experiments.paper.study import drawn_splits, placeholder, pretrained
 from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.io.datasets import Dataset, save_dataset
+from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.flight import SplitSpec
 from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 # The paper's tables, written down a second time: N → (rate of θ_d, minimum, patience).
@@ -190,3 +197,65 @@ REFUSED = [
 def test_options_that_do_not_fit_are_refused_by_name(change, named):
     with pytest.raises(ValueError, match=named):
         replace(PAPER, **change)
+
+
+@pytest.mark.parametrize("choice", get_args(ablation.Choice))
+def test_every_choice_has_its_default_once(choice):
+    config = ablation.PRESETS["paper"]
+    changed = list(ablation.varied(choice, config).values())
+    assert changed.count(config) == 1
+    assert len({str(other) for other in changed}) == len(changed) > 2
+
+
+def test_contradictory_values_are_refused_before_any_flight(tmp_path):
+    config = replace(ablation.PRESETS["smoke"], batch_size=1, norm="none", over=("weight", "norm"), out=tmp_path)
+    with pytest.raises(ValueError, match="--batch-size must be at least 2 with --norm batch"):
+        ablation.experiment(config, Console(quiet=True))
+    assert not list(tmp_path.iterdir())
+
+
+def test_noise_has_its_size_and_spares_the_test_split():
+    x = np.zeros((400, 10, 13), np.float32)
+    x[..., 3] = 1
+    clean = Trajectories(x[:, 0], np.zeros((400, 10, 4), np.float32), x, 0.01)
+    noisy = measured(Dataset({"train": clean, "test": clean}, {}), 2.0, seed=0)
+    np.testing.assert_array_equal(noisy.splits["test"].x, x)
+    off = noisy.splits["train"].x - x
+    # 4000 draws of a normal: its spread is known to 1.1 %.
+    np.testing.assert_allclose(off[..., 0].std(), 2 * Noise().position, rtol=0.05)
+    np.testing.assert_allclose(off[..., 12].std(), 2 * Noise().body_rates, rtol=0.05)
+    np.testing.assert_allclose(np.linalg.norm(noisy.splits["train"].x0[:, 3:7], axis=1), 1, rtol=1e-6)
+
+
+def windows(count, steps):
+    flights = placeholder(SplitSpec(count, steps))
+    flights.x[..., 0] = np.arange(count)[:, None]
+    return flights
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "flights.npz"
+    splits = {"train": windows(8, 10), "validation": windows(4, 10)}
+    save_dataset(path, Dataset(splits, {"config": SOURCE.describe() | {"seed": 3}}))
+    return path
+
+
+def test_the_first_windows_are_taken_so_that_sizes_are_nested(file):
+    few = chosen_flights(file, SOURCE, {"train": SplitSpec(3, 10)}).splits["train"]
+    more = chosen_flights(file, SOURCE, {"train": SplitSpec(8, 10)}).splits["train"]
+    assert (len(few), len(more)) == (3, 8)
+    np.testing.assert_array_equal(few.x, more.x[:3])
+
+
+@pytest.mark.parametrize(
+    ("domain", "splits", "said"),
+    [
+        (SOURCE, {"train": SplitSpec(9, 10)}, "9 windows of split 'train' requested, but it has 8"),
+        (SOURCE, {"test": SplitSpec(1, 100)}, "has no split 'test'"),
+        (SOURCE, {"train": SplitSpec(3, 20)}, "split 'train' has windows of 10 steps, expected 20"),
+        (PARAMETER_SHIFT, {"train": SplitSpec(3, 10)}, 'domain is "source", expected "parameter_shift"'),
+    ],
+)
+def test_what_the_file_does_not_have_is_refused_in_one_line(file, domain, splits, said):
+    refusal(lambda: chosen_flights(file, domain, splits), file, said)

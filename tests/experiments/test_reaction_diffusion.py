@@ -6,16 +6,7 @@ import pytest
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.models import pieces
-from experiments.reaction_diffusion.systems import (
-    COARSE,
-    DT,
-    FINE,
-    fitzhugh_nagumo,
-    gray_scott,
-    plane,
-    reacting,
-    trajectories,
-)
+from experiments.reaction_diffusion.systems import COARSE, DT, FINE, fitzhugh_nagumo, plane, reacting, trajectories
 
 
 def smooth(points):
@@ -48,12 +39,6 @@ def test_the_derivative_is_the_equation():
     expected = [1e-3 * bend[0] + u - u**3 - v - 5e-3 - 0.5 * u * v, 5e-3 * bend[1] + u - v]
     found = fitzhugh_nagumo(grid, coupling=-0.5)(jnp.asarray(x), jnp.zeros(0))
     np.testing.assert_allclose(found, np.ravel(expected), atol=1e-5)
-
-
-def test_a_steady_state_of_gray_scott_without_catalyst():
-    field = gray_scott([(0.03, 0.06), (0.04, 0.05)], reacts=True)
-    rest = jnp.concatenate([jnp.ones(1024), jnp.zeros(1024)])
-    np.testing.assert_allclose(field(rest, jnp.array([0.0, 1.0])), 0, atol=1e-7)
 
 
 def test_training_and_test_data_are_disjoint_and_pieces_touch():

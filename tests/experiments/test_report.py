@@ -1,17 +1,22 @@
-"""Reports: the contract of report.json, and what the pages and a terminal show."""
+"""Reports: the contract of report.json, the digits of a table, and figures of any rows."""
 
+import csv
+import io
 import json
 import math
 
+import matplotlib as mpl
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from reports import ODD_ROWS, TRUTH, changed, make_report, make_rows
 
 from experiments.paper.claims import DOMAINS_OF
-from experiments.paper.lanes import by_altitude
+from experiments.paper.figures import ranking, scores
+from experiments.paper.lanes import DOMAINS, by_altitude
 from experiments.paper.study import placeholder
+from experiments.reporting.plots import save_figures
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import measured
@@ -75,3 +80,26 @@ def test_any_rows_make_a_report_that_holds_them(tmp_path_factory, rows, experime
     record = json.loads((out / "report.json").read_text())
     assert Results(record["rows"], record["tags"]) == rows
     assert len((out / "rows.csv").read_text().splitlines()) == 1 + len(rows)
+    for row, flat in zip(rows, csv.DictReader(io.StringIO(rows.to_csv())), strict=True):
+        for name, value in (row["theta"] or {}).items():
+            assert flat[f"theta.{name}"] == ("" if value is None else repr(value))
+
+
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(rows=ODD_ROWS, floor=st.floats(0, 1e6))
+def test_any_rows_are_drawn(rows, floor):
+    own = rows.where(domain=DOMAINS[0])
+    if len(rows):
+        ranking(rows, "Ranking", {DOMAINS[1]: floor}).savefig(io.BytesIO(), format="png", dpi=30)
+    if len(own):
+        scores(own, "Scores", floor).savefig(io.BytesIO(), format="png", dpi=30)
+
+
+def test_figures_are_reproducible_and_keep_matplotlibs_settings(tmp_path):
+    before, drawn = (
+        dict(mpl.rcParams),
+        {name: (scores(make_rows(), "Scores", floor=0.01), "A") for name in ("one", "two")},
+    )
+    assert save_figures(tmp_path, drawn) == dict.fromkeys(("one.png", "two.png"), "A")
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    assert dict(mpl.rcParams) == before

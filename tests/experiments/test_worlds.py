@@ -9,9 +9,9 @@ from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 from experiments.worlds.cases import WORLDS
 from experiments.worlds.measures import EXPECTED, parameters_of
-from experiments.worlds.rotorpy import CRAZYFLIE, HUMMINGBIRD, ROTORPY, decide, derivative
+from experiments.worlds.rotorpy import CRAZYFLIE, HUMMINGBIRD, decide, derivative
 from experiments.worlds.verdicts import CLAIMS
-from experiments.worlds.world import BURST, CHANGES, Reference, logged
+from experiments.worlds.world import BURST, Reference, logged
 from hybrid_jax.adaptation.results import Parameter
 from hybrid_jax.vehicle import IRIS
 
@@ -41,15 +41,6 @@ def test_the_derivative_and_the_controller_are_those_of_rotorpy(module, constant
         np.testing.assert_allclose(found, packed[[0, 1, 2, 9, 6, 7, 8, 3, 4, 5, 10, 11, 12]], rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(lagging, packed[16:], rtol=1e-10)
         np.testing.assert_allclose(own, asked, rtol=1e-10)
-
-
-@pytest.mark.parametrize("world", ROTORPY, ids=lambda world: world.name)
-def test_a_vehicle_flies_after_every_change(world):
-    usual = world.fly("nothing", "moving", 1, 3.0, jax.random.key(0)).states
-    for change in CHANGES:
-        states = world.fly(change, "moving", 1, 3.0, jax.random.key(0)).states
-        assert np.abs(states[0, :, :3] - usual[0, :, :3]).max() < 3.0  # m
-        assert (change == "nothing") == np.array_equal(states, usual)
 
 
 def test_a_log_has_sampled_or_averaged_speeds_and_wild_samples():

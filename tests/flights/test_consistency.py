@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks import log_mistakes
 from hybrid_jax.flights.checks.cleaning import delay
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, NOTHING, OK, UNKNOWN, WARNS, check_log
 from hybrid_jax.flights.checks.motor_response import orders
@@ -40,7 +41,7 @@ def test_a_sound_flight_passes(flight, noise):
         assert (check.verdict, check.suggestion) == (OK, NOTHING), check
 
 
-# Beside those of benchmarks/log_mistakes, which test_log_mistakes plants.
+# Beside those of benchmarks/log_mistakes, which are planted below.
 MISTAKES = {
     "no climb": (lambda log: with_parts(log, v=log.x[:, 7:10] * [1, 1, 0]), VELOCITY, "z alone"),
     "dead velocity": (lambda log: with_parts(log, v=log.x[:, 7:10] * [1, 1, 0]), COLUMNS, "vz never changes"),
@@ -189,3 +190,23 @@ def test_short_logs_decide_nothing(flight, samples):
     wrong = table(with_parts(log, p=log.x[:, [1, 0, 2]], omega=-log.x[:, 10:]))
     assert len(wrong) == 12
     assert all(wrong[name].verdict == UNKNOWN for name in (VELOCITY, RATES, THRUST)) == (samples < 30)
+
+
+PLANTED = {f"{kind}: {name}": own for kind, kinds in log_mistakes.MISTAKES.items() for name, own in kinds.items()}
+
+
+@pytest.fixture(scope="module")
+def parts(flight):
+    noise = log_mistakes.NOISE * np.random.default_rng(0).normal(size=flight.x.shape)
+    return log_mistakes.parts_of(FlightLog(flight.t, flight.x + noise, flight.u))
+
+
+def test_nothing_is_said_of_a_sound_flight(parts):
+    assert log_mistakes.said(parts) == []
+
+
+@pytest.mark.parametrize("mistake", PLANTED)
+def test_every_mistake_is_named(parts, mistake):
+    make, words = PLANTED[mistake]
+    lines = [line for _, line in log_mistakes.said(make(parts))]
+    assert any(words in line for line in lines), lines

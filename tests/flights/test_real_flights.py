@@ -1,4 +1,4 @@
-"""Logs of real vehicles are read; checks and errors of baselines agree with what is known of them."""
+"""Logs of real vehicles are read, or refused for what is wrong; checks agree with what is known of them."""
 
 import os
 from pathlib import Path
@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hybrid_jax.cli.estimates import estimate
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.checks.consistency import OK, check_log
-from hybrid_jax.flights.load import load_log
+from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.flights.load import CRAZYFLIE, ULOG, find_logs, format_of, load_log, read_recording
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.vehicle import load_vehicle
@@ -20,9 +22,10 @@ FILES = [
     file for name, parts in SETS.items() for part in parts for file in sorted((FOLDER / name / part).glob("*.csv.gz"))
 ]
 
-pytestmark = pytest.mark.skipif(not FILES, reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder")
+needs_flights = pytest.mark.skipif(not FILES, reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder")
 
 
+@needs_flights
 @pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}/{file.name.split('.')[0]}")
 def test_real_flights_pass_all_checks(file):
     log, vehicle = load_log(file), load_vehicle(file.parents[1] / "vehicle.toml")
@@ -37,18 +40,12 @@ def test_real_flights_pass_all_checks(file):
     assert len(cut) == (len(log) - 1) // 50
 
 
-@pytest.mark.parametrize("file", [file for file in FILES if file.parent.name == "payload"], ids=lambda file: file.name)
-def test_load_changes_the_ratio_of_thrust(file):
-    """Stated mass 37 g, actual mass 44.4 g: 37 / 44.4 = 0.83, with estimated thrust coefficients."""
-    found = {check.name: check for check in check_log(load_log(file), load_vehicle(file.parents[1] / "vehicle.toml"))}
-    assert found["specific force over thrust per mass"].value == pytest.approx(37 / 44.4, rel=0.05)
-
-
 # Published for 54 others: position [m], velocity [m/s], rotation [rad], body rates [rad/s] after 0.1 s. Those here
 # turn less, so of rotation and rates only the order of magnitude is the same.
 HELD_OUT = {"hold": (0.0903, 0.282, 0.145, 1.534), "thrust": (0.0144, 0.0661, 0.0808, 1.534)}
 
 
+@needs_flights
 @pytest.mark.parametrize("name", HELD_OUT)
 def test_baseline_errors_are_close_to_published_ones(name):
     vehicle = load_vehicle(FOLDER / "crazyflie_payload" / "vehicle.toml", "payload")
@@ -57,3 +54,47 @@ def test_baseline_errors_are_close_to_published_ones(name):
     found = np.sqrt([np.mean(part[:, 9] ** 2) for part in flight_errors(field, windows)])
     np.testing.assert_allclose(found[:2], HELD_OUT[name][:2], rtol=0.15)
     assert (np.abs(np.log(found / HELD_OUT[name])) < np.log(2)).all()
+
+
+RAW = Path(os.environ.get("HYBRID_JAX_LOGS", Path(__file__).parents[3] / "shared" / "logs"))
+needs_logs = pytest.mark.skipif(not RAW.is_dir(), reason="no real logs: set HYBRID_JAX_LOGS to their folder")
+CORNERS = [[1, -1], [-1, -1], [-1, 1], [1, 1]]  # M1 … M4: front right, rear right, rear left, front left
+# PX4 log → the check that fails first, and how many rotors it has.
+PX4 = {
+    "sample": ("motors turn", 4),
+    "sample_appended_multiple": ("motors turn", 4),
+    "sample_log_small": ("airframe: VTOL (SYS_AUTOSTART 13014)", 8),
+    "sample_logging_tagged_and_default_params": ("motors turn", 4),
+    "sample_px4_events": ("slowest signal: slower than 100 Hz: position 10 Hz", 4),
+}
+
+
+@needs_logs
+@pytest.mark.parametrize("name", PX4)
+def test_no_public_px4_log_is_a_flight_at_100_hz(name):
+    recording = read_recording(RAW / "px4" / f"{name}.ulg")
+    failed, rotors = PX4[name]
+    assert failures(check_recording(recording, None, 0.01), "log")[0].startswith(f"log: {failed}")
+    assert (recording.facts["format"], recording.rotors) == (ULOG, rotors)
+
+
+@needs_logs
+def test_all_crazyflie_logs_are_whole():
+    paths = [path for path in sorted(RAW.rglob("*.gz")) if format_of(path)[0] == CRAZYFLIE]
+    assert paths
+    for path in paths:
+        recording = read_recording(path)
+        assert "damage" not in recording.facts
+        assert recording.rotors == 4
+        assert not [line for line in failures(check_recording(recording), "log") if "quantities" not in line]
+    assert set(find_logs(RAW / "sysid_tools")[1].values()) == {"no format that is read"}
+
+
+@needs_logs
+@pytest.mark.parametrize("name", ["sysid_tools", "crazypad/controller_data/normal_flight"])
+def test_where_rotors_are_and_how_they_spin_follows_from_commands_and_gyro(name):
+    found = estimate([read_recording(path) for path in find_logs(RAW / name)[0]])
+    np.testing.assert_array_equal(np.sign(found.positions(1.0)), CORNERS)
+    assert found.spin() == [-1, 1, -1, 1]
+    if name == "sysid_tools":
+        assert found.lag == pytest.approx(0.072, rel=0.15)

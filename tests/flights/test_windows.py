@@ -1,4 +1,4 @@
-"""A folder of logs becomes windows in one call, or is refused in one line."""
+"""A log is whole and possible; a folder of logs becomes windows in one call; held-out flights are disjoint."""
 
 from dataclasses import replace
 
@@ -8,7 +8,8 @@ from recorded import DT, LOGS, SAMPLES, write
 from surface import refusal
 
 import hybrid_jax as hj
-from hybrid_jax.flights import FlightLog
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.windows import flight_of, folds, hold_out, manoeuvre_of
 from hybrid_jax.vehicle import IRIS
 
 
@@ -47,3 +48,86 @@ def test_invalid_arguments_are_refused(tmp_path, options, message):
     write(tmp_path, LOGS[:1])
     refusal(lambda: hj.load_windows(tmp_path, IRIS, **options), message)
     refusal(lambda: hj.load_windows(tmp_path / "none", IRIS), "no such folder")
+
+
+def test_quaternions_become_unit_and_continuous(flight):
+    signs = np.where(np.arange(len(flight)) % 3 == 1, -1.01, 0.99)[:, None]
+    x = np.concatenate([flight.x[:, :3], flight.x[:, 3:7] * signs, flight.x[:, 7:]], axis=1)
+    again = FlightLog(flight.t, x, flight.u)
+    np.testing.assert_allclose(again.x, flight.x, atol=1e-12)
+    assert again.x[0, 3] >= 0
+
+
+def test_the_arrays_given_are_not_changed(flight):
+    x = -flight.x
+    x[:, 3:7] *= 1.01
+    before = x.copy()
+    FlightLog(flight.t, x, flight.u)
+    np.testing.assert_array_equal(x, before)
+
+
+@pytest.mark.parametrize(
+    ("array", "at", "value", "words"),
+    [
+        ("t", 5, np.nan, ("sample 5", "field t", "nan")),
+        ("t", 5, 0.0, ("sample 5", "field t", "goes back")),
+        ("t", 6, 0.05, ("sample 6", "repeats")),
+        ("x", (7, 8), np.inf, ("sample 7", "field vy", "inf")),
+        ("u", (3, 2), np.nan, ("sample 3", "field u2")),
+        ("u", (3, 2), -1.0, ("sample 3", "field u2", "negative")),
+        ("x", (9, slice(3, 7)), 0.0, ("sample 9", "qw", "norm is 0")),
+        ("x", (9, 3), 1e200, ("sample 9", "qw", "is 1e+200")),
+        ("x", (9, 0), 2e9, ("sample 9", "px", "is 2e+09")),
+    ],
+)
+def test_impossible_values_are_named(flight, array, at, value, words):
+    broken = {"t": flight.t.copy(), "x": flight.x.copy(), "u": flight.u.copy()}
+    broken[array][at] = value
+    refusal(lambda: FlightLog(**broken, name="mine"), "mine", *words)
+
+
+def test_shapes_must_agree(flight):
+    refusal(lambda: FlightLog(flight.t[1:], flight.x, flight.u), "(n, 13)")
+    refusal(lambda: FlightLog(flight.t[:0], flight.x[:0], flight.u[:0]), "no samples")
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "manoeuvre"),
+    [
+        ("/a/b/chirp_run2.csv.gz", "chirp_run2", "chirp"),
+        ("melon-03.csv", "melon-03", "melon"),
+        ("flight_17.csv", "flight_17", "flight_17"),
+        ("figure8_run2.ULG", "figure8_run2", "figure8"),
+        ("squarerun3.csv", "squarerun3", "square"),
+        ("hover flight-4.csv", "hover flight-4", "hover"),
+        ("2024.05.01_hover_2.Csv.Gz", "2024.05.01_hover_2", "2024.05.01_hover"),
+        ("17.csv", "17", "17"),
+    ],
+)
+def test_names_of_flights_and_manoeuvres(name, own, manoeuvre):
+    log = replace(LOGS[0], name=name)
+    assert (flight_of(log), manoeuvre_of(log)) == (own, manoeuvre)
+
+
+@pytest.mark.parametrize("of", [flight_of, manoeuvre_of])
+@pytest.mark.parametrize("count", [None, 2])
+def test_folds_hold_out_every_flight_once(of, count):
+    found = folds(LOGS, count, of)
+    assert len(found) == (count or len({of(log) for log in LOGS}))
+    held = [log.name for _, out in found for log in out]
+    assert sorted(held) == sorted(log.name for log in LOGS)
+    for kept, out in found:
+        assert not {of(log) for log in kept} & {of(log) for log in out}
+        assert len(kept) + len(out) == len(LOGS)
+
+
+def test_a_manoeuvre_is_held_out_whole():
+    kept, out = hold_out(LOGS, ["random"], manoeuvre_of)
+    assert [flight_of(log) for log in out] == ["random_run1", "random_run2", "random_run3"]
+    assert len(kept) == 6
+
+
+def test_impossible_splits_are_refused():
+    refusal(lambda: hold_out(LOGS, ["melon"], manoeuvre_of), "'melon'", "chirp")
+    refusal(lambda: hold_out(LOGS[:1], ["chirp_run1"]), "0 flights for training")
+    refusal(lambda: folds(LOGS, 4, manoeuvre_of), "3 different names")

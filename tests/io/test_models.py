@@ -1,16 +1,26 @@
-"""Saved models of this library: bit for bit the same when loaded, or refused in one line."""
+"""Saved models of this library are bit for bit the same when loaded; what is no such file is refused in one line."""
+
+import os
+import secrets
+import warnings
+from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-import surface
 from pendulum import pendulum
+from surface import refusal
 
+import hybrid_jax as hj
 from hybrid_jax import IRIS, Hybrid, load, residual_network, rollout_batch, save
 from hybrid_jax.dynamics.rigid_body import perturbed
+from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.io import models
 from hybrid_jax.io.archive import save_archive, to_numpy
+from hybrid_jax.io.datasets import load_dataset
+from hybrid_jax.io.files import read_json, write_atomic
 from hybrid_jax.io.structure import Structure
 from hybrid_jax.networks.mlp import InputScaling
 
@@ -21,8 +31,8 @@ FIELDS = {"physics": PHYSICS, "network": NETWORK, "hybrid": Hybrid(PHYSICS, NETW
 _direct = eqx.filter_jit(rollout_batch)
 
 
-def refusal(path):
-    return surface.refusal(lambda: load(path), path)
+def refused(path):
+    return refusal(lambda: load(path), path)
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -52,16 +62,16 @@ def test_scalars_and_precision_are_kept(tmp_path):
 
 
 def test_other_files_are_refused(tmp_path):
-    assert "no such file" in refusal(tmp_path / "none.npz")
+    assert "no such file" in refused(tmp_path / "none.npz")
     other = tmp_path / "other.npz"
     save_archive(other, "hybrid_jax dataset 1", {}, {"x": np.zeros(3)})
-    assert "hybrid_jax model" in refusal(other)
+    assert "hybrid_jax model" in refused(other)
     for metadata in ({}, [1], {"field": 3, "about": {}}, {"field": {"array": "gone"}, "about": {}}):
         save_archive(other, models.FORMAT, metadata, {})
-        assert "not a complete model" in refusal(other)
+        assert "not a complete model" in refused(other)
     body = {"class": "hybrid_jax.dynamics.rigid_body:RigidBody", "fields": {"mass": 1}}
     save_archive(other, models.FORMAT, {"field": body, "about": {}}, {})
-    assert "has fields deviations, vehicle, terms, wrench, but the file has mass" in refusal(other)
+    assert "has fields deviations, vehicle, terms, wrench, but the file has mass" in refused(other)
 
 
 def test_a_vehicle_in_a_file_is_checked(tmp_path):
@@ -69,4 +79,51 @@ def test_a_vehicle_in_a_file_is_checked(tmp_path):
     tree["fields"]["vehicle"]["fields"]["mass"] = -1.0
     arrays = {f"field/deviations/{name}": to_numpy(value) for name, value in PHYSICS.deviations.items()}
     save_archive(tmp_path / "model.npz", models.FORMAT, {"field": tree, "about": {}}, arrays)
-    assert "mass must be a positive" in refusal(tmp_path / "model.npz")
+    assert "mass must be a positive" in refused(tmp_path / "model.npz")
+
+
+@pytest.mark.parametrize("load", [hj.load, load_dataset, hj.load_vehicle, load_column_map, read_json])
+def test_what_is_no_regular_file_is_refused_and_not_waited_for(load, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "nowhere").symlink_to(tmp_path / "none")
+    for path in (*tmp_path.iterdir(), Path("/dev/zero"), tmp_path):
+        refusal(lambda path=path: load(path), path)
+
+
+def test_nothing_is_written_through_a_link_and_nothing_is_left(tmp_path, monkeypatch):
+    """Where another user may write: a link in the place of the file, or of the one that is written first."""
+    victim, path = tmp_path / "victim", tmp_path / "out" / "file"
+    victim.write_text("mine")
+    path.parent.mkdir()
+    path.symlink_to(victim)
+    write_atomic(path, "new")
+    assert (path.read_text(), victim.read_text(), path.is_symlink()) == ("new", "mine", False)
+    monkeypatch.setattr(secrets, "token_hex", lambda _: "0" * 16)
+    (planted := path.with_name(f".{'0' * 16}.part")).symlink_to(victim)
+    with pytest.raises(OSError, match="cannot be saved"):
+        write_atomic(path, "newer")
+    assert (path.read_text(), victim.read_text()) == ("new", "mine")
+    planted.unlink(missing_ok=True)
+    (left := path.with_name(f".{'1' * 16}.part")).touch()
+    (other := path.with_name(".notes.part")).touch()
+    for each in (left, other):
+        os.utime(each, (0, 0))
+    write_atomic(path, "newest")
+    assert {*path.parent.iterdir()} == {path, other}
+
+
+@pytest.mark.parametrize("spoil", [lambda w: w.at[0, 0].set(jnp.nan), lambda w: w[:2], lambda w: w.astype(int)])
+def test_weights_that_are_not_finite_or_of_another_shape_or_type_are_refused(spoil, tmp_path):
+    field = hj.residual_network(13, 4, jax.random.key(0), hidden=4)
+    spoiled = eqx.tree_at(lambda field: field.weight_in, field, spoil(field.weight_in))
+    with warnings.catch_warnings(action="ignore"):  # of what cannot be loaded
+        hj.save(tmp_path / "model.npz", spoiled)
+    refusal(lambda: hj.load(tmp_path / "model.npz"), "model.npz", "must be")
+
+
+def test_models_side_by_side_are_loaded(tmp_path):
+    keys = jax.random.split(jax.random.key(0), 3)
+    fields = eqx.filter_vmap(lambda key: hj.residual_network(13, 4, key, hidden=4))(keys)
+    hj.save(tmp_path / "models.npz", fields)
+    assert eqx.tree_equal(hj.load(tmp_path / "models.npz").field, fields)
