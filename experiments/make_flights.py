@@ -83,12 +83,16 @@ def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], see
 
 def chosen_flights(path: Path, domain: Domain, splits: Mapping[str, SplitSpec]) -> Dataset:
     whole = load_dataset(path, domain.describe())
-    parts = {name: whole.first(name, spec.windows) for name, spec in splits.items()}
     for name, spec in splits.items():
-        found = parts[name].horizon
-        if found != spec.steps:
-            raise ValueError(f"{path}: split {name!r} has windows of {found} steps, expected {spec.steps}")
-    return Dataset(parts, whole.metadata, origin=str(path))
+        if name not in whole.splits:
+            raise ValueError(f"{path}: has no split {name!r}, only {', '.join(whole.splits)}")
+        found, steps = len(whole.splits[name]), whole.splits[name].horizon
+        if found < spec.windows:
+            raise ValueError(f"{path}: {spec.windows} windows of split {name!r} requested, but it has {found}")
+        if steps != spec.steps:
+            raise ValueError(f"{path}: split {name!r} has windows of {steps} steps, expected {spec.steps}")
+    parts = {name: whole.splits[name][: spec.windows] for name, spec in splits.items()}
+    return Dataset(parts, whole.metadata)
 
 
 def survey(windows: Trajectories) -> dict[str, float]:

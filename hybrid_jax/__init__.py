@@ -7,7 +7,7 @@
 The packages from the bottom up: `dynamics` (vector fields, physics), `networks` (residuals), `io` (models and data as
 files), `training` (`fit`), `adaptation` (`adapt`), `sweep` (many runs as one program), `sim` (a MuJoCo quadrotor),
 `flights` (recorded logs), `control` (closed-loop flight), `export` (StableHLO, CasADi, C), `identification` (a vehicle
-from commands and measurements).
+from its logs).
 """
 
 import lazy_loader

@@ -16,13 +16,13 @@ from experiments.identification.record import rmse
 from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
 from hybrid_jax import runtime
-from hybrid_jax.cli.compared import inputs_of
 from hybrid_jax.dynamics.actuators import Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
 from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification.fitting import identify
+from hybrid_jax.identification.log_checks import inputs_of
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.vehicle import Vehicle
 

@@ -21,7 +21,6 @@ from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
 from hybrid_jax import runtime
 from hybrid_jax.adaptation.ridge import defects
-from hybrid_jax.cli.compared import inputs_of
 from hybrid_jax.dynamics import FrozenRates, HoldState, Terms
 from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
@@ -34,6 +33,7 @@ from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.scores import errors_between
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.identification.fitting import identify
+from hybrid_jax.identification.log_checks import inputs_of
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.state import VELOCITY
 

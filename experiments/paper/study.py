@@ -204,12 +204,12 @@ def flown(
             found = flights(domain, splits, config.data_seed, config.cache)
         arrays = {f"{name}/{part}": getattr(found.splits[name], part) for name in found.splits for part in ARRAYS}
         steps = {name: windows.dt for name, windows in found.splits.items()}
-        return [dict(found.metadata), steps, found.origin], arrays
+        return [dict(found.metadata), steps], arrays
 
-    (metadata, steps, origin), arrays = stages.timed(f"flights {domain.name}", lambda: hosts.from_first(read))
+    (metadata, steps), arrays = stages.timed(f"flights {domain.name}", lambda: hosts.from_first(read))
     received = {n: Trajectories(*(arrays[f"{n}/{part}"] for part in ARRAYS), dt=dt) for n, dt in steps.items()}
     noise = config.noise if config.noise_on == "all" or domain is not SOURCE else 0.0
-    return measured(Dataset(received, metadata, origin), noise, config.data_seed)
+    return measured(Dataset(received, metadata), noise, config.data_seed)
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:

@@ -21,10 +21,10 @@ from experiments.reporting.statistics import Estimate, mean_interval, spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, spread_text, tabulate
 from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages
-from hybrid_jax.cli import errors
-from hybrid_jax.cli.learning import LEVEL
-from hybrid_jax.cli.logs import STEPS, Flights
+from hybrid_jax.cli.logs import Flights
 from hybrid_jax.flights.windows import flight_of
+from hybrid_jax.identification.learning import LEVEL, STEPS
+from hybrid_jax.identification.prediction_errors import UNITS
 
 NAME = "real_flight"
 LABELS = names.LABELS | {
@@ -92,8 +92,8 @@ def error_figure(rows: Results) -> Figure:
         ", ".join([LABELS.get(model) or model, *(names.label(mode) for mode in modes if mode != names.NOMINAL)]): own
         for (model, *modes), own in groups.items()
     }
-    figure, (panels,) = subplots((PAGE, 0.9 + 0.24 * len(named)), 1, len(errors.UNITS), sharey=True)
-    for axes, (quantity, unit) in zip(panels, errors.UNITS.items(), strict=True):
+    figure, (panels,) = subplots((PAGE, 0.9 + 0.24 * len(named)), 1, len(UNITS), sharey=True)
+    for axes, (quantity, unit) in zip(panels, UNITS.items(), strict=True):
         tints = [plots.colour(keys[0]) if keys[0] != ADAPTED else METHODS["adapted"] for keys in groups]
         scores = [own.numbers(f"scores.{horizon}.{quantity}") for own in named.values()]
         dots(axes, [Line(*line) for line in zip(named, scores, tints, strict=True)])
@@ -132,7 +132,7 @@ def expected_table(found: Mapping[Cell, Results]) -> Table:
         known = rows.where(lambda row: row["expected"] is not None)
         if len(known):
             texts = []
-            for name in errors.UNITS:
+            for name in UNITS:
                 told, came = (
                     np.exp(np.log(known.numbers(f"{of}.{name}")).mean()) for of in ("expected", f"scores.{STEPS}")
                 )
@@ -156,7 +156,7 @@ def score_tables(rows: Results, found: Mapping[Cell, Results], dt: float) -> lis
         tabulate(
             f"RMSE after {int(horizon) * dt:.3g} s; {mean_over_seeds(rows)}, all test flights",
             named,
-            {title: partial(text, horizon, name) for title, name in zip(_titles(), errors.UNITS, strict=True)},
+            {title: partial(text, horizon, name) for title, name in zip(_titles(), UNITS, strict=True)},
         )
         for horizon in rows[0]["scores"]
     ]
@@ -168,12 +168,11 @@ def by_flight_table(found: Mapping[Cell, Results], best: Cell, horizon: int) -> 
     lines = []
     for flight, own in found[best].group("flight").items():
         ratios = [
-            pooled(own, str(horizon), name).mean() / pooled(frozen[flight], str(horizon), name).mean()
-            for name in errors.UNITS
+            pooled(own, str(horizon), name).mean() / pooled(frozen[flight], str(horizon), name).mean() for name in UNITS
         ]
         lines.append((flight, ", ".join(own.unique("chosen")), *(f"{ratio:.3g}" for ratio in ratios)))
     title = f"{label(*best)}: error after {horizon} intervals over that of thrust with frozen rates"
-    return Table(title, ("flight", "chosen", *errors.UNITS), lines, labels=2, folded=True)
+    return Table(title, ("flight", "chosen", *UNITS), lines, labels=2, folded=True)
 
 
 def parameter_table(found: Mapping[Cell, Results]) -> Table:
@@ -219,7 +218,7 @@ def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Map
         if not known:
             raise Undecided("none of these was run")
         outcomes, words = [], []
-        for horizon, quantity in product(found[cell][0]["scores"], errors.UNITS):
+        for horizon, quantity in product(found[cell][0]["scores"], UNITS):
             ratios = [_log_ratio(found[cell], rows, f"scores.{horizon}.{quantity}") for rows in known]
             outcomes += [ratio.below(0.0) for ratio in ratios]
             worst = Estimate(*np.exp(max(ratios, key=lambda ratio: ratio.value)))
@@ -240,4 +239,4 @@ def _log_ratio(rows: Results, others: Results, column: str) -> Estimate:
 
 
 def _titles() -> list[str]:
-    return [f"{name.replace('_', ' ')} [{unit}]" for name, unit in errors.UNITS.items()]
+    return [f"{name.replace('_', ' ')} [{unit}]" for name, unit in UNITS.items()]

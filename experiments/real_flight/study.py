@@ -13,15 +13,16 @@ from experiments.reporting.results import Results
 from experiments.runner.cache import identity_of
 from experiments.runner.stages import Found, Stages, rows_of
 from hybrid_jax.adaptation import Adaptation, adapt
-from hybrid_jax.cli import errors
-from hybrid_jax.cli.learning import Learned, adapted, learn
-from hybrid_jax.cli.logs import STEPS, Flights, lagged
+from hybrid_jax.cli.logs import Flights
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
+from hybrid_jax.flights.checks.cleaning import lag_motors
 from hybrid_jax.flights.log import FlightLog, segments
 from hybrid_jax.flights.windows import cut_windows, flight_of, folds, manoeuvre_of
+from hybrid_jax.identification.learning import STEPS, Learned, adapted, learn
+from hybrid_jax.identification.prediction_errors import UNITS, errors_of, rmse
 
 LEARNED, ADAPTED = "learned", "adapted"
 BASELINES = (names.HOLD, names.THRUST, names.LINEAR_RESIDUAL)
@@ -98,18 +99,16 @@ def of_fold(
     config: RealFlightConfig, model: VehicleModel, fold: Fold, source: Learned, seed: int, adapts: bool
 ) -> Found:
     """Return rows of one fold and seed; baselines only in the first seed."""
-    train, test = lagged(fold.train, source.lag), lagged(fold.test, source.lag)
+    train, test = ([lag_motors(log, source.lag) for log in each] for each in (fold.train, fold.test))
     physics, rigid = model.physics(), rigid_body(model.vehicle, (), model.terms)
     rows = []
 
     def score(name: str, field: AbstractVectorField, found: Adaptation | None = None, n: int = 0) -> None:
         for log in test:
-            curve = errors.rmse(errors.errors_of(field, log, max(config.horizon)))
+            curve = rmse(errors_of(field, log, max(config.horizon)))
             row: dict[str, Any] = {"flight": flight_of(log), "model": name, "n_train": n, "seed": seed}
             row |= {"fold": fold.name, "chosen": found.chosen if found else source.chosen if name == LEARNED else ""}
-            row["scores"] = {
-                str(h): dict(zip(errors.UNITS, curve[h - 1].tolist(), strict=True)) for h in config.horizon
-            }
+            row["scores"] = {str(h): dict(zip(UNITS, curve[h - 1].tolist(), strict=True)) for h in config.horizon}
             row |= expected_of(source.expected if name == LEARNED and not adapts else None, found, curve)
             row |= parameters_of(found or (source.physics if name == LEARNED else None))
             rows.append(row)
@@ -130,13 +129,13 @@ def of_fold(
 def expected_of(learned: np.ndarray | None, found: Adaptation | None, curve: np.ndarray) -> dict[str, Any]:
     """Return the expected error after a window, and whether the actual one is inside its 80 % interval."""
     if learned is not None:
-        ends = {name: each.tolist() for name, each in zip(errors.UNITS, learned.T, strict=True)}
+        ends = {name: each.tolist() for name, each in zip(UNITS, learned.T, strict=True)}
     elif found is not None and found.expected:
         first = next(iter(found.expected.values()))
-        ends = {name: list(first[OF_ADAPT.get(name, name)]) for name in errors.UNITS}
+        ends = {name: list(first[OF_ADAPT.get(name, name)]) for name in UNITS}
     else:
         return {"expected": None, "inside": None}
-    came = dict(zip(errors.UNITS, curve[STEPS - 1], strict=True))
+    came = dict(zip(UNITS, curve[STEPS - 1], strict=True))
     inside = {name: bool(low <= came[name] <= high) for name, (_, low, high) in ends.items()}
     return {"expected": {name: value for name, (value, *_) in ends.items()}, "inside": inside}
 

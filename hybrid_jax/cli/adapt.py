@@ -11,10 +11,11 @@ from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
 from hybrid_jax.cli.identified import KEEP
-from hybrid_jax.cli.learning import adapted, without_past
 from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.identification.learning import adapted, without_past
+from hybrid_jax.identification.prediction_errors import rmse_by_flight
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import load, save
 from hybrid_jax.trajectories import Trajectories
@@ -83,7 +84,7 @@ def _page(
         effective.setdefault(why, {})[name.partition("[")[0]] = None
     own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
     fields = {"before": known.field} | ({"adapted": field} if different else {})
-    curves = {name: errors.rmse_by_flight(each, flights.logs, known.steps) for name, each in fields.items()}
+    curves = {name: rmse_by_flight(each, flights.logs, known.steps) for name, each in fields.items()}
     old, *new = (errors.texts(each.mean(axis=0)[-1])[1] for each in curves.values())
     error = f"On these flights the error of velocity after {known.steps * known.dt:g} s"
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])

@@ -14,6 +14,7 @@ from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, Known, flights_fo
 from hybrid_jax.dynamics.baselines import FrozenRates, Kinematics
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.windows import flight_of
+from hybrid_jax.identification.prediction_errors import UNITS, errors_of, ratio, rmse, rmse_by_flight
 from hybrid_jax.io.models import load
 
 __all__ = ["LISTS", "Options", "run"]
@@ -42,24 +43,24 @@ def run(options: Options) -> int:
     with step("predicting") as told:
         others = {"thrust, rates frozen": FrozenRates(rigid_body(known.vehicle)), "no forces": Kinematics()}
         steps = LONGER * known.steps
-        each = [errors.errors_of(known.field, log, steps) for log in flights.logs]
-        curves = {"model": np.stack([errors.rmse(one) for one in each])}
-        curves |= {name: errors.rmse_by_flight(field, flights.logs, steps) for name, field in others.items()}
+        each = [errors_of(known.field, log, steps) for log in flights.logs]
+        curves = {"model": np.stack([rmse(one) for one in each])}
+        curves |= {name: rmse_by_flight(field, flights.logs, steps) for name, field in others.items()}
         told(f"{sum(map(len, each))} windows")
     places = {"short": known.steps - 1, "long": -1}
     ends = {name: {end: found[:, at] for end, at in places.items()} for name, found in curves.items()}
     for end in ends.values():  # over all flights
-        end["mean"] = errors.rmse(end["short"])
+        end["mean"] = rmse(end["short"])
     shown = _page(options, known, flights, curves, each)
-    page.write(options.out, "check", shown, {"flights": list(flights.contents), "units": errors.UNITS, "rmse": ends})
+    page.write(options.out, "check", shown, {"flights": list(flights.contents), "units": UNITS, "rmse": ends})
     return 0
 
 
 def _page(options: Options, known: Known, flights: Flights, curves: dict[str, Any], each) -> page.Page:
     at, frozen = known.steps - 1, curves["thrust, rates frozen"]
-    better = float(np.exp(np.log(frozen[:, at] / curves["model"][:, at]).mean()))
-    rows = [(name, *errors.texts(np.sqrt(np.mean(np.square(found[:, at]), axis=0)))) for name, found in curves.items()]
-    header = ("", *(name.replace("_", " ") for name in errors.UNITS))
+    better = ratio(frozen[:, at], curves["model"][:, at])
+    rows = [(name, *errors.texts(rmse(found[:, at]))) for name, found in curves.items()]
+    header = ("", *(name.replace("_", " ") for name in UNITS))
     names = [flight_of(log) for log in flights.logs]
     by_flight = [(name, *errors.texts(curves["model"][i, at])) for i, name in enumerate(names)]
     beaten = (

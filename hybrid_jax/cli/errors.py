@@ -1,28 +1,20 @@
-"""Prediction errors on flights, and their tables and figures for the verbs."""
+"""Tables and figures of prediction errors and parameters, for the verbs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from hybrid_jax import trajectories
 from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.cli.page import STYLE, Table
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
-from hybrid_jax.estimation import observe
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.scores import flight_errors
-from hybrid_jax.flights.windows import cut_windows, sequences
+from hybrid_jax.identification.prediction_errors import UNITS
 
-UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
 BASELINE = (
     "RMSE is the root mean square of the error of predictions. Frozen rates are a baseline: the thrust of the motors "
     "acts, and body rates stay as they are."
 )
-MOST = 500  # windows of a flight
 LINES = {  # colour and dashes of a model, the same on every page
     "thrust, rates frozen": ("0.6", "--"),
     "no forces": ("0.6", ":"),
@@ -33,33 +25,6 @@ LINES = {  # colour and dashes of a model, the same on every page
     "hybrid": ("#0072B2", "-"),
     "hybrid with its past": ("#0072B2", "--"),
 }
-
-
-def rmse_by_flight(
-    field: AbstractVectorField, logs: Sequence[FlightLog], steps: int
-) -> Float[np.ndarray, "flights t 4"]:
-    """Compute the RMSE in UNITS on each flight at the end of each interval."""
-    return np.stack([rmse(errors_of(field, log, steps)) for log in logs])
-
-
-def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[np.ndarray, "n t 4"]:
-    """Compute the errors in UNITS for windows of a flight at the end of each interval."""
-    if isinstance(field, DisturbanceModel):  # which starts from what was seen before
-        parts = [(each, observe(field, each)[0]) for each in sequences([log], steps)]
-        cut = [trajectories.windows_of(seen, np.asarray(each.u[0]), each.dt, steps=steps) for each, seen in parts]
-        windows = trajectories.concatenate(cut)
-    else:
-        windows = cut_windows([log], steps, steps)
-    places = np.arange(-(-len(windows) // MOST) * MOST) % len(windows)  # so that flights share a program
-    return np.stack(flight_errors(field, windows[places], chunk=MOST), axis=-1)[: len(windows)]
-
-
-def rmse(errors: Float[np.ndarray, "n t 4"]) -> Float[np.ndarray, "t 4"]:
-    return np.sqrt(np.mean(np.square(errors), axis=0))
-
-
-def ratio(errors: Float[np.ndarray, "*n 4"], others: Float[np.ndarray, "*n 4"]) -> float:
-    return float(np.exp(np.log(errors / others).mean()))
 
 
 def texts(values: Float[np.ndarray, " 4"]) -> list[str]:

@@ -13,13 +13,14 @@ from hybrid_jax.cli import errors, identify, logs, page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
 from hybrid_jax.cli.inspect import inspected, write_vehicle
-from hybrid_jax.cli.learning import CANDIDATES, FROZEN, PAST, Learned, learn
-from hybrid_jax.cli.logs import STEPS, FlightOptions, Flights, paths_of, read_flights
+from hybrid_jax.cli.logs import FlightOptions, Flights, paths_of, read_flights
 from hybrid_jax.dynamics.actuators import NAMES
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.flights.conversion import DT, missing_states
 from hybrid_jax.flights.load import read_recording
+from hybrid_jax.identification.learning import CANDIDATES, FROZEN, PAST, STEPS, Learned, learn
+from hybrid_jax.identification.prediction_errors import UNITS, ratio
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
@@ -120,7 +121,7 @@ def _about(options: Options, model: VehicleModel, flights: Flights, found: Learn
     features = RIGID_BODY_SPACE.features(
         *(np.concatenate([getattr(log, part) for log in flights.logs]) for part in "xu")
     )
-    ends = {name: list(each) for name, *each in zip(errors.UNITS, *found.expected, strict=True)}
+    ends = {name: list(each) for name, *each in zip(UNITS, *found.expected, strict=True)}
     return {
         "steps": STEPS,
         "vehicle": model.vehicle.name,
@@ -136,14 +137,14 @@ def _about(options: Options, model: VehicleModel, flights: Flights, found: Learn
 
 def _page(options: Options, flights: Flights, found: Learned, dt: float) -> page.Page:
     seconds, frozen = STEPS * dt, found.left_out[FROZEN][:, -1]
-    better = errors.ratio(frozen, found.left_out[found.chosen][:, -1])
+    better = ratio(frozen, found.left_out[found.chosen][:, -1])
     cells = [errors.texts(each) for each in (*found.expected, np.exp(np.log(frozen).mean(axis=0)))]
     rows = [
         (name.replace("_", " "), value, f"{low.partition(chr(160))[0]} to {high}", baseline)
-        for name, value, low, high, baseline in zip(errors.UNITS, *cells, strict=True)
+        for name, value, low, high, baseline in zip(UNITS, *cells, strict=True)
     ]
     by_flight = [
-        (name, *(f"{errors.ratio(found.left_out[each][i, -1], frozen[i]):.3g}" for each in CANDIDATES))
+        (name, *(f"{ratio(found.left_out[each][i, -1], frozen[i]):.3g}" for each in CANDIDATES))
         for i, name in enumerate(flights.contents)
     ]
     helps = "improves the predictions" if found.chosen.startswith("hybrid") else "does not help"

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import ChecksFailed, in_flags, step
-from hybrid_jax.cli.compared import compared, unlearned_drag
 from hybrid_jax.cli.logs import grouped, recordings_of
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
@@ -23,6 +22,7 @@ from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.recording import Recording, unit_of
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, window_errors
+from hybrid_jax.identification.log_checks import compared, unlearned_drag
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
@@ -157,7 +157,7 @@ def _page(options: Any, found: Identified, read: Read, layout: Layout, values: M
                 figure(found.field, read.logs, layout),
             )
         ],
-        [*warned(read, found), *_notes(found, read.logs, unseen)],
+        [*warned(read, found.converged), *_notes(found, read.logs, unseen)],
         [f"You should excite {', '.join(unseen)} more, or learn fewer parameters." if unseen else again],
         [
             *([page.Table("All parameters, with 95 % intervals", header, lines)] * (len(lines) > LINES)),
@@ -167,9 +167,9 @@ def _page(options: Any, found: Identified, read: Read, layout: Layout, values: M
     )
 
 
-def warned(read: Read, found: Identified) -> list[str]:
+def warned(read: Read, converged: bool = True) -> list[str]:
     stopped = "The fit stopped before it converged: start closer, or learn fewer parameters."
-    return [ANYWAY.format(len(read.failed))] * bool(read.failed) + [stopped] * (not found.converged)
+    return [ANYWAY.format(len(read.failed))] * bool(read.failed) + [stopped] * (not converged)
 
 
 def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) -> list[str]:

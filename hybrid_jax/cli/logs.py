@@ -35,12 +35,12 @@ from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import FlightLog, unevenness
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.windows import require_length
+from hybrid_jax.identification.learning import STEPS
 from hybrid_jax.io.archive import digest
 from hybrid_jax.io.models import Model
 from hybrid_jax.vehicle import Vehicle
 
 LISTS = ("--polynomial", "--motor-order", "--topics", "--learn")
-STEPS = 10  # intervals of a window
 ONE_TO_ONE = (0.0, 1.0)  # rotor speed = command, in whatever unit: motors are still compared with the motion
 CUT = ("time on the ground",)  # is cut out
 CHANGED = 2.0  # factor by which thrust may differ from the vehicle's where a change is asked for
@@ -248,11 +248,6 @@ def look(
     return Looked(log, [each for each in checks if each not in excused], refusal, notes)
 
 
-def lagged(logs: Sequence[FlightLog], lag: float) -> list[FlightLog]:
-    """Apply a rotor lag [s] to the motors of flights."""
-    return [lag_motors(log, lag) for log in logs] if lag else list(logs)
-
-
 class Known(NamedTuple):
     """A model of a vehicle, with its constants and the metadata written by `fit`."""
 
@@ -279,7 +274,7 @@ def flights_for(known: Known, folder: Path, options: FlightOptions, changed: boo
     lag, options = known.about.get("lag", 0.0), replace(options, polynomial=polynomial)
     found = read_flights(folder, known.vehicle, known.dt, options, changed, lag > 0)
     require_unseen(known.about["learned_from"] if unseen else {}, found.contents)
-    return found._replace(logs=lagged(found.logs, lag))
+    return found._replace(logs=[lag_motors(log, lag) for log in found.logs])
 
 
 def unlike(known: Known, flights: Flights) -> list[str]:

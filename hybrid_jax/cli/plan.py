@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
-from hybrid_jax.cli.learning import without_past
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.identification.learning import without_past
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.io.models import load
 from hybrid_jax.planning import Excitation, FlightBounds, excitation

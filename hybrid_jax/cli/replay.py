@@ -16,9 +16,9 @@ from PIL import Image
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
-from hybrid_jax.cli.learning import without_past
 from hybrid_jax.cli.logs import LISTS, FlightOptions, flights_for, known_of
 from hybrid_jax.flights.windows import cut_windows
+from hybrid_jax.identification.learning import without_past
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.io.models import load

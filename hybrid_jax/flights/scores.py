@@ -2,19 +2,19 @@
 
 from typing import NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import checks, rotation
+from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
+CHUNK = 500  # windows at a time
 Errors = Float[Array | np.ndarray, "*n"]
 
 
@@ -41,33 +41,27 @@ def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"
     return FlightErrors(*(jnp.linalg.norm(part, axis=-1) for part in parts))
 
 
-def flight_errors(
-    field: AbstractVectorField, windows: Trajectories, solver: diffrax.AbstractSolver | None = None, chunk: int = 2000
-) -> FlightErrors:
+def flight_errors(field: AbstractVectorField, windows: Trajectories) -> FlightErrors:
     """Compute the errors (n, t) of a field in inference mode at the end of every interval of every window.
 
     Args:
         field: the model.
         windows: true states and inputs; the first 13 numbers of a state are as in `hybrid_jax.state`.
-        solver: ODE solver, by default the classical Runge–Kutta method of fourth order.
-        chunk: number of windows per batch.
 
     Raises:
         ValueError: the windows are malformed, or their states are not a multirotor's.
     """
     check(windows, "windows")
-    checks.count("chunk", chunk)
     if windows.x.shape[-1] < STATE_SIZE:
         raise ValueError(f"windows: states of {STATE_SIZE} expected, as in state.py, got {windows.x.shape[-1]}")
     check_attitudes(windows, "windows")
-    # The last part is padded, so that all parts share one program.
-    chunk = min(chunk, len(windows))
-    parts = (np.arange(start, start + chunk) % len(windows) for start in range(0, len(windows), chunk))
-    found = [jax.device_get(_errors(field, windows[part], solver)) for part in parts]
+    # The last part is padded, so that all flights share one program.
+    parts = (np.arange(start, start + CHUNK) % len(windows) for start in range(0, len(windows), CHUNK))
+    found = [jax.device_get(_errors(field, windows[part])) for part in parts]
     return FlightErrors(*(np.concatenate(arrays)[: len(windows)] for arrays in zip(*found, strict=True)))
 
 
 @eqx.filter_jit
-def _errors(field, windows: Trajectories, solver) -> FlightErrors:
-    predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, solver)
+def _errors(field, windows: Trajectories) -> FlightErrors:
+    predicted = rollout_batch(field, windows.x0, windows.u, windows.dt)
     return errors_between(*(each[..., :STATE_SIZE] for each in (predicted, jnp.asarray(windows.x))))

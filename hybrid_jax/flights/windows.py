@@ -72,9 +72,7 @@ def load_windows(
     logs = load_logs(folder, **given, dt=dt, cleaning=cleaning, vehicle=vehicle, failed=failed)
     report([(log.name, check) for log in logs for check in check_log(log, vehicle)], failed)
     require_common_interval(logs)
-    if motor_time_constant:
-        logs = [lag_motors(log, motor_time_constant) for log in logs]
-    return cut_windows(logs, steps, stride)
+    return cut_windows([lag_motors(log, motor_time_constant) for log in logs], steps, stride)
 
 
 def flight_of(log: FlightLog) -> str:

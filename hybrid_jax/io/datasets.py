@@ -3,7 +3,7 @@
 import platform
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -26,57 +26,37 @@ class Dataset:
     Attributes:
         splits: the windows of each split by its name, for example "train".
         metadata: JSON values. Its entry `config` determines the windows; other entries describe them, e.g. versions.
-        origin: the file that it was read from, for messages.
     """
 
     splits: Mapping[str, Trajectories]
     metadata: Mapping[str, Any]
-    origin: str = field(default="dataset", compare=False)
 
     @property
     def config(self) -> Mapping[str, Any]:
         """The configuration that determines the windows."""
         return self.metadata.get("config", {})
 
-    def first(self, split: str, count: int | None = None) -> Trajectories:
-        """The first windows of a split.
 
-        Args:
-            split: its name.
-            count: how many windows; None for all.
-
-        Raises:
-            ValueError: there are fewer, or there is no such split.
-        """
-        if split not in self.splits:
-            raise ValueError(f"{self.origin}: has no split {split!r}, only {', '.join(self.splits)}")
-        windows = self.splits[split]
-        if count is not None and not 1 <= count <= len(windows):
-            raise ValueError(f"{self.origin}: {count} windows of split {split!r} requested, but it has {len(windows)}")
-        return windows[:count]
-
-
-def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) -> None:
+def save_dataset(path: str | Path, dataset: Dataset) -> None:
     """Write a dataset atomically. A file with the same windows and configuration is left unchanged.
 
     Args:
         path: of the file to write.
         dataset: the windows and their metadata.
-        overwrite: whether a file with other content may be replaced.
 
     Raises:
         ValueError: malformed windows, windows of a vehicle without unit quaternions, metadata that are not JSON, or a
-            file with other content while `overwrite` is false.
+            file with other content.
         OSError: the file cannot be written.
     """
     path = Path(path)
     _check_splits(path, dataset)
-    if path.exists() and not overwrite:
+    if path.exists():
         content = content_hash(dataset)
         with suppress(ValueError):
             if content_hash(load_dataset(path)) == content:
                 return
-        raise ValueError(f"{path}: exists with other content; choose another path or pass overwrite=True")
+        raise ValueError(f"{path}: exists with other content; choose another path, or remove it")
     splits, arrays = _content(dataset)
     save_archive(path, FORMAT, {"about": dataset.metadata, "splits": splits}, arrays)
 
@@ -98,7 +78,7 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
             name: Trajectories(*(arrays[f"{name}/{part}"] for part in ARRAYS), dt=float(entry["dt"]))
             for name, entry in header["splits"].items()
         }
-        dataset = Dataset(splits, dict(header["about"]), origin=str(path))
+        dataset = Dataset(splits, dict(header["about"]))
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: not a complete dataset: lacks {first_line(error)}") from error
     _check_splits(path, dataset)

@@ -7,9 +7,9 @@ import pytest
 from recorded import LOGS
 
 import hybrid_jax as hj
-from hybrid_jax.cli.errors import errors_of
-from hybrid_jax.cli.learning import STEPS, choose, expected, with_past, without_past
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
+from hybrid_jax.identification.learning import STEPS, choose, expected, with_past, without_past
+from hybrid_jax.identification.prediction_errors import errors_of
 from hybrid_jax.vehicle import IRIS
 
 BODY = hj.rigid_body(IRIS)

@@ -15,8 +15,8 @@ from smoke import ROOT
 from writers import MAP
 
 from hybrid_jax.cli.command import VERBS
-from hybrid_jax.cli.learning import without_past
 from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.identification.learning import without_past
 from hybrid_jax.integrate import rollout
 from hybrid_jax.io.models import load, save
 from hybrid_jax.sim import PARAMETER_SHIFT

@@ -20,11 +20,11 @@ from experiments.reporting.results import Results
 from experiments.runner.command import read
 from experiments.runner.stages import Stages
 from hybrid_jax.cli.command import split_lists
-from hybrid_jax.cli.errors import UNITS
 from hybrid_jax.cli.help import option_of
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.windows import manoeuvre_of
+from hybrid_jax.identification.prediction_errors import UNITS
 from hybrid_jax.vehicle import IRIS
 
 

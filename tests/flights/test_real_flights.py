@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_jax.cli.estimates import estimate
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.checks.consistency import OK, check_log
@@ -14,6 +13,7 @@ from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.load import CRAZYFLIE, ULOG, find_logs, format_of, load_log, read_recording
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import cut_windows
+from hybrid_jax.identification.estimates import estimate
 from hybrid_jax.vehicle import load_vehicle
 
 FOLDER = Path(os.environ.get("HYBRID_JAX_FLIGHTS", Path(__file__).parents[3] / "shared" / "flights"))

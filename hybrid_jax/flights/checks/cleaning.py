@@ -112,6 +112,8 @@ def delay(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
 
 def lag_motors(log: FlightLog, time_constant: float) -> FlightLog:
     """Replace motors u by the mean over each interval of w with τ ẇ = u − w; segments start in equilibrium."""
+    if not time_constant:
+        return log
     u, step = log.u.copy(), log.dt / time_constant
     kept = np.exp(-step)
     for part in even_segments(log):

@@ -142,3 +142,10 @@ def moving_mean(values: Float[np.ndarray, "n d"], width: int) -> Float[np.ndarra
     """Average each `width` consecutive rows."""
     total = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
     return (total[width:] - total[:-width]) / width
+
+
+def band_passed(values: Float[np.ndarray, "n d"], fast: int, slow: int) -> Float[np.ndarray, "m d"]:
+    """Average each `fast` consecutive rows, without the average of `slow` of these around each."""
+    smooth = moving_mean(values, fast)
+    trend = moving_mean(smooth, slow)
+    return smooth[slow // 2 :][: len(trend)] - trend

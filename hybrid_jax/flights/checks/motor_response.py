@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from hybrid_jax.flights.checks.mistakes import middle, moving_mean
+from hybrid_jax.flights.checks.mistakes import band_passed, middle, moving_mean
 from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.state import BODY_RATES
 from hybrid_jax.vehicle import Vehicle
@@ -95,10 +95,6 @@ def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], 
         return np.zeros((0, 3)), np.zeros((0, log.u.shape[1]))
     mean = middle(omega)
     torque = inertia * np.diff(omega, axis=0) / np.diff(log.t)[:, None] + np.cross(mean, inertia * mean)
-    bands = []
-    for values in (torque, log.u[:-1] ** 2):
-        smooth = moving_mean(values, fast)
-        trend = moving_mean(smooth, slow)
-        bands.append(smooth[slow // 2 :][: len(trend)] - trend)
     whole = moving_mean(sound[:, None].astype(float), fast + slow - 1) > 1 - 1e-9
-    return np.where(whole, bands[0], 0.0), np.where(whole, bands[1], 0.0)
+    quick = (np.where(whole, band_passed(each, fast, slow), 0.0) for each in (torque, log.u[:-1] ** 2))
+    return next(quick), next(quick)

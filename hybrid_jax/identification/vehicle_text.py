@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from hybrid_jax.cli.estimates import GRAVITY, Estimate
+from hybrid_jax.identification.estimates import GRAVITY, Estimate
 
 ARM, MASS = 0.1, 1.0  # m and kg, where they were not given
 LEARN, OF_VELOCITY = ("Ix", "Iy", "Iz", "k_rotors", "rate_damping"), ("drag", "aerodynamic_moment")

@@ -1,4 +1,4 @@
-"""Learn a vehicle from flights, with physics only or with a network, for `fit` and experiments."""
+"""Learn a vehicle from flights, with physics only or with a network, and adapt it to flights after a change."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,23 +10,23 @@ import scipy
 from jaxtyping import Float
 
 from hybrid_jax.adaptation import METHODS, Adaptation, Auto, adapt
-from hybrid_jax.cli import errors
-from hybrid_jax.cli.logs import STEPS, lagged
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.estimation import fit_disturbance
-from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS
+from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.windows import cut_windows, sequences
+from hybrid_jax.identification.prediction_errors import rmse_by_flight
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.training import Settings, fit, rates_by_group
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.trajectories import Trajectories, split
 
+STEPS = 10  # intervals of a window
 LEVEL = 0.8  # of the interval of the error on a new flight
 TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
 FOLDS = 3  # at most so many groups of flights are left out in turn
@@ -37,21 +37,38 @@ FROZEN, CANDIDATES = "thrust, rates frozen", ("physics", "hybrid", f"physics{PAS
 
 
 class Learned(NamedTuple):
-    """A learned model of a vehicle."""
+    """A learned model of a vehicle.
+
+    Attributes:
+        field: the model.
+        physics: the fit of the physics without the network, with intervals.
+        chosen: one of `CANDIDATES`.
+        lag: time constant of the rotors behind the logged motors [s].
+        left_out: RMSE of frozen rates and of each candidate on held-out flights after each interval of `dt`, in the
+            units of `prediction_errors.UNITS`.
+        windows: some that it was learned from, by which `adapted` judges its errors without any change.
+        expected: error on a new flight after `STEPS` intervals: value, low and high end of the 80 % interval.
+    """
 
     field: AbstractVectorField
-    physics: Adaptation  # without the network, with intervals
-    chosen: str  # one of CANDIDATES
-    lag: float  # of the rotors behind the logged motors [s]
-    left_out: dict[str, Float[np.ndarray, "flights t 4"]]  # RMSE of FROZEN and each candidate on held-out flights
-    windows: Trajectories  # some that it was learned from, by which `adapt` judges its errors without any change
-    expected: Float[np.ndarray, "3 4"]  # error on a new flight, in `errors.UNITS`: value, low, high
+    physics: Adaptation
+    chosen: str
+    lag: float
+    left_out: dict[str, Float[np.ndarray, "flights t 4"]]
+    windows: Trajectories
+    expected: Float[np.ndarray, "3 4"]
 
 
 def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Learned:
-    """Learn from all flights (two or more), and choose by held-out flights whether to add a network to the physics."""
+    """Learn from all flights, and choose by held-out flights whether to add a network to the physics.
+
+    Args:
+        model: the vehicle file, with the parameters to learn.
+        logs: two flights or more, at one interval, checked and in the air.
+        seed: seed of the network.
+    """
     lag = _lag(model, logs) if LAG in model.learn else model.terms.motor_time_constant
-    logs = lagged(logs, lag)
+    logs = [lag_motors(log, lag) for log in logs]
     # One scale of errors for all flights, so that all trainings share a program.
     settings = Settings(objective=scaled_loss(model.physics(), _windows(logs, TRAINED)))
     parts: dict[str, list[Float[np.ndarray, "f t 4"]]] = {name: [] for name in (FROZEN, *CANDIDATES)}
@@ -63,7 +80,7 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
         both = physics, _hybrid(physics, kept, seed, settings)
         fields = FrozenRates(model.physics()), *both, *(with_past(field, kept) for field in both)
         for name, field in zip(parts, fields, strict=True):
-            parts[name].append(errors.rmse_by_flight(field, [logs[i] for i in group], STEPS))
+            parts[name].append(rmse_by_flight(field, [logs[i] for i in group], STEPS))
     order = np.argsort(np.concatenate(groups))
     found = {name: np.concatenate(each)[order] for name, each in parts.items()}
     ends = {name: each[:, -1] for name, each in found.items()}
@@ -82,6 +99,12 @@ def adapted(
     """Adapt the physics of a model to at most `most` windows of flights after a change, and what it has of the past.
 
     Also return the adaptation of the model without its past.
+
+    Args:
+        field: the source model.
+        logs: flights after the change.
+        learned_from: windows that the source was trained on, see `hybrid_jax.adapt`.
+        most: the most windows to adapt to.
     """
     windows = cut_windows(logs, STEPS, STEPS, most)
     found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)
@@ -108,13 +131,11 @@ def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
     """Find the lag with which physics fitted to all but the last flight predicts that flight best."""
 
     def error(lag: float) -> float:
-        flights = lagged(logs, lag)
+        flights = [lag_motors(log, lag) for log in logs]
         train = _windows(flights[:-1], OF_LAG)
         settings = Settings(objective=scaled_loss(model.physics(), train))
         field = METHODS[PHYSICS].solve(model.physics(), train, train, settings).field
-        ends = [
-            errors.rmse_by_flight(each, flights[-1:], STEPS)[:, -1] for each in (field, FrozenRates(model.physics()))
-        ]
+        ends = [rmse_by_flight(each, flights[-1:], STEPS)[:, -1] for each in (field, FrozenRates(model.physics()))]
         return float(np.log(ends[0] / ends[1]).mean())
 
     found = {lag: off for lag in TIME_CONSTANTS if np.isfinite(off := error(lag))}

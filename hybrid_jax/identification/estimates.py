@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from hybrid_jax.flights.attitude import interpolate, mean_of_held
 from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS
-from hybrid_jax.flights.checks.mistakes import moving_mean
+from hybrid_jax.flights.checks.mistakes import band_passed
 from hybrid_jax.flights.checks.motor_response import FAST
 from hybrid_jax.flights.conversion import motors_of
 from hybrid_jax.flights.recording import Recording, Signal
@@ -162,9 +162,7 @@ def _regress(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, "3
     for piece in pieces:
         fast, slow = (max(1, round(span / piece.dt)) for span in (FAST, SLOW))
         turned = np.diff(piece.omega, axis=0) / piece.dt
-        smooth = moving_mean(np.concatenate([turned, (_lagged(piece, lag) ** 2)[:-1]], axis=1), fast)
-        trend = moving_mean(smooth, slow)
-        rows.append(smooth[slow // 2 :][: len(trend)] - trend)
+        rows.append(band_passed(np.concatenate([turned, (_lagged(piece, lag) ** 2)[:-1]], axis=1), fast, slow))
     both = np.concatenate(rows)
     turned, squares = both[:, :3], both[:, 3:]
     effect = np.linalg.lstsq(squares, turned, rcond=1e-6)[0].T
