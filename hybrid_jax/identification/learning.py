@@ -69,13 +69,14 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
     """
     lag = _lag(model, logs) if LAG in model.learn else model.terms.motor_time_constant
     logs = [lag_motors(log, lag) for log in logs]
-    # One scale of errors for all flights, so that all trainings share a program.
+    # One scale of errors and number of windows for all flights, so that all trainings share a program.
     settings = Settings(objective=scaled_loss(model.physics(), _windows(logs, TRAINED)))
+    windows = cut_windows(logs, STEPS, STEPS, TRAINED)
     parts: dict[str, list[Float[np.ndarray, "f t 4"]]] = {name: [] for name in (FROZEN, *CANDIDATES)}
     groups = [range(i, len(logs), min(FOLDS, len(logs))) for i in range(min(FOLDS, len(logs)))]
     for group in groups:
         kept = [log for i, log in enumerate(logs) if i not in group]
-        train = _windows(kept, TRAINED)
+        train = _windows(kept, len(windows), STEPS)
         physics = METHODS[PHYSICS].solve(model.physics(), train, train, settings).field
         both = physics, _hybrid(physics, kept, seed, settings)
         fields = FrozenRates(model.physics()), *both, *(with_past(field, kept) for field in both)
@@ -85,7 +86,6 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
     found = {name: np.concatenate(each)[order] for name, each in parts.items()}
     ends = {name: each[:, -1] for name, each in found.items()}
     chosen = choose({name: np.log(ends[name] / ends[FROZEN]).mean(axis=1) for name in CANDIDATES})
-    windows = cut_windows(logs, STEPS, STEPS, TRAINED)
     physics = adapt(model.physics(), windows, method=PHYSICS, settings=settings)
     field = physics.field if chosen.startswith("physics") else _hybrid(physics.field, logs, seed, settings)
     field = with_past(field, logs) if chosen.endswith(PAST) else field
@@ -144,9 +144,9 @@ def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
     return min(found, key=lambda lag: found[lag])
 
 
-def _windows(logs: Sequence[FlightLog], count: int) -> Trajectories:
+def _windows(logs: Sequence[FlightLog], count: int, stride: int = 1) -> Trajectories:
     """Select evenly spaced windows, repeated if there are fewer, so that trainings share a compiled program."""
-    windows = cut_windows(logs, STEPS, 1, count)
+    windows = cut_windows(logs, STEPS, stride, count)
     return windows[np.arange(count) % len(windows)]
 
 
