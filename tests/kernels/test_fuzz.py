@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from test_rollouts import both_ways, calls, doubled, needs_kernels, trained, trained_by_jax
 
-from hybrid_jax import kernels, rollouts
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.integrate import RK4, integrate
-from hybrid_jax.kernels import library
+from hybrid_jax import AbstractVectorField, kernels
 
-STATES, INPUTS, WEIGHTS, DT, DEPTH = 12, 2, 6, 0.05, 4
+STATES, INPUTS, WEIGHTS, DEPTH = 12, 2, 6, 4
 ONE = {
     **{name: getattr(jnp, name) for name in ("sin", "cos", "tanh", "arctan", "arcsinh", "abs", "square")},
     **{name: getattr(jax.nn, name) for name in ("sigmoid", "relu", "softplus")},
@@ -58,21 +56,7 @@ class Random(AbstractVectorField):
         return jnp.tanh(drift) - 0.1 * self.matrix @ jnp.sin(x)
 
 
-def both_ways(function, field, x0, u, d_states):
-    arrays, rest = eqx.partition(field, eqx.is_array)
-    states, pullback = jax.vjp(lambda arrays, x0, u: function(eqx.combine(arrays, rest), x0, u), arrays, x0, u)
-    return states, pullback(d_states)
-
-
-def by_kernel(field, x0, u):
-    return rollouts.rollout_minibatch(field, x0, u, DT, RK4())
-
-
-def by_jax(field, x0, u):
-    return integrate(jax.vmap(field, in_axes=-1, out_axes=-1), x0, u, DT, RK4())
-
-
-@pytest.mark.skipif(library.obstacle() is not None, reason=kernels.status())
+@needs_kernels
 @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3, 100))])
 def test_a_hundred_random_fields_are_those_of_jax(seed):
     rng = np.random.default_rng(100 + seed)
@@ -83,12 +67,10 @@ def test_a_hundred_random_fields_are_those_of_jax(seed):
     field = Random(jnp.asarray(draw(WEIGHTS)), jnp.asarray(draw(STATES, STATES)), seed)
     arguments = draw(STATES, 21), draw(2, INPUTS, 21), draw(2, STATES, 21)
     arguments[0][3, 4] = np.nan
-    function = eqx.filter_jit(partial(both_ways, by_kernel))
-    assert "custom_call @hybrid_jax_" in function.lower(field, *arguments).as_text(), kernels.status()
-    found = function(field, *arguments)
+    assert calls(trained, field, *arguments[:2]), kernels.status()
+    found = eqx.filter_jit(partial(both_ways, partial(trained, dt=0.05)))(field, *arguments)
     with jax.enable_x64(True):
-        double = jax.tree.map(lambda leaf: np.asarray(leaf, float) if eqx.is_array(leaf) else leaf, (field, *arguments))
-        exact = eqx.filter_jit(partial(both_ways, by_jax))(*double)
+        exact = eqx.filter_jit(partial(both_ways, partial(trained_by_jax, dt=0.05)))(*doubled((field, *arguments)))
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
         np.testing.assert_array_equal(np.isnan(one), np.isnan(other))
         known = ~np.isnan(other)

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks.subjects import DT, untrained
-from hybrid_jax import kernels, runtime
-from hybrid_jax.integrate import rollout_batch
+from hybrid_jax import kernels, rollout_batch, runtime
 from hybrid_jax.kernels import fields, library
 from hybrid_jax.rollouts import predict
 
@@ -25,7 +24,6 @@ needs_kernels = pytest.mark.skipif(library.obstacle() is not None, reason=kernel
 
 @pytest.fixture
 def anew():
-    """Nothing is known of kernels, before and after."""
     fields._KNOWN.clear()
     library.obstacle.cache_clear()
     library._begun.cache_clear()
@@ -129,11 +127,6 @@ def test_a_folder_of_others_is_not_used(cache):
         checked()
 
 
-def open_folder(tmp_path, monkeypatch):
-    (tmp_path / "hybrid_jax" / "kernels").mkdir(parents=True, mode=0o777)
-    (tmp_path / "hybrid_jax" / "kernels").chmod(0o777)
-
-
 def compiler_that(does):
     """A change that puts a compiler in the place of g++; "$last" is the file that it should write."""
 
@@ -163,7 +156,6 @@ WITHOUT = {
     "source that GCC rejects": (rejected, "could not be compiled: "),
     "a library that does not load": (compiler_that('echo no > "$last"'), "not be loaded"),
     "a library without its functions": (compiler_that('g++ -shared -x c /dev/null -o "$last"'), "not be loaded"),
-    "a folder of all": (open_folder, "0700"),
     "no folder": (lambda path, _: (path / "hybrid_jax").touch(), "not be kept"),
 }
 

@@ -1,4 +1,4 @@
-"""Laws of views: what a network cannot see changes nothing, what it may not write stays zero."""
+"""Laws of views: what a network cannot see changes nothing, what it may not write stays zero; and of rotors' thrust."""
 
 from dataclasses import replace
 
@@ -8,23 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from choices import PAIRS, mostly_slow, slow
-from evaluations import train_batch
+from evaluations import infer_batch, train_batch
 
-from hybrid_jax import Hybrid, residual_network, rigid_body, rotation
+from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid, Trajectories, residual_network, rigid_body, rotation
 from hybrid_jax.dynamics import base
-from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.networks import views
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.networks.views import View, multirotor_network
-from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
+from hybrid_jax.networks.standardise import with_scaling
+from hybrid_jax.networks.views import INPUTS, RotorThrust, View, _nearness, multirotor_network
+from hybrid_jax.sim.forces import ground_effect, parameters_of, rotor_altitudes
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
-from hybrid_jax.vehicle import IRIS
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 
 KEY = jax.random.key(0)
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
-VIEWS = [pair for pair in PAIRS if pair[1] != "rotors"]  # see test_rotors
+VIEWS = [pair for pair in PAIRS if pair[1] != "rotors"]  # these have laws of their own
 FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in views.FROM_THE_BODY]
 
 
@@ -61,13 +60,6 @@ def test_by_default_the_network_is_the_paper_s(norm):
     plain = residual_network(13, 4, KEY, hidden=20, scaling=HOVER, norm=norm)
     assert eqx.tree_equal(multirotor_network(IRIS, KEY, hidden=20, scaling=HOVER, norm=norm), plain)
     assert eqx.tree_equal(multirotor_network(IRIS, KEY), residual_network(13, 4, KEY))
-
-
-@pytest.mark.parametrize("options", [{"inputs": "world"}, {"outputs": "v"}, {"norm": "group"}], ids=str)
-def test_an_unknown_name_is_refused(options):
-    (name, value), *_ = options.items()
-    with pytest.raises(ValueError, match=rf"{name} must be one of .*'{value}'"):
-        multirotor_network(IRIS, KEY, **options)
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(pair for pair in VIEWS if pair[0] != "all"))
@@ -119,10 +111,21 @@ def test_near_the_ground_each_rotor_is_as_high_as_in_the_simulator():
     np.testing.assert_array_equal(jnp.delete(seen, np.arange(1, 5), axis=0), view("no_xy_yaw").read(x))
 
 
-@pytest.mark.parametrize("options", [{"inputs": "near_ground"}, {"outputs": "rotors"}], ids=str)
-def test_rotors_of_an_unknown_vehicle_are_refused(options):
-    with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
-        view(**options, vehicle=replace(IRIS, rotor_radius=0.0))
+SIZELESS = replace(IRIS, rotor_radius=0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"inputs": "world"}, "inputs must be one of .*'world'"),
+        ({"norm": "group"}, "norm must be one of .*'group'"),
+        ({"outputs": "rotors", "vehicle": SIZELESS}, r"vehicle\.rotor_radius must be .*got 0"),
+        ({"outputs": "motion"}, "outputs 'motion' needs inputs of body or body_motion, got 'all'"),
+    ],
+)
+def test_a_view_that_cannot_be_is_refused(options, said):
+    with pytest.raises(ValueError, match=said):
+        view(**options)
 
 
 def test_the_body_s_view_of_a_state():
@@ -143,11 +146,6 @@ def test_a_correction_of_the_motion_keeps_the_attitude_a_rotation(inputs):
     np.testing.assert_allclose((x[QUATERNION] * derivative[QUATERNION]).sum(0), 0, atol=1e-12)
 
 
-def test_motion_is_not_written_in_the_world():
-    with pytest.raises(ValueError, match="outputs 'motion' needs inputs of body or body_motion, got 'all'"):
-        view("all", "motion")
-
-
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
     field, (x, u) = view(inputs, outputs, linear=True), samples()
@@ -163,7 +161,7 @@ def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
 
 
 @pytest.mark.parametrize(("outputs", "written"), [("accelerations", 6), ("angular_acceleration", 3)])
-@pytest.mark.parametrize("inputs", views.INPUTS)
+@pytest.mark.parametrize("inputs", INPUTS)
 def test_what_accelerations_do_not_write_is_left_to_physics(inputs, outputs, written):
     field, (x, u) = view(inputs, outputs), samples()
     for evaluate in (deployed, train_batch):
@@ -199,3 +197,70 @@ def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
     for field in (view(inputs, outputs, norm=norm), Hybrid(rigid_body(IRIS), view(inputs, outputs, norm=norm))):
         for same in (field, Frozen(field)):
             np.testing.assert_allclose(same.infer_batch(x, u), deployed(field, x, u), rtol=0, atol=1e-11)
+
+
+class CheesemanBennett(AbstractVectorField):
+    """T / T∞ − 1 of a rotor at R / h = x[0]."""
+
+    def __call__(self, x, u):
+        return 1 / (1 - (x / 4) ** 2) - 1
+
+
+def shared():
+    return RotorThrust(residual_network(1, 1, KEY, hidden=7, scaling=HOVER, norm="none"), IRIS)
+
+
+def near_the_ground(count=6):
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(13, count))
+    x[2] = np.linspace(0.1, 1.0, count)
+    x[QUATERNION] = np.eye(4)[:, :1] + 0.1 * rng.normal(size=(4, count))
+    x[QUATERNION] /= np.linalg.norm(x[QUATERNION], axis=0)
+    return jnp.asarray(x), jnp.asarray(rng.uniform(500, 800, (4, count)))
+
+
+def test_with_their_formula_it_is_the_simulator_s_ground_effect():
+    x, u = near_the_ground()
+    at_once = jax.vmap(ground_effect, (-1, -1, None, None), -1)
+    force, torque = at_once(x, u, jnp.asarray(0.0), parameters_of(IRIS))
+    turning = rotation.rotate(rotation.conjugate(x[QUATERNION]), torque) / np.array(IRIS.inertia)[:, None]
+    found = deployed(RotorThrust(CheesemanBennett(), IRIS), x, u)
+    assert np.abs(turning[:2]).max() > 1
+    np.testing.assert_allclose(found[VELOCITY], force / IRIS.mass, atol=1e-5)
+    np.testing.assert_allclose(found[BODY_RATES], turning, atol=1e-4)
+    np.testing.assert_array_equal(found[: VELOCITY.start], 0)
+
+
+@pytest.mark.parametrize("many", [train_batch, infer_batch])
+def test_a_batch_is_its_samples(many):
+    x, u = near_the_ground()
+    np.testing.assert_allclose(many(shared(), x, u), deployed(shared(), x, u), rtol=1e-4, atol=1e-4)
+
+
+def test_rotors_are_alike():
+    """At one altitude an exchange of speeds is one of thrusts; equal ones push where the middle of the rotors is."""
+    level, u = jnp.eye(13)[3].at[2].set(0.2), jnp.array([600.0, 650.0, 700.0, 750.0])
+    one, other = shared()(level, u), shared()(level, u[::-1])
+    np.testing.assert_allclose(one[VELOCITY], other[VELOCITY], rtol=1e-5)
+    same = shared()(level, jnp.full(4, 600.0))
+    x, y = np.mean(IRIS.rotor_positions, axis=0)
+    turning = IRIS.mass * same[9] * np.array([y, -x]) / np.array(IRIS.inertia[:2])
+    assert abs(same[9]) > 0.01
+    np.testing.assert_allclose(same[BODY_RATES][:2], turning, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), mostly_slow((inputs, "rotors") for inputs in INPUTS))
+def test_beside_any_network_it_begins_silent_and_learns(inputs, outputs):
+    known = {"inputs": inputs, "hidden": 5, "scaling": HOVER}
+    (x, u), field = near_the_ground(), multirotor_network(IRIS, KEY, outputs=outputs, **known)
+    alone = multirotor_network(IRIS, KEY, outputs="accelerations", **known)
+    np.testing.assert_array_equal(deployed(field, x, u), deployed(alone, x, u))
+    slope = eqx.filter_jit(eqx.filter_grad(lambda residual: jnp.sum(residual.train_batch(x, u))))(field)
+    assert (slope.physics.field.weight_out != 0).any()
+
+
+def test_what_all_rotors_read_is_scaled_by_windows():
+    x, u = near_the_ground()
+    windows = Trajectories(x.T, u.T[:, None], x.T[:, None], 0.01)
+    field = with_scaling(multirotor_network(IRIS, KEY, outputs="rotors", hidden=5), windows)
+    np.testing.assert_allclose(field.physics.field.scaling.offset, [_nearness(x, IRIS).mean(), u.mean()], rtol=1e-5)
