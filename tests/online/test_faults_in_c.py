@@ -60,7 +60,6 @@ FAULTS = {
 
 
 def flight():
-    """Sample, input and periods of each step, while a controller lets the speed swing."""
     rng, v, rows = np.random.default_rng(0), 0.0, []
     for i in range(STEPS):
         u = HOVER - 4 * (v + NOISE * rng.normal() - np.sin(5 * DT * i))

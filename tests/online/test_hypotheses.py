@@ -72,7 +72,6 @@ def watched(hypotheses, after, seeds=6, rate=0.0):
 
 
 def errors(theta, after):
-    """The mean distance of the last θ from the truth."""
     true = np.stack([getattr(after, name) - TRUTH[name] for name in adaptation().names])
     return np.mean(np.linalg.norm(theta[:, -40:] - true, axis=-1))
 
@@ -83,15 +82,13 @@ def test_until_a_change_the_model_stays_exactly_as_it_was():
     np.testing.assert_array_equal(theta, 0)
 
 
-@pytest.mark.parametrize(
-    ("name", "after"),
-    [
-        ("spring", {"stiffness": 1.6}),
-        ("damper", {"friction": 1.2}),
-        ("load", {"stiffness": 0.7, "friction": 0.35, "gain": 0.7}),
-    ],
-)
-def test_a_cause_is_found_and_told_better_than_by_all_parameters(name, after):
+CAUSES = {"spring": {"stiffness": 1.6}, "damper": {"friction": 1.2}}
+CAUSES |= {"load": {"stiffness": 0.7, "friction": 0.35, "gain": 0.7}}
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_a_cause_is_found_and_told_better_than_by_all_parameters(name):
+    after = CAUSES[name]
     found, theta = watched(True, cart(**after))
     assert (found.changes > 0).all()
     place = 2 + [hypothesis.name for hypothesis in HYPOTHESES].index(name)
@@ -137,11 +134,7 @@ def test_bad_samples_keep_the_model_and_its_weights():
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [
-        ({}, "it must have a parameter"),
-        ({"parameters": {"push": 0.0}}, "push must be"),
-        ({"parameters": {"push": 1.0}, "rates": {"gain": 1.0}}, "rates of gain"),
-    ],
+    [({}, "it must have a parameter"), ({"parameters": {"push": 1.0}, "rates": {"gain": 1.0}}, "rates of gain")],
 )
 def test_hypotheses_that_cannot_be_are_refused(options, said):
     with pytest.raises(ValueError, match=f"hypothesis a: {said}"):

@@ -53,7 +53,6 @@ def run(field, steps, seed=0, change=None, noise=NOISE):
 
 @eqx.filter_jit
 def watch(adaptation, samples, inputs, elapsed=None):
-    """The states of the filter after each sample."""
     elapsed = jnp.ones(len(samples)) if elapsed is None else elapsed
     start = adaptation.begin(jnp.zeros(samples.shape[1]))
 
@@ -135,8 +134,7 @@ def test_bad_samples_keep_the_last_good_estimate(name):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(states))
     assert states.restarts[-1] == 0
     if name != "unknown input":
-        assert flags.missing.all()
-        assert flags.gap
+        assert flags.missing.all() & flags.gap
         assert flags.frozen.all() == (name == "frozen")
 
 
@@ -167,7 +165,7 @@ def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
     assert OnlineAdaptation(pushed, DT, NOISE).names[-1] == "disturbance[0]"
     assert not held.theta[:, -1].any()
     learning = OnlineAdaptation(with_disturbance(SLIDE, (0,)), DT, NOISE, disturbance=1.0, tuning=CALM)
-    found = learning.model(jax.tree.map(lambda leaf: leaf[-1], watch(learning, samples, u)))
+    found = learning.model(last(watch(learning, samples, u)))
     assert disturbance_of(found).value == pytest.approx([0.5], abs=0.05)
 
 
@@ -179,11 +177,8 @@ def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
         ({"prior": 0.0}, "prior must be positive for a parameter at least, got 0 for all"),
         ({"disturbance": 1.0}, "indices must say"),
         ({"disturbance": (1.0, 1.0), "indices": (0,)}, "disturbance must be one number, or one for each of 1 dist"),
-        ({"disturbance": 1.0, "indices": (0, 0)}, "indices must be different integers of at least 0, got"),
         ({"noise": 0.0}, "noise must be"),
-        ({"tuning": "x"}, "tuning must be a Tuning, got 'x'"),
         ({"hypotheses": hj.Hypothesis("a", {"idle": 0.3})}, "hypotheses must be a list of Hypothesis, got Hypothesis"),
-        ({"hypotheses": ("friction",)}, "hypotheses must be a list of Hypothesis, got"),
         ({"hypotheses": [hj.Hypothesis("a", {"idle": 1})], "prior": HELD}, "hypothesis a: idle must be among"),
         ({"field": hj.Model(SLIDE)}, "field: must be a function .* got Model; pass its .field"),
     ],
@@ -191,42 +186,17 @@ def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
 def test_a_filter_that_makes_no_sense_is_refused(options, said):
     with pytest.raises(ValueError, match=f"^{said}"):
         OnlineAdaptation(**({"field": SLIDE, "dt": DT, "noise": NOISE} | options))
-    with pytest.raises(ValueError, match="drift must be"):
-        Tuning(drift=-1.0)
-
-
-@pytest.mark.parametrize(
-    ("options", "x", "said"),
-    [
-        ({"noise": (NOISE, NOISE)}, [0.0], "noise must be one number, or one for each of the 1 of x, got 2"),
-        ({"process": (0.1, 0.1)}, [0.0], "process must be one number, or one for each of the 1 of x, got 2"),
-        ({"disturbance": 1.0, "indices": (3,)}, [0.0], "indices must be different integers .* at most 0"),
-        ({}, [[0.0]], r"x must be one sample \(d,\), got shape \(1, 1\)"),
-    ],
-)
-def test_a_first_sample_of_another_size_is_refused(options, x, said):
-    with pytest.raises(ValueError, match=f"^{said}"):
-        OnlineAdaptation(SLIDE, DT, **({"noise": NOISE} | options)).begin(x)
 
 
 def test_a_sample_is_a_list_or_an_array_of_the_size_of_the_first():
     state = adaptation().begin([0.0])
     assert eqx.tree_equal(adaptation().update(state, [0.1], [1]), adaptation().update(state, np.array([0.1]), [1.0]))
+    with pytest.raises(ValueError, match=r"^noise must be one number, or one for each of the 1 of x, got 2"):
+        OnlineAdaptation(SLIDE, DT, (NOISE, NOISE)).begin([0.0])
     with pytest.raises(ValueError, match=r"^x must be one sample \(1,\), as the state is, got shape \(2,\)"):
         adaptation().update(state, [0.0, 0.0], [0.0])
     with pytest.raises(ValueError, match=r"^elapsed must be a finite number of at least 0, got -1"):
         adaptation().update(state, [0.0], [0.0], elapsed=-1)
-
-
-def test_an_input_of_another_size_is_refused_with_the_name_of_the_field():
-    class Strict(Slide):
-        def __call__(self, x, u):
-            (force,) = u
-            return force - self.friction * x
-
-    strict = OnlineAdaptation(Strict(SLIDE.friction, SLIDE.idle), DT, NOISE)
-    with pytest.raises(ValueError, match=r"^field: Strict does not take a state .*\(2,\): .*too many"):
-        strict.update(strict.begin([0.0]), [0.0], [0.0, 0.0])
 
 
 @pytest.mark.parametrize("hypotheses", [(), (hj.Hypothesis("drag", {"friction": 1.0}),)], ids=["alone", "hypotheses"])

@@ -26,8 +26,6 @@ class Pushed(hj.AbstractVectorField):
 
 
 class Doubled(hj.AbstractVectorField):
-    """ẋ = (a + b) u."""
-
     a: jax.Array
     b: jax.Array
 
@@ -102,10 +100,8 @@ def test_a_parameter_that_nothing_excites_is_named():
         ({"bounds": hj.FlightBounds()}, "bounds must be InputBounds"),
         ({"bounds": hj.InputBounds((-1.0,), (1.0,), (2.0,), (-1.0,), (1.0,))}, "x0 leaves its limits even at rest"),
         ({"noise": None}, "noise must be given"),
-        ({"noise": [0.0]}, "noise must be 1 positive numbers"),
         ({"window": 0.05}, "window must be a multiple of dt"),
         ({"bandwidth": 0.1}, "bandwidth must be between"),
-        ({"starts": 0}, "starts must be an integer of at least 1"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(change, said):
@@ -119,8 +115,6 @@ def test_bad_input_is_refused_in_one_line(change, said):
     ("make", "said"),
     [
         (lambda: hj.FlightBounds(low=(0.0, 0.0, 2.0), high=(1.0, 1.0, 1.0)), "low must be below high"),
-        (lambda: hj.FlightBounds(tilt=2.0), "tilt must be between"),
-        (lambda: hj.FlightBounds(speed=0.0), "speed must be a positive"),
         (lambda: hj.FlightBounds(rotor_speed=(0.5, 1.2)), "two shares between 0 and 1"),
         (lambda: hj.InputBounds((0.0,), (1.0, 2.0), (0.0,)), "equally many"),
         (lambda: hj.InputBounds((0.0,), (1.0,), (0.0,), state_low=(0.0,)), "given together"),

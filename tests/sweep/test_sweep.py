@@ -1,4 +1,4 @@
-"""Laws of many runs as one program: lanes do not touch, stop alone, and are compiled once."""
+"""Laws of many runs as one program: lanes do not touch, stop alone, are compiled once, and no device waits."""
 
 import logging
 import os
@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from choices import slow
 from pendulum import DAMPING, pendulum, swings
-from smoke import script
 
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.status import Status
-from hybrid_jax.sweep.lanes import LaneMap, lane, stack
+from hybrid_jax.sweep.lanes import LaneMap, count, lane, load_balance, schedule, stack
 from hybrid_jax.sweep.training import evaluate, evaluate_windows, sweep
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import make_run_config, start
@@ -93,6 +92,7 @@ def test_every_lane_comes_to_its_own_end(final):
     assert set(final.status) <= {Status.OK, Status.CAPPED}
     assert (final.epoch[2], final.status[2]) == (6, Status.CAPPED)
     assert (final.epoch <= 12).all()
+    assert same(swept(final, PLANS, width=1), final)  # and once all have stopped nothing moves
 
 
 def compilations(caplog):
@@ -134,11 +134,9 @@ def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
 def test_minibatches_are_of_the_lanes_windows_however_many_are_listed(listed):
     subset, key = np.random.default_rng(0).permutation(listed), jax.random.key_data(jax.random.key(1))
     for n in {1, listed // 8, listed // 8 + 1, listed} - {0}:
-        orders = [
-            fitting._shuffled(make_run_config(0.1, padded, n, 1, 1, 1, 0.0), key)
-            for padded in (subset, np.pad(subset, (0, 10 * listed)))
-        ]
-        np.testing.assert_array_equal(*(order[:listed] for order in orders))
+        pairs = [make_run_config(0.1, np.pad(subset, (0, more)), n, 1, 1, 1, 0.0) for more in (0, 10 * listed)]
+        orders = [fitting._shuffled(each, key)[:listed] for each in pairs]
+        np.testing.assert_array_equal(*orders)
         assert set(np.asarray(orders[0][:n])) == set(subset[:n])
         if n > 20:
             assert (orders[0][:n] != subset[:n]).any()
@@ -173,10 +171,6 @@ def test_stopped_lanes_are_run_no_more(monkeypatch):
     assert epochs[-1] == [1, 9, 20]
 
 
-def test_a_sweep_whose_lanes_have_all_stopped_is_left_as_it_is(final):
-    assert same(swept(final, PLANS, width=1), final)
-
-
 def test_progress_says_what_is_left():
     reports = []
     swept(starts(), [plan(cap=12, minimum=12)] * 3, width=1, block_seconds=1e-9,
@@ -199,21 +193,17 @@ def test_evaluate_is_the_error_of_each_lane(final):
         np.testing.assert_allclose(errors[i], alone, rtol=1e-4)  # another program for the same float32 sums
 
 
-@pytest.mark.parametrize("size", [41, 9, 0])
-def test_plans_that_do_not_fit_the_data_are_refused(size):
-    with pytest.raises(ValueError, match=f"n_train={size} must lie between batch_size=10 and .* 40 in train"):
-        swept(starts(), [*PLANS[:2], plan(n_train=size)])
-    short = [replace(each, subset=each.subset[:30]) for each in PLANS]
-    with pytest.raises(ValueError, match="n_train=40"):
-        swept(starts(), short)
-
-
-@pytest.mark.parametrize(("place", "index"), [(0, 40), (39, -1)])
-def test_subsets_that_point_outside_the_data_are_refused(place, index):
-    """A gather would clamp such an index and train on another window in silence."""
-    wrong = replace(PLANS[1], subset=PLANS[1].subset.at[place].set(index))
-    with pytest.raises(ValueError, match=f"subset contains {index}"):
-        swept(starts(), [PLANS[0], wrong, PLANS[2]])
+def test_plans_that_do_not_fit_the_data_are_refused():
+    """A gather would clamp an index outside the data and train on another window in silence."""
+    for size in (41, 9):
+        with pytest.raises(ValueError, match=f"n_train={size} must lie between batch_size=10 and .* 40 in train"):
+            swept(starts(), [*PLANS[:2], plan(n_train=size)])
+    for place, index in ((0, 40), (39, -1)):
+        with pytest.raises(ValueError, match=f"subset contains {index}"):
+            swept(starts(), [PLANS[0], replace(PLANS[1], subset=PLANS[1].subset.at[place].set(index)), PLANS[2]])
+    spoiled = eqx.tree_at(lambda w: w.u, VALIDATION, VALIDATION.u.at[1, 2, 0].set(jnp.nan))
+    with pytest.raises(ValueError, match=r"^validation: u\[1, 2, 0\] is not finite"):
+        swept(starts(), PLANS, validation=spoiled)
 
 
 def test_runs_stop_by_their_own_validation_windows():
@@ -227,27 +217,43 @@ def test_runs_stop_by_their_own_validation_windows():
         swept(starts(), [own[0], wrong])
 
 
-def test_bad_data_are_refused_by_name():
-    spoiled = eqx.tree_at(lambda w: w.u, VALIDATION, VALIDATION.u.at[1, 2, 0].set(jnp.nan))
-    with pytest.raises(ValueError, match=r"^validation: u\[1, 2, 0\] is not finite"):
-        swept(starts(), PLANS, validation=spoiled)
+def test_lanes_are_stacked_and_picked():
+    lanes = [{"x": np.full(2, i), "n": np.int32(i), "name": "all alike"} for i in range(3)]
+    stacked = stack(lanes)
+    assert count(stacked) == 3
+    assert eqx.tree_equal(lane(stacked, 1), lanes[1] | {"n": np.asarray(lanes[1]["n"])})
+    assert lane(stacked, 1)["n"].shape == ()
 
 
-DEVICES = """
-import sys
-sys.path[:0] = ["tests", "tests/sweep"]
-import jax
-jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
-import numpy as np
-from test_sweep import PLANS, starts, swept
-assert len(jax.devices()) == int(sys.argv[1])
-final = swept(starts(), PLANS, width=1)
-print(final.epoch.tolist(), [np.float32(number).tobytes().hex() for number in final.field.log_length])
-"""
+def test_a_number_is_a_constant_of_all_lanes():
+    fields = [{"k": np.float32(i), "mass": 2.0} for i in range(3)]
+    assert stack(fields)["mass"] == 2.0
+    with pytest.raises(ValueError, match=r"lanes: 2.0 must be an array if it differs between lanes"):
+        stack([*fields, {"k": np.float32(3), "mass": 3.0}])
 
 
-@pytest.mark.slow
-def test_the_number_of_devices_changes_nothing():
-    one, two = (script("-c", DEVICES, number) for number in (1, 2))
-    assert one == two
-    assert one.startswith("[")
+@pytest.mark.parametrize(("devices", "width"), [(1, 1), (2, 1), (3, 2), (4, 5), (4, 30)])
+def test_schedule_is_complete_and_balanced_and_load_balance_equalises_the_work(devices, width):
+    rng = np.random.default_rng(0)
+    costs, active = rng.uniform(1, 10, 40), sorted(rng.permutation(40)[:33].tolist())
+    shards = schedule(costs, active, devices, width, 40)
+    assert len(shards) == devices
+    assert sorted(np.concatenate(shards).tolist()) == active
+    chunks = [[shard[i : i + width] for i in range(0, len(shard), width)] for shard in shards]
+    loads = [sum(max(costs[chunk]) for chunk in shard) for shard in chunks]
+    # Most expensive first, to the least loaded: two devices never differ by more than one chunk.
+    assert max(loads) - min(loads) <= max(costs)
+    assert all(np.diff(costs[shard]).max(initial=-1) <= 0 for shard in shards)
+
+    times = load_balance(shards, costs, width)
+    busy = [sum(costs[i] * times[i] for i in shard[::width]) for shard in shards if len(shard)]
+    assert busy == pytest.approx([max(busy)] * len(busy))
+    assert times[active].min() == 1
+    assert not np.delete(times, active).any()
+
+
+def test_schedule_respects_the_capacity_of_a_device():
+    costs = [100.0, *[1.0] * 9]
+    assert [len(shard) for shard in schedule(costs, range(10), 2, 1, 10)] == [1, 9]
+    assert [len(shard) for shard in schedule(costs, range(10), 2, 1, 6)] == [4, 6]
+    assert [len(shard) for shard in schedule(costs, range(10), 2, 2, 3)] == [4, 6]
