@@ -61,15 +61,6 @@ def swings(count, steps=8, seed=0, dt=0.05, damping=DAMPING, length=LENGTH):
     return Trajectories(x0, u, jax.jit(rollout_batch)(pendulum(length, damping), x0, u, dt), dt)
 
 
-class Brake(AbstractVectorField):
-    """What a pendulum without damping lacks, as a residual that could be learned."""
-
-    damping: Float[Array, ""]
-
-    def __call__(self, x, u):
-        return jnp.stack([jnp.zeros_like(x[0]), -self.damping * x[1]])
-
-
 @cache
 def hybrid(length=0.7):
     """A pendulum beside a small network that says little."""
@@ -82,8 +73,3 @@ def flown(truth, count=40, noise=0.003, seed=0):
     start = swings(count, seed=seed)
     x = np.asarray(eqx.filter_jit(rollout_batch)(truth, start.x0, start.u, start.dt))
     return replace(start, x=x + noise * np.random.default_rng(seed).normal(size=x.shape).astype(np.float32))
-
-
-def log_lengths(*lengths):
-    """Stacked pendulums."""
-    return eqx.tree_at(lambda field: field.log_length, pendulum(), jnp.log(jnp.array(lengths)))

@@ -25,8 +25,6 @@ PUSH = jnp.array([0.0, 1.5])
 
 
 class Own(hj.training.TrajectoryLoss.__base__):
-    """An objective of a user's own."""
-
     prepare = batch = loss = observe = validate = lambda self, *_: None
 
 

@@ -41,7 +41,6 @@ def trained():
 
 
 def lengths(field, windows):
-    """The lengths that an encoder reads off the heads of windows [m]."""
     return np.exp(np.asarray(jax.vmap(field.estimate)(split(windows, PAST)[0])))[:, 0]
 
 

@@ -28,7 +28,6 @@ def source(seed=0):
 
 
 def flown(truth, count=100, seed=0, dt=0.01, steps=3):
-    """Windows of a field in all attitudes, under inputs around hover."""
     rng = np.random.default_rng(seed)
     x0 = rng.normal(size=(count, 13))
     x0[:, QUATERNION] /= np.linalg.norm(x0[:, QUATERNION], axis=1, keepdims=True)

@@ -28,8 +28,6 @@ HIDDEN_FROM_DERIVATIVES = ("stop_gradient", "grad")
 
 
 class Gain(base.AbstractVectorField):
-    """What a user may write around a network."""
-
     inner: base.AbstractVectorField
     scale: float = eqx.field(static=True, default=1.0)
     how: str = eqx.field(static=True, default="call")
@@ -39,8 +37,6 @@ class Gain(base.AbstractVectorField):
 
 
 class Sum(eqx.Module):
-    """A module that is no `AbstractVectorField`."""
-
     parts: list
 
     def __call__(self, x, u):
@@ -59,7 +55,6 @@ def batch():
 
 @eqx.filter_jit
 def trained(field):
-    """Loss, gradient, and running statistics of a training step."""
     x, u = batch()
 
     def loss(field):

@@ -41,7 +41,6 @@ def samples(count=6, seed=1):
 
 
 def moved(field, size=0.1, seed=2):
-    """The field with every parameter away from nominal."""
     rng = np.random.default_rng(seed)
     leaves, structure = jax.tree.flatten(field)
     return jax.tree.unflatten(structure, [leaf + size * rng.normal(size=leaf.shape) for leaf in leaves])

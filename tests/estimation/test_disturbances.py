@@ -13,8 +13,6 @@ DT, STEPS, BODY = 0.05, 10, hj.rigid_body(hj.IRIS)
 
 
 class Spring(hj.AbstractVectorField):
-    """A mass on a spring, x = [position, velocity]."""
-
     def __call__(self, x, u):
         return jnp.stack([x[1], u[0] - 4 * x[0]])
 

@@ -17,8 +17,6 @@ NOISE = 0.01
 
 
 class Pendulum(hj.AbstractVectorField):
-    """x = [angle, rate], u = [acceleration]."""
-
     log_length: jax.Array
     damping: jax.Array
 
@@ -53,7 +51,6 @@ def model_of(field, d=2, **options):
 
 @pytest.fixture(scope="module")
 def records():
-    """Of different intervals, one with a gap."""
     second = record(pendulum(), (-0.4, 1.0), 6.0, 60, seed=2, drop=(2.0, 3.5), interval=0.25)
     return [record(pendulum(), (0.5, 0.0), seed=1), second]
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
-from pendulum import Brake, pendulum, swings
+from pendulum import pendulum, swings
 from pushes import Push, pushes
 from rich.console import Console
 
@@ -40,11 +40,6 @@ def test_a_linear_problem_meets_its_closed_form(kind):
     np.testing.assert_allclose(covariance_of(field, windows, kind=kind), expected, rtol=1e-4)  # float32 sums
     # In pieces that do not divide the windows the sums are the same.
     np.testing.assert_allclose(covariance_of(field, windows, kind=kind, chunk=7), expected, rtol=1e-4)
-
-
-def test_a_residual_is_taken_as_given():
-    bare, hybrid = (covariance_of(field, SWINGS) for field in (pendulum(), Hybrid(pendulum(), Brake(jnp.array(0.0)))))
-    np.testing.assert_allclose(hybrid, bare, rtol=1e-5)  # float32
 
 
 def test_a_parameter_that_the_windows_do_not_depend_on_stays_and_may_be_anything():

@@ -48,12 +48,10 @@ def network(**options):
 
 
 def solved(x, u):
-    """A function that calls LAPACK."""
     return jnp.linalg.solve(jnp.eye(13) + jnp.outer(x, x), x)
 
 
 def plain(x, u):
-    """A function, and no field."""
     return jnp.tanh(x) * jnp.where(x[2] > 0, 1.0, jnp.sum(u) / 2500)
 
 
@@ -107,7 +105,6 @@ SIZES = {"state_size": 13, "input_size": 4}
 
 
 def samples(count=3, seed=1):
-    """States (n, 13) and inputs (n, 4)."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(count, 13))
     x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
@@ -115,5 +112,4 @@ def samples(count=3, seed=1):
 
 
 def double(field):
-    """The field with its numbers in double precision, where that is enabled."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)

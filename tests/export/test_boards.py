@@ -36,8 +36,6 @@ def paper(tmp_path_factory):
 
 
 def header(x, u):
-    """The samples as C."""
-
     text = f"enum {{ SAMPLES = {len(x)} }};\n"
     for name, rows in (("X", x), ("U", u)):
         table = ", ".join("{" + ", ".join(f"{one:.9e}f" for one in row) + "}" for row in rows.astype(np.float32))
@@ -46,7 +44,6 @@ def header(x, u):
 
 
 def target(processor):
-    """What GCC is told of a processor."""
     return (f"-mcpu={processor}", f"-mfpu={BOARDS[processor][0]}", "-mfloat-abi=hard", "-mthumb", "-O2")
 
 

@@ -57,7 +57,6 @@ def test_it_is_the_field(name, tmp_path):
 
 
 def wide(norm="batch", **options):
-    """A network of the paper's size, whose layers are loops."""
     return Hybrid(body(), multirotor_network(IRIS, KEY, hidden=64, norm=norm, **options))
 
 
@@ -79,7 +78,6 @@ def test_layers_that_are_loops_are_the_network(name, tmp_path):
 
 
 def turned(x, u):
-    """A system of another size, of which the library knows nothing."""
     return jnp.stack([x[1], u[0] * jnp.where(x[0] > 0, 2.0, jnp.exp(x[0])) - x[1] ** 3 + jnp.maximum(x[0], -0.5)])
 
 

@@ -21,7 +21,6 @@ def close(found, expected):
 
 
 def jacobian(function):
-    """∂/∂(x, u) of a CasADi function of x and u."""
     x, u = function.sx_in()
     return ca.Function("jacobian", [x, u], [ca.jacobian(function(x, u), ca.vertcat(x, u))])
 

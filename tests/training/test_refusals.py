@@ -31,8 +31,6 @@ class Stopped(AbstractVectorField):
 
 
 class Stiff(AbstractVectorField):
-    """A pendulum whose length is a Python float."""
-
     length: float
 
     def __call__(self, x, u):

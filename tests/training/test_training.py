@@ -9,9 +9,8 @@ import pytest
 from pendulum import DAMPING, LENGTH, pendulum, swings
 from systems import Dense
 
-from hybrid_jax import IRIS, Hybrid, Settings, Trajectories, fit, load, residual_network, rollout_batch, save
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
+from hybrid_jax import IRIS, Hybrid, Settings, Trajectories, fit, residual_network, rollout_batch
+from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.state import VELOCITY
@@ -64,23 +63,16 @@ def test_an_unknown_length_is_recovered(damped):
     assert damped.best_mse < 1e-3 * validated(pendulum(0.8, DAMPING))
 
 
-def test_a_hybrid_of_one_s_own_learns_predicts_and_survives_a_file(hybrid, tmp_path):
+def test_a_hybrid_of_one_s_own_learns_and_predicts(hybrid):
     field, state = hybrid
     # What physics alone can do with its length free is the measure of what the network adds.
     physics_only = trained(field.physics)
     assert state.best_mse < 0.2 * physics_only.best_mse
     np.testing.assert_allclose(np.exp(state.best.physics.log_length), LENGTH, rtol=0.1)
-
-    save(tmp_path / "model.npz", state.best, {"val_mse": float(state.best_mse)})
-    model = load(tmp_path / "model.npz")
-    assert eqx.tree_equal(model.field, state.best)
-    test = swings(30, seed=2)
-    predicted = model.predict(test.x0, test.u, test.dt)
-    error = np.square(np.asarray(predicted - test.x)).sum(-1).mean()
-    assert error < 4 * state.best_mse  # windows never seen, of the same kind
+    assert rollout_mse(state.best, swings(30, seed=2)) < 4 * state.best_mse  # windows never seen, of the same kind
     # The network has learned the damping itself, at rest and within what was flown.
     rates = jnp.array([-2.0, -1.0, 1.0, 2.0])
-    push = jax.vmap(lambda rate: model.field(jnp.array([0.0, rate]), jnp.zeros(1))[1])(rates)
+    push = jax.vmap(lambda rate: state.best(jnp.array([0.0, rate]), jnp.zeros(1))[1])(rates)
     np.testing.assert_allclose(push, -DAMPING * rates, atol=0.5)
 
 
@@ -94,13 +86,6 @@ def test_running_statistics_move_while_a_part_with_rate_zero_does_not(hybrid):
     assert state.field.physics.log_length != field.physics.log_length
 
 
-class Dragged(AbstractVectorField):
-    body: AbstractVectorField
-
-    def __call__(self, x, u):
-        return self.body(x, u).at[VELOCITY].add(-0.3 * x[VELOCITY])
-
-
 def test_exact_physics_leaves_a_silent_residual_silent():
     rng = np.random.default_rng(0)
     x0 = np.zeros((40, 13), np.float32)
@@ -108,15 +93,17 @@ def test_exact_physics_leaves_a_silent_residual_silent():
     u = np.asarray(IRIS.hover_speed + 30 * rng.normal(size=(40, 10, 4)), np.float32)
     network = residual_network(13, 4, KEY, hidden=8, scaling=InputScaling(IRIS.hover_speed, 60.0))
     push = {}
-    for truth in (rigid_body(IRIS), Dragged(rigid_body(IRIS))):
-        flown = Trajectories(x0, u, np.asarray(jax.jit(rollout_batch)(truth, x0, u, 0.01)), 0.01)
-        field = Hybrid(rigid_body(IRIS), zero_output(network))
+    body = rigid_body(IRIS)
+    dragged = lambda x, u: body(x, u).at[VELOCITY].add(-0.3 * x[VELOCITY])  # noqa: E731
+    for name, truth in {"exact": body, "dragged": dragged}.items():
+        flown = Trajectories(x0, u, np.asarray(rollout_batch(truth, x0, u, 0.01)), 0.01)
+        field = Hybrid(body, zero_output(network))
         state = trained(field, Hybrid(0.0, 3e-3), train=flown, validation=flown, max_epochs=40, min_epochs=40)
         forces = jax.vmap(state.best.residual)(x0, u[:, 0])[:, VELOCITY]
-        push[type(truth)] = float(jnp.sqrt(jnp.mean(jnp.square(forces))))
+        push[name] = float(jnp.sqrt(jnp.mean(jnp.square(forces))))
     # Adam turns even a gradient of round-off into steps of the rate, so silence is not exact; a force is far louder.
-    assert push[RigidBody] < 0.02
-    assert push[Dragged] > 0.1
+    assert push["exact"] < 0.02
+    assert push["dragged"] > 0.1
 
 
 def test_the_best_epoch_is_the_best_that_validation_saw():
@@ -147,12 +134,6 @@ def test_it_stops_when_patience_is_spent_and_not_before_the_minimum(damped):
     for rules, ended in (({"min_epochs": 0, "patience": 7}, (Status.OK, 8)), ({"max_epochs": 7}, (Status.CAPPED, 7))):
         state = trained(pendulum(LENGTH, DAMPING), 0.0, **rules)
         assert (state.status, state.epochs) == ended
-
-
-def test_the_key_decides_the_order_of_minibatches(damped):
-    again, other = (trained(pendulum(0.8, DAMPING), key=key) for key in (KEY, jax.random.key(5)))
-    assert again.field.log_length == damped.field.log_length
-    assert other.field.log_length != damped.field.log_length
 
 
 def test_only_the_first_n_train_of_the_subset_are_used():
@@ -213,16 +194,9 @@ def test_a_field_in_single_precision_trains_on_windows_in_double(norm):
     assert {leaf.dtype for leaf in jax.tree.leaves(eqx.filter(best, eqx.is_array))} == {np.dtype(np.float32)}
 
 
-class Decay(AbstractVectorField):
-    rate: np.ndarray
-
-    def __call__(self, x, u):
-        return u - self.rate * x
-
-
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("field", [Decay(np.ones(2)), Hybrid(pendulum(0.8), NETWORK)], ids=["parameters", "network"])
-def test_arrays_of_numpy_are_taken_without_a_warning(field):
+def test_arrays_of_numpy_are_taken_without_a_warning():
+    field = jax.tree.map(np.asarray, Hybrid(pendulum(0.8), NETWORK))
     train, validation = (jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), w) for w in (TRAIN, VALIDATION))
     assert trained(field, train=train, validation=validation, max_epochs=1).epochs == 1
 
