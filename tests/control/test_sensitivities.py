@@ -7,16 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from choices import slow
 
 import hybrid_jax as hj
 from hybrid_jax.control import advance
-from hybrid_jax.control.sensitivities import (
-    advance_lagged,
-    advance_with_jacobian,
-    condensed,
-    stage_shares,
-    step_of,
-)
+from hybrid_jax.control.sensitivities import advance_lagged, advance_with_jacobian, condensed, stage_shares, step_of
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
@@ -27,15 +22,12 @@ SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
 
 
 def network(inputs="all", outputs="all", norm="batch", linear=False):
-    """A network in which every parameter matters."""
     known = {"hidden": 8, "scaling": SCALING, "vehicle": hj.IRIS}
     made = multirotor_network(key=jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
     return jax.tree.map(lambda leaf: leaf + 0.3 + 0.2 * jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape), made)
 
 
 class Spun(hj.AbstractVectorField):
-    """A user's field without a registered derivative."""
-
     def __call__(self, x, u):
         return jnp.sin(x) + jnp.concatenate([x[5:9] * u / 600, x[:9]])
 
@@ -71,10 +63,9 @@ def samples(count=3):
 
 
 LONG_TO_COMPILE = ("paper", "layer norm", "body frame", "invariant, disturbed")
-CASES = [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG_TO_COMPILE)) for name in FIELDS]
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in FIELDS if name not in LONG_TO_COMPILE] + slow(*LONG_TO_COMPILE))
 def test_jacobian_of_a_step_equals_autodiff(name):
     def both(field, x, u):
         expected = jnp.concatenate(jax.jacfwd(partial(advance, field), argnums=(0, 1))(x, u, DT), axis=1)

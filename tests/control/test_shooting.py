@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import add_body_rates, advance, figure_eight, hover, sample
+from hybrid_jax.control import figure_eight, hover, sample
 from hybrid_jax.networks import InputScaling
 from hybrid_jax.rotation import from_axis_angle
 
@@ -18,7 +18,6 @@ from benchmarks.control_problems import CONTROLLER, Problem, problems
 from benchmarks.optimal_control import ITERATIONS, ours
 from benchmarks.shooting import Shooting
 
-NAMES = ("hop", "figure-8 window", "flip recovery", "low pass", "wind hover", "step")
 SOLVERS = ("ipopt", "fatrop")
 SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
 
@@ -40,7 +39,7 @@ def shooting(kind):
 
 
 @pytest.mark.parametrize("kind", MODELS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", problems())
 def test_both_solvers_end_within_forty_iterations_at_the_same_feasible_plan(kind, name):
     problem = problems()[name]
     first, second = (shooting(kind).solve(solver, problem, ITERATIONS) for solver in SOLVERS)
@@ -86,19 +85,3 @@ def test_the_controller_converges_from_a_cold_start(name):
     x, reference = moved(states_of(path)[0]), CONTROLLER.horizon(states_of(path), 0)
     problem = Problem(np.asarray(x), np.asarray(reference), np.zeros(6, np.float32))
     check(ours(MODELS["physics"](), problem, iterations).cost, x, reference, saturated)
-
-
-def test_one_iteration_per_call_is_enough():
-    still, body = states_of("still")[:20], hj.rigid_body(hj.IRIS)
-    call, x, plan = eqx.filter_jit(CONTROLLER), add_body_rates(still[0]), CONTROLLER.begin()
-    for _ in range(20):
-        u, plan = call(body, still, x, plan)
-        x = advance(body, x, u, CONTROLLER.period)
-    check(float(call(body, still, x, plan)[1].cost), x, still)
-
-
-def test_a_reference_is_that_of_the_controller():
-    assert tuple(problems()) == NAMES
-    for problem in problems().values():
-        assert problem.reference.shape == (CONTROLLER.steps, 13)
-        assert np.allclose(jnp.linalg.norm(problem.reference[:, 3:7], axis=1), 1, atol=1e-5)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from systems import ODD
 
-from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax import IRIS, rigid_body
 from hybrid_jax.rotation import conjugate, rotate
 from hybrid_jax.rotation import derivative as quaternion_derivative
 from hybrid_jax.sim.domain import Quadrotor
 from hybrid_jax.sim.forces import drag, ground_effect, parameters_of, wind
 from hybrid_jax.sim.scene import build_model
-from hybrid_jax.vehicle import IRIS
 
+pytestmark = pytest.mark.usefixtures("double_precision")
 ALL = (drag, ground_effect, wind)
 
 
@@ -39,7 +39,12 @@ def at_rest(altitude=5.0):
 
 
 @pytest.mark.parametrize("vehicle", [IRIS, ODD], ids=["iris", "odd"])
-def test_mjx_is_newton_euler_and_c_mujoco(vehicle, states, derivative):
+def test_mjx_is_newton_euler_and_c_mujoco(vehicle):
+    rng, derivative = np.random.default_rng(7), jax.jit(Quadrotor.derivative)
+    x = rng.normal(size=(8, 13)) * np.repeat([1, 1, 4, 3], [3, 4, 3, 3])  # fast, tilted flight above 0.3 m
+    x[:, 2] = rng.uniform(0.3, 1.0, 8)
+    x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=1, keepdims=True)
+    states = x, rng.uniform(200, 1000, (8, 4))
     model = build_model(vehicle)
     data = mujoco.MjData(model)
     for x, u in zip(*states, strict=True):
@@ -57,14 +62,6 @@ def test_mjx_is_newton_euler_and_c_mujoco(vehicle, states, derivative):
         np.testing.assert_allclose(found, data.qacc, rtol=1e-13, atol=4e-13)
 
 
-def test_free_fall_is_exact(step):
-    x = at_rest().at[7:10].set(jnp.array([1.0, -2.0, 3.0]))
-    for _ in range(50):
-        x = step(quadrotor(IRIS), x, jnp.zeros(4), jnp.asarray(0.0), 0.02)
-    expected = np.array([1.0, -2.0, 5 + 3 - 0.5 * IRIS.gravity, 1, 0, 0, 0, 1, -2, 3 - IRIS.gravity, 0, 0, 0])
-    np.testing.assert_allclose(x, expected, atol=1e-13)
-
-
 def reference_flight(x0, u, t0, duration):
     """The analytic equations with all forces, integrated to 1e-12."""
 
@@ -78,7 +75,8 @@ def reference_flight(x0, u, t0, duration):
     return diffrax.diffeqsolve(term, diffrax.Dopri8(), t0, end, 0.001, x0, stepsize_controller=control).ys[0]
 
 
-def test_order_of_convergence_is_four(step):
+def test_order_of_convergence_is_four():
+    step = jax.jit(Quadrotor.step)
     x0 = at_rest(0.35).at[7:13].set(jnp.array([2.0, -1.0, 0.4, 0.5, -0.8, 1.5]))
     u = jnp.array([650.0, 660.0, 655.0, 668.0])
     truth = jax.jit(reference_flight)(x0, u, 0.2, 0.4)
@@ -91,9 +89,3 @@ def test_order_of_convergence_is_four(step):
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     np.testing.assert_allclose(orders, 4, atol=0.25)
     assert errors[-1] < 1e-7  # 0.4 s at dt = 0.01
-
-
-def test_single_precision_stays_single():
-    with jax.enable_x64(False):
-        shape = jax.eval_shape(quadrotor(IRIS, *ALL).step, at_rest(), jnp.zeros(4), jnp.asarray(0.0), 0.01)
-    assert shape.dtype == jnp.float32

@@ -1,17 +1,28 @@
-"""Laws of the recorded flights."""
+"""Laws of the recorded flights, and what the simulator says of its versions and pictures."""
 
 from collections import Counter
 
 import jax
 import numpy as np
 import pytest
+from smoke import script
+from surface import refusal
 
 from experiments import make_flights
+from experiments.flying.images import picture
 from hybrid_jax.io.datasets import content_hash, load_dataset
+from hybrid_jax.sim import check_versions
 from hybrid_jax.sim import flight as recording
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, SOURCE, Domain
 from hybrid_jax.sim.flight import Flights, SplitSpec, cut, gone_wrong, make_dataset, permutation, random_flights
 from hybrid_jax.vehicle import IRIS, Vehicle
+
+pytestmark = pytest.mark.usefixtures("double_precision")
+
+
+@pytest.fixture(scope="module")
+def source(double_precision):
+    return make_dataset(SOURCE, {"train": SplitSpec(200, 10), "test": SplitSpec(30, 100)}, seed=3)
 
 
 def specs(dataset):
@@ -19,7 +30,6 @@ def specs(dataset):
 
 
 def level_flights(count, steps=40):
-    """Flights that stand still at 1 m."""
     states = np.zeros((count, steps + 1, 13))
     states[..., 2], states[..., 3] = 1.0, 1.0
     return Flights(states, np.zeros((count, steps, 4)), np.ones((count, steps + 1)), np.zeros(count))
@@ -134,14 +144,7 @@ def test_a_domain_in_which_every_flight_fails_says_so(monkeypatch):
     broken = level_flights(64)
     broken.states[:, 3, 2] = np.nan
     monkeypatch.setattr(recording, "random_flights", lambda *_: broken)
-    with pytest.raises(ValueError, match="domain source: none of 64 flights"):
-        make_dataset(SOURCE, {"train": SplitSpec(1, 10)}, seed=0)
-
-
-@pytest.mark.parametrize(("windows", "steps"), [(0, 10), (5, 0), (5, 1101)])
-def test_impossible_splits_are_refused(windows, steps):
-    with pytest.raises(ValueError, match=r"(windows|steps) must be"):
-        SplitSpec(windows, steps)
+    refusal(lambda: make_dataset(SOURCE, {"train": SplitSpec(1, 10)}, seed=0), "domain source: none of 64 flights")
 
 
 def call(monkeypatch, *arguments):
@@ -165,10 +168,20 @@ def test_the_command_writes_a_dataset_prints_a_table_and_keeps_what_exists(tmp_p
     assert file.read_bytes() == before
 
 
-def test_the_cache_is_flown_once_and_named_by_its_configuration(tmp_path, monkeypatch):
-    splits = {"train": SplitSpec(5, 10)}
-    first = make_flights.flights(SOURCE, splits, 0, tmp_path)
-    monkeypatch.setattr(make_flights, "make_dataset", None)
-    assert content_hash(make_flights.flights(SOURCE, splits, 0, tmp_path)) == content_hash(first)
-    with pytest.raises(TypeError):
-        make_flights.flights(SOURCE, splits, 1, tmp_path)
+@pytest.mark.parametrize(("mujoco", "mjx"), [("4.0.0", "3.17.0"), ("3.17.0", "not installed"), ("3.16.2", "3.16.2")])
+def test_other_versions_are_refused_with_the_command_that_mends_it(mujoco, mjx):
+    check_versions({"mujoco": "3.17.0", "mujoco-mjx": "3.17.5"})
+    with pytest.raises(ImportError, match=r"pip install .*mujoco==3\.17") as refusal:
+        check_versions({"mujoco": mujoco, "mujoco-mjx": mjx})
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.slow
+def test_importing_the_simulator_prints_nothing():
+    assert not script("-c", "import hybrid_jax.sim.flight")
+
+
+def test_no_renderer_is_one_line_that_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "none such")
+    refusal(lambda: picture(tmp_path / "vehicle.png"), "libosmesa6 or libegl1")
+    refusal(lambda: picture(tmp_path / "vehicle.jpg"), ".png")
