@@ -45,8 +45,6 @@ def report_of(folder: Path) -> Report:
 
 def written(folder: Path, report: Report) -> dict[str, str]:
     """Return the text of each file of a report, whose figures are in the folder."""
-    if not report.tables:  # of an earlier program, which alone could make its tables
-        return {}
     return {PAGE_NAME: markdown_page(report.page(folder), report), JSON_NAME: lines_of(to_json(report))}
 
 

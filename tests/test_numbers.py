@@ -187,12 +187,6 @@ def said():
         needed = np.quantile(np.abs(own.numbers("error")), 0.95)
         wide.setdefault(domain == "gusty_wind", []).append(np.median(own.numbers("half_width")) / needed)
     expected = np.mean(committed("changes").where(lambda row: row["expected_inside"] is not None)["expected_inside"])
-    inertia = [
-        row["theta"][name] / size
-        for row in committed("real_flight/payload")
-        for name, size in (("Ix", 1.66e-5), ("Iy", 1.67e-5))
-        if row["theta"] and name in row["theta"]
-    ]
     claimed = {
         "control": [
             f"{min(better):.1f} to {max(better):.1f} times",
@@ -203,7 +197,6 @@ def said():
         "intervals": [
             *(f"{min(each):.1f} to {max(each):.1f} times as wide" for each in wide.values()),
             f"error on another flight in {100 * expected:.0f} %",
-            f"up to {max(inertia):.0f} times the vehicle's inertia",
         ],
     }
     for page, sentences in claimed.items():

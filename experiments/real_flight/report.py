@@ -34,7 +34,6 @@ LABELS = names.LABELS | {
     names.PHYSICS_ONLY: "its physics, no network",
     names.LINEAR_RESIDUAL: "rigid body + linear residual",
 }
-SHOWN = (None, names.NOMINAL, names.FINE_TUNED, names.SOURCE_ONLY)  # modes, in reports of an earlier program
 Cell = tuple[str, int]  # model, n_train
 HEAD = """\
 Flights held out are predicted open loop with the recorded motors, by models that the calls of `hybrid-jax fit` and
@@ -66,8 +65,6 @@ def write(
 
 def report(record: Mapping[str, Any]) -> Report:
     rows, config = rows_in(record), record["config"]
-    if "mode" in rows[0]:  # of an earlier program
-        return Report(record, draw(rows))
     found = cells(rows)
     best = max((cell for cell in found if cell[0] in (ADAPTED, LEARNED)), key=lambda cell: cell[1])
     claims = verdicts(found, best)
@@ -86,15 +83,11 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
 def error_figure(rows: Results) -> Figure:
     """Draw the RMSE at the end of the longest prediction, a panel per quantity, of models adapted to most windows."""
     horizon, most = max(int(name) for name in rows[0]["scores"] if name.isdigit()), max(rows["n_train"])
-    chosen = rows.where(lambda row: row.get("mode") in SHOWN, n_train=(0, most))
-    groups = chosen.group("model", *(["mode"] if "mode" in rows[0] else []))
-    named = {
-        ", ".join([LABELS.get(model) or model, *(names.label(mode) for mode in modes if mode != names.NOMINAL)]): own
-        for (model, *modes), own in groups.items()
-    }
+    groups = rows.where(n_train=(0, most)).group("model")
+    named = {LABELS[model]: own for model, own in groups.items()}
     figure, (panels,) = subplots((PAGE, 0.9 + 0.24 * len(named)), 1, len(UNITS), sharey=True)
     for axes, (quantity, unit) in zip(panels, UNITS.items(), strict=True):
-        tints = [plots.colour(keys[0]) if keys[0] != ADAPTED else METHODS["adapted"] for keys in groups]
+        tints = [plots.colour(model) if model != ADAPTED else METHODS["adapted"] for model in groups]
         scores = [own.numbers(f"scores.{horizon}.{quantity}") for own in named.values()]
         dots(axes, [Line(*line) for line in zip(named, scores, tints, strict=True)])
         axes.set(title=quantity.replace("_", " "), xlabel=f"RMSE [{unit}]")
