@@ -15,7 +15,7 @@ def main() -> None:
             continue
         said = ast.get_docstring(ast.parse(source)) or ""
         print(f"{name.removesuffix('.__main__'):<25}{said.splitlines()[0].partition(': python -m')[0].rstrip('.')}")
-    print("\npython -m experiments.NAME --help says more. Your own logs: hybrid-jax --help.")
+    print("\npython -m experiments.NAME --help lists its options. For logs of your own: hybrid-jax --help.")
 
 
 if __name__ == "__main__":

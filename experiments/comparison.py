@@ -39,7 +39,7 @@ DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 
 @dataclass(frozen=True)
 class ComparisonConfig(Config):
-    """Adapt one pre-trained model by every method with N trajectories; test on 10 steps of 0.01 s after 10 of past."""
+    """Adapt one pre-trained model by every method with N trajectories, and test predictions over 0.1 s."""
 
     sizes: Annotated[tuple[int, ...], Target] = (100,)
     """N, target trajectories to adapt to; rates and patience are those of the nearest size in the paper's table."""

@@ -56,7 +56,7 @@ def test_no_line_of_code_scrolls(page):
 @pytest.mark.parametrize("page", written(), ids=lambda page: page.stem)
 def test_what_belongs_to_an_item_is_indented_by_four(page):
     """Otherwise the list ends there, and the next item is set as a part of a paragraph."""
-    assert re.findall(r"\n\n {1,3}[^ \n].*|\n\n {4}[^`\n]*\n(?: {4}.*\n)*- .*", page.read_text()) == []
+    assert re.findall(r"\n\n {1,3}[^ \n].*|\n\n {4}[^`\n]*\n(?: {4}.*\n)*(?:-|\d+\.) .*", page.read_text()) == []
 
 
 @pytest.mark.parametrize("notebook", sorted(DOCS.glob("tutorials/*.ipynb")), ids=lambda path: path.stem)

@@ -1,9 +1,10 @@
-"""What mkdocs does beyond its plugins: MathML, changes, an index of names."""
+"""What mkdocs does beyond its plugins: MathML, changes, names, 404.html."""
 
 import html
 import re
 from importlib import import_module
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
@@ -58,3 +59,15 @@ def on_page_content(content, page, config, files):
         return DOTTED.sub(dotted, convert(text, display=display[found[1]]))
 
     return FORMULA.sub(formula, content)
+
+
+def on_post_template(output_content, template_name, config):
+    """Tell lost visitors where to go on."""
+    if template_name != "404.html":
+        return output_content
+    home = f"{urlsplit(config.site_url or '').path.rstrip('/')}/index.html"
+    return output_content.replace(
+        "<h1>404 - Not found</h1>",
+        "<h1>This page does not exist</h1><p>It may have moved. Search for "
+        f'it, or begin at the <a href="{home}">first page</a>.</p>',
+    )

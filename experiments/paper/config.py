@@ -99,7 +99,7 @@ class Encoding:
 
 @dataclass(frozen=True)
 class Config(Run):
-    """Shared options of all experiments in simulation. Defaults: the paper's full protocol."""
+    """Experiments in simulation share most of their options."""
 
     sizes: Annotated[tuple[int, ...], options.Target] = TABLE_SIZES
     """N, target trajectories to train on. Rates and patience are those of the nearest size in the paper's table."""
@@ -237,7 +237,7 @@ class AdaptationConfig(Config):
 
 @dataclass(frozen=True)
 class OneFlight(Config):
-    """What you have after a change: one short flight with sensor noise, and no other data."""
+    """After a change you have one short flight with sensor noise, and no other data."""
 
     sizes: Annotated[tuple[int, ...], options.Target] = (100,)
     """N, windows of 0.1 s: one number."""

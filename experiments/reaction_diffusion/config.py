@@ -46,7 +46,8 @@ class Config(Run):
     seeds: Count = 10
     """Trials: initial weights and training trajectories. Forecasts use at most three."""
     parts: tuple[Part, ...] = get_args(Part)
-    """forecast: as APHYNITY. shifted: adapt to changed equations. gray_scott: as Neural Context Flows."""
+    """Which parts to run. forecast: as APHYNITY. shifted: adapt to changed equations. gray_scott: as Neural Context
+    Flows."""
     cases: tuple[CaseName, ...] = tuple(case.name for case in CASES)
     """Lines of the table of forecasts."""
     shifts: tuple[Shift, ...] = get_args(Shift)

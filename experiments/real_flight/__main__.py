@@ -17,7 +17,7 @@ from hybrid_jax.cli.logs import Flights, read_flights, require_distinct
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 from hybrid_jax.sweep import hosts
 
-ABOUT = "How well does what `hybrid-jax fit` and `adapt` make of your flights predict others?"
+ABOUT = "How well do models that `hybrid-jax fit` and `adapt` learn predict other flights?"
 GUIDE = """\
 real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--test FOLDER], or --simulated.
 

@@ -80,7 +80,7 @@ def report(record: Mapping[str, Any]) -> Report:
 
 
 TABLES = ratio_table, coverage_table, expectation_table, method_table
-ABOUT = "One flight in worlds that we wrote and others did: does adaptation ever make a model worse?"
+ABOUT = "Does adaptation to one flight ever make a model worse, in our simulator or in RotorPy?"
 main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":

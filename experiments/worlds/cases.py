@@ -61,7 +61,7 @@ FLIGHTS: dict[str, Manner] = {
 
 @dataclass(frozen=True)
 class WorldsConfig(OneFlight):
-    """Adapt to one flight in several worlds: after each change a usual one; each other flight, after no change."""
+    """Adapt to a usual flight after each change, and to other flights, for example a hover, after none."""
 
     worlds: tuple[WorldName, ...] = ("iris", "hummingbird", "crazyflie")
     """True systems. iris: the simulator of the other experiments. hummingbird, crazyflie: vehicles of RotorPy."""

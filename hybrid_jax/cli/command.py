@@ -26,20 +26,21 @@ Options = TypeVar("Options")
 BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED = 2, 3, 4
 VERBS = {
     "inspect": "check what logs contain, and write a vehicle file from them",
-    "fit": "learn a vehicle from its logs, of all states or of any measurements",
-    "adapt": "adapt a model to logs after a change, and say what changed",
+    "fit": "learn a model of a vehicle from its logs",
+    "adapt": "adapt a model to logs from after a change, and say what changed",
     "check": "compare a model's predictions with flights",
-    "plan": "plan the most informative flight for a model",
-    "replay": "show a flight in 3-D, and where a model expects the vehicle",
+    "plan": "plan the flight from which a model learns most",
+    "replay": "show a flight and the predictions of a model in 3-D",
     "export": "write a model as C, CasADi functions or StableHLO",
 }
 USAGE = """usage: hybrid-jax VERB ...
 
-From folders of logs to a model that can be trusted:
+Learn a model from a folder of flight logs, and adapt it after a change:
 
 {verbs}
 
-hybrid-jax VERB --help says more, VERB --help-all all.
+For example: hybrid-jax fit before/ -o source.npz
+hybrid-jax VERB --help lists the common options, --help-all all of them.
 Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."""
 
 # Arguments that messages of the library name, and the options of the commands that have them.

@@ -58,7 +58,7 @@ class Options(FlightOptions):
     learn: tuple[str, ...] = ()
     """Parameters to learn, instead of the vehicle file's."""
     dt: float | None = None
-    """Interval of the model [s], by default 0.01; of an identified one 0.005."""
+    """Interval of the model [s]; by default 0.01, or 0.005 if physics is identified."""
     seed: int = 0
     """Random seed of the network."""
     out: Path = Path("runs/fit")

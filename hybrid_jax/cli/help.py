@@ -51,7 +51,8 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
         first = " " * INDENT if len(head) > INDENT else head
         text += textwrap.wrap(told, width, initial_indent=first, subsequent_indent=" " * INDENT)
     left = len(every) - len(options)
-    return "\n".join([*text, "", "--help-all explains more" + f", and lists {left} more options" * (left > 0) + "."])
+    lists = f", and lists {left} more option{'s' * (left > 1)}" * (left > 0)
+    return "\n".join([*text, "", f"--help-all explains more{lists}."])
 
 
 def option_of(name: str, marks: Collection[Any]) -> str:
