@@ -20,6 +20,7 @@ from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.networks.normalisation import ChannelScaling
 from hybrid_jax.trajectories import windows_of
 
 
@@ -207,3 +208,27 @@ def test_one_window_warns_and_a_source_without_its_motion_says_how_to_add_it():
         pytest.warns(UserWarning, match="its training windows are unknown.*; pass learned_from="),
     ):
         assert adapt(hybrid(), flown(hybrid(), count=1)).chosen == "source"
+
+
+def example(key, scaling):
+    """README's example: an exact record of a damped pendulum, and a model that does not know the damping."""
+    weights, order, *draws = jax.random.split(key, 5)
+
+    def windows(length, count, key):
+        starts, inputs = jax.random.split(key)
+        x0, u = jax.random.normal(starts, (count, 2)), jax.random.normal(inputs, (count, 10, 1))
+        truth = hj.Hybrid(pendulum(length), Network(jnp.array([0.3, 0.0])))
+        return hj.Trajectories(x0, u, eqx.filter_jit(hj.rollout_batch)(truth, x0, u, 0.05), dt=0.05)
+
+    options = {"hidden": 16, "norm": "none", "activation": "tanh", "scaling": scaling}
+    model = hj.Hybrid(pendulum(1.0), hj.residual_network(2, 1, weights, **options))
+    source = hj.fit(model, windows(0.7, 300, draws[0]), windows(0.7, 100, draws[1]), order, max_epochs=200).best
+    return adapt(source, windows(0.8, 20, draws[2]))
+
+
+@pytest.mark.parametrize("keys", [2, pytest.param(100, marks=pytest.mark.slow)])
+def test_the_interval_of_readme_s_example_contains_the_length_or_it_is_effective(keys):
+    scaling = ChannelScaling(output=(0.1, 1.0))  # one for all, so that one program serves
+    found = [example(key, scaling).parameters["log_length"] for key in jax.random.split(jax.random.key(7), keys)]
+    assert np.mean([not one.has_interval or one.low <= np.log(0.8) <= one.high for one in found]) >= 0.9
+    assert any(one.effective for one in found)

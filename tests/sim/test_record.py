@@ -181,7 +181,27 @@ def test_importing_the_simulator_prints_nothing():
     assert not script("-c", "import hybrid_jax.sim.flight")
 
 
+@pytest.mark.slow
+def test_a_picture_is_drawn_or_the_missing_library_named(tmp_path):
+    file = tmp_path / "vehicle.png"
+    try:
+        picture(file)
+    except ValueError as error:
+        assert "libosmesa6" in str(error)  # noqa: PT017 - machines without a renderer take this branch
+    else:
+        assert file.read_bytes().startswith(b"\x89PNG")
+
+
 def test_no_renderer_is_one_line_that_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "none such")
     refusal(lambda: picture(tmp_path / "vehicle.png"), "libosmesa6 or libegl1")
     refusal(lambda: picture(tmp_path / "vehicle.jpg"), ".png")
+
+
+def test_the_cache_is_flown_once_and_named_by_its_configuration(tmp_path, monkeypatch):
+    splits = {"train": SplitSpec(5, 10)}
+    first = make_flights.flights(SOURCE, splits, 0, tmp_path)
+    monkeypatch.setattr(make_flights, "make_dataset", None)
+    assert content_hash(make_flights.flights(SOURCE, splits, 0, tmp_path)) == content_hash(first)
+    with pytest.raises(TypeError):
+        make_flights.flights(SOURCE, splits, 1, tmp_path)

@@ -136,6 +136,12 @@ def test_it_stops_when_patience_is_spent_and_not_before_the_minimum(damped):
         assert (state.status, state.epochs) == ended
 
 
+def test_the_key_decides_the_order_of_minibatches(damped):
+    again, other = (trained(pendulum(0.8, DAMPING), key=key) for key in (KEY, jax.random.key(5)))
+    assert again.field.log_length == damped.field.log_length
+    assert other.field.log_length != damped.field.log_length
+
+
 def test_only_the_first_n_train_of_the_subset_are_used():
     subset = np.random.default_rng(0).permutation(60)
     used, unused = subset[:40], subset[40:]
