@@ -55,7 +55,7 @@ def reference_of(name):
     return control.sample(PATHS[name], CONTROLLER, 2.0)
 
 
-@pytest.mark.parametrize(("name", "allowed"), zip(PATHS, (0.001, 0.001, 0.005, 0.002), strict=True))
+@pytest.mark.parametrize(("name", "allowed"), [*zip(PATHS, (0.001, 0.001, 0.005, 0.002), strict=True)])
 def test_true_model_tracks_the_reference(name, allowed):
     _, found = alone(np.zeros(6), reference_of(name), reference_of(name)[0], 0.0, NEVER)
     assert found.position_rmse < allowed
