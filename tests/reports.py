@@ -2,11 +2,9 @@
 
 from types import MappingProxyType
 
-from hypothesis import strategies as st
-
 from experiments.paper.claims import claims
 from experiments.paper.config import PRESETS
-from experiments.paper.lanes import DOMAINS, MODELS, MODES, TAGS, THETA, with_rho
+from experiments.paper.lanes import TAGS, with_rho
 from experiments.paper.outcome import paper_report
 from experiments.reporting.results import Results
 from experiments.runner.run_record import record_of
@@ -61,32 +59,3 @@ def verdicts(rows, experiment="param_shift", truth=TRUTH):
 def make_report(rows, experiment="param_shift", figures=MappingProxyType({}), notes=(), **extra):
     record = record_of(experiment, PRESETS["paper"], rows, {"training": 12.5}, notes, truth_theta=TRUTH, **extra)
     return paper_report(record, rows, figures)
-
-
-NUMBERS = st.none() | st.floats(min_value=0) | st.sampled_from([float("nan"), float("inf")])
-THETAS = st.none() | st.fixed_dictionaries({name: st.none() | st.floats() for name in THETA})
-
-
-@st.composite
-def odd_rows(draw):
-    mode = draw(st.sampled_from(MODES))
-    return row(
-        draw(st.sampled_from(MODELS)),
-        mode,
-        0 if mode == "source_only" else draw(st.sampled_from([1, 100, 500, 1000])),
-        draw(st.integers(0, 2)),
-        draw(NUMBERS),
-        draw(st.sampled_from(DOMAINS)),
-        draw(THETAS),
-        rho=draw(st.none() | st.floats()),
-        val_mse=draw(NUMBERS),
-        epochs=draw(st.integers(0, 10**6)),
-        status=draw(st.sampled_from(["ok", "capped", "diverged"])),
-    )
-
-
-def tags(row):
-    return tuple(row[tag] for tag in TAGS)
-
-
-ODD_ROWS = st.lists(odd_rows(), max_size=12, unique_by=tags).map(lambda rows: Results(rows, TAGS))

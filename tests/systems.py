@@ -178,25 +178,19 @@ def wrap(space, data):
     return replace(data, x0=usual(data.x0), x=usual(data.x))
 
 
-def car_start(rng, n):
-    """Anywhere within 100 m, at 10 to 25 m/s."""
-    low, high = [-100, -100, -np.pi, 10, -1, -0.4], [100, 100, np.pi, 25, 1, 0.4]
-    return rng.uniform(low, high, (n, 6))
-
-
-def car_inputs(rng, shape):
-    """Steering within 0.12 rad and acceleration within 3 m/s², held over a window but for a tenth of them."""
-    held = rng.uniform(-1, 1, (shape[0], 1, 2)) + 0.1 * rng.normal(size=(*shape, 2))
-    return held * [0.12, 3.0]
-
-
 def _car() -> System:
+    """Anywhere within 100 m, at 10 to 25 m/s; inputs are held over a window but for a tenth of them."""
+    low, high = [-100, -100, -np.pi, 10, -1, -0.4], [100, 100, np.pi, 25, 1, 0.4]
+
+    def inputs(rng, shape):
+        return [0.12, 3.0] * (rng.uniform(-1, 1, (shape[0], 1, 2)) + 0.1 * rng.normal(size=(*shape, 2)))
+
     return _system(
         truth=car(grip=0.9, drag=1e-3),
         changed=car(0.7, 0.8, grip=0.9, drag=1e-3),
         model=hj.Hybrid(car(1.3, 0.8), hj.residual_network(6, 2, jax.random.key(1), hidden=16)),
-        start=car_start,
-        inputs=car_inputs,
+        start=lambda rng, n: rng.uniform(low, high, (n, 6)),
+        inputs=inputs,
         dt=0.05,
     )
 

@@ -118,18 +118,6 @@ def test_substeps_and_their_gradient_are_those_of_steps_by_hand(solver):
     np.testing.assert_allclose(*map(jax.tree.leaves, (found, expected)), rtol=1e-12)  # order of sums
 
 
-@pytest.mark.parametrize("solver", STEPPERS[:2], ids=lambda value: type(value).__name__)
-def test_substeps_are_differentiated_inside_shard_map(solver):
-    def slope(x0):
-        field = pendulum(**FIELD)
-        return jax.grad(lambda field: integrate(field, x0, jnp.asarray(TORQUES), DT, solver, 3).sum())(field).log_length
-
-    mesh, part = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("lanes",)), jax.sharding.PartitionSpec("lanes")
-    share = jax.shard_map(lambda x0: slope(x0[0])[None], mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
-    x0 = jnp.asarray(START)
-    np.testing.assert_allclose(jax.jit(share)(x0[None])[0], jax.jit(slope)(x0), rtol=1e-12)  # order of sums
-
-
 def test_a_batch_is_a_loop_of_rollouts():
     rng = np.random.default_rng(0)
     x0, u = jnp.asarray(rng.normal(size=(4, 2))), jnp.asarray(rng.normal(size=(4, 6, 1)))

@@ -1,13 +1,18 @@
-"""What the pages show is what happens, and each program of the gallery draws its picture."""
+"""Pages show what happens; the site needs neither a server nor the network, and has an entry for every public name."""
 
+import os
 import re
 import runpy
 import shutil
 import sys
-from importlib import util
+import zlib
+from importlib import import_module, util
+from pathlib import Path
 
 import pytest
-from smoke import ROOT
+from browser import BROWSER, PREFIX, visit
+from smoke import LEFT, ROOT, script
+from test_documentation import PACKAGES
 from test_layers import ORDER
 
 DOCS = ROOT / "docs"
@@ -85,3 +90,50 @@ def test_a_program_draws_its_picture(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(tmp_path / path.name))
     assert (tmp_path / f"{path.stem}.png").exists()
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Built with --strict: a page, a link or an anchor that is missing ends it."""
+    pytest.importorskip("mkdocs")
+    if LEFT is not None:
+        return Path(LEFT) / "site"
+    folder = tmp_path_factory.mktemp("site")
+    more = {"PYTHONPATH": str(ROOT), "HYBRID_JAX_EXECUTE": "false", "SITE_URL": f"http://host{PREFIX}"}
+    script("-m", "mkdocs", "build", "--strict", "--site-dir", folder, env=os.environ | more)
+    return folder
+
+
+@pytest.mark.slow
+def test_every_public_name_has_an_entry(site):
+    inventory = zlib.decompress((site / "objects.inv").read_bytes().split(b"zlib.\n", 1)[1]).decode()
+    entries = {line.split(" ")[0] for line in inventory.splitlines()}
+    for package in PACKAGES:
+        for name in (name for name in import_module(package).__all__ if not name.startswith("_")):
+            # `rigid_body` has the name of its module.
+            assert {f"{package}.{name}", f"hybrid_jax.dynamics.{name}.{name}"} & entries, f"{package}.{name}"
+
+
+MEASURE = """(page, window) => {
+  const right = Math.min(page.querySelector(".md-content")?.getBoundingClientRect().right ?? 1e9, window.innerWidth)
+  const frames = [...page.querySelectorAll("table")].map(table => table.closest(".md-typeset__scrollwrap") ?? table)
+  return {
+    sideways: page.documentElement.scrollWidth > window.innerWidth,
+    tables: frames.filter(frame => frame.getBoundingClientRect().right > right + 1).length,
+    formulas: [...page.querySelectorAll("math")].filter(each => each.getBoundingClientRect().height < 3).length,
+    source: page.querySelectorAll(".arithmatex").length,
+    styles: [...page.styleSheets].filter(each => each.href && !each.cssRules.length).length,
+    pictures: [...page.images].filter(each => each.complete && !each.naturalWidth).length,
+  }
+}"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium")
+def test_pages_fit_wide_and_narrow_screens_and_need_no_network(site, tmp_path):
+    """Also under a path of a host that others share, where an address that leads nowhere shows 404.html."""
+    pages = [str(page.relative_to(site)) for page in sorted(site.rglob("*.html"))]
+    found, said = visit(site, [*pages, "no/such/page.html"], [1400, 400], MEASURE, tmp_path)
+    assert len(found) == 2 * len(pages) + 2
+    assert [(page, width, own) for page, width, own in found if any(own.values())] == []
+    assert said == []

@@ -50,13 +50,6 @@ def test_the_product_turns_by_one_and_then_the_other(a, b, v):
     np.testing.assert_allclose(rotation.rotate(rotation.multiply(a, b), v), one_by_one, **CLOSE)
 
 
-@given(units())
-@quick
-def test_body_z_is_the_third_axis(q):
-    expected = rotation.rotate(jnp.asarray(q), jnp.array([0.0, 0.0, 1.0]))
-    np.testing.assert_allclose(rotation.body_z(jnp.asarray(q)), expected, **CLOSE)
-
-
 @given(units(), vectors)
 @quick
 def test_derivative_is_the_limit_of_a_finite_rotation_about_a_body_axis(q, rates):

@@ -25,13 +25,8 @@ def regular(rotors):
     """The Iris with rotors at equal angles that spin in turn, and as much thrust together."""
     angles = 2 * np.pi * (np.arange(rotors) + 0.5) / rotors
     places = tuple((0.25 * float(np.cos(a)), 0.25 * float(np.sin(a))) for a in angles)
-    return replace(
-        IRIS,
-        name=f"{rotors}",
-        rotor_positions=places,
-        spin=tuple((-1.0) ** i for i in range(rotors)),
-        thrust_coefficient=IRIS.thrust_coefficient * 4 / rotors,
-    )
+    spin, k = tuple((-1.0) ** i for i in range(rotors)), IRIS.thrust_coefficient * 4 / rotors
+    return replace(IRIS, name=f"{rotors}", rotor_positions=places, spin=spin, thrust_coefficient=k)
 
 
 HEXA = regular(6)

@@ -45,13 +45,9 @@ def rates(texts):
     return [count, *(1e4 * len(re.findall(pattern, text)) / count for pattern in WORDS.values())]
 
 
-def peers():
-    for name in ("diffrax", "equinox"):
-        yield from docstrings(Path(find_spec(name).origin).parent)
-
-
 def main():
-    columns = [rates(pages()), rates(docstrings(ROOT / "hybrid_jax")), rates(peers())]
+    peers = [text for name in ("diffrax", "equinox") for text in docstrings(Path(find_spec(name).origin).parent)]
+    columns = [rates(pages()), rates(docstrings(ROOT / "hybrid_jax")), rates(peers)]
     print(f"{'per 10 000 words':22}{'our pages':>12}{'docstrings':>12}{'peers':>12}")
     for name, *values in zip(("words", *WORDS), *columns, strict=True):
         print(f"{name:22}" + "".join(f"{value:12.1f}" for value in values))

@@ -191,12 +191,14 @@ def ulog(topics, formats=None, parameters=None, ordered=True, hardware=""):
     return b"".join(parts)
 
 
+def stamps(times):
+    return (START + np.round(times * 1e6)).astype(int).tolist()
+
+
 def stamped(times, values, delay=0):
     """Samples of floats whose message came `delay` µs after what was measured."""
-    stamps = (START + np.round(times * 1e6)).astype(int).tolist()
-    return [
-        struct.pack(f"<QQ{len(row)}f", stamp + delay, stamp, *row) for stamp, row in zip(stamps, values, strict=True)
-    ]
+    rows = zip(stamps(times), values, strict=True)
+    return [struct.pack(f"<QQ{len(row)}f", stamp + delay, stamp, *row) for stamp, row in rows]
 
 
 def px4_topics(flight, rate=50):
@@ -219,11 +221,8 @@ def px4_topics(flight, rate=50):
 
 def escs(t, u):
     rpm = np.round(np.concatenate([u, 0 * u], axis=1) * 30 / np.pi).astype(int)
-    stamps = (START + np.round(t * 1e6)).astype(int).tolist()
-    return [
-        struct.pack("<Q", stamp) + b"".join(struct.pack("<Qi", stamp, speed) for speed in row)
-        for stamp, row in zip(stamps, rpm.tolist(), strict=True)
-    ]
+    rows = zip(stamps(t), rpm.tolist(), strict=True)
+    return [struct.pack("<Q", at) + b"".join(struct.pack("<Qi", at, speed) for speed in row) for at, row in rows]
 
 
 def commands(t, u):
@@ -233,8 +232,7 @@ def commands(t, u):
 
 def outputs(t, values):
     rows = np.concatenate([values, np.zeros((len(t), 16 - values.shape[1]))], axis=1)
-    stamps = (START + np.round(t * 1e6)).astype(int).tolist()
-    return [struct.pack("<QI16f", at, 16, *row) for at, row in zip(stamps, rows.tolist(), strict=True)]
+    return [struct.pack("<QI16f", at, 16, *row) for at, row in zip(stamps(t), rows.tolist(), strict=True)]
 
 
 MAP = """

@@ -10,8 +10,8 @@ from unittest import mock
 
 import pytest
 from browser import BROWSER, visit
-from cli_logs import READING, of_every_format, simulated, written
 from packaging.version import Version
+from recorded import READING, of_every_format, simulated, written
 from smoke import ROOT
 from writers import MAP
 

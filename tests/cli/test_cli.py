@@ -1,4 +1,4 @@
-"""The console script as a user meets it: help, refusals, and fit, adapt and check on logs that tests write."""
+"""The console script as a user meets it: help, refusals, verbs on logs that tests write, and pages in a browser."""
 
 import json
 import re
@@ -8,6 +8,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from smoke import ROOT
 
 from experiments.real_flight.simulated import csv_of, vehicle_toml
@@ -15,6 +16,7 @@ from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED, VERBS, in_flags
 from hybrid_jax.cli.export import PARTS
 from hybrid_jax.cli.logs import Flights
+from hybrid_jax.cli.page import Page, Table, document, write
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.io.models import load, save
@@ -162,3 +164,32 @@ SAID = {
 def test_arguments_become_options(said, printed):
     assert in_flags(said, "real_flight") == printed
     assert in_flags(said, "external_force") == said  # which reads no logs
+
+
+def drawn():
+    figure = Figure()
+    figure.subplots().plot([1, 2], [3, 4])
+    return figure
+
+
+@pytest.fixture
+def page():
+    wide = Table("Many < columns", [f"column {i}" for i in range(30)], [[f"{i}.123 m/s" for i in range(30)]])
+    figures = [("The one & only <figure>", drawn()), ("Another", drawn())]
+    return Page("What?", "This.", wide, figures, ["a < b"], ["Go on: " + "x" * 200], [wide], ["y" * 300])
+
+
+def test_it_needs_nothing_but_itself(page, tmp_path, capsys):
+    write(tmp_path, "check", page, {"one": 1})
+    shown = (tmp_path / "report.html").read_text()
+    assert re.findall(r"(?:src|href)=\"(?!data:)[^\"]*|url\(|@import|fetch\(", shown) == []
+    assert shown.index("This.") < shown.index("<img") < shown.index("<table") < shown.index("<details")
+    assert "The one &amp; only &lt;figure&gt;" in shown
+    record = json.loads((tmp_path / "report.json").read_text())
+    assert list(record) == ["format", "verb", "answer", "notes", "one"]
+    assert capsys.readouterr().out.splitlines()[-1] == f"page: {tmp_path / 'report.html'}"
+
+
+def test_a_browser_shows_it_without_an_error(page, seen):
+    right = {"images": 2, "hidden": 0, "wide": False}
+    assert seen({"page": document(page)}) == {("page", 400): right, ("page", 1400): right}

@@ -9,8 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from cli_logs import READING, of_every_format, written
-from recorded import LOGS
+from recorded import LOGS, READING, of_every_format, written
 from smoke import ROOT
 from writers import MAP
 

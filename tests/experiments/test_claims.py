@@ -5,7 +5,6 @@ from reports import TRUTH, changed, make_rows, row, verdicts
 
 from experiments.paper.claims import claims
 from experiments.paper.lanes import BASELINES, DOMAINS, TAGS, with_rho
-from experiments.reporting.claims import all_of
 from experiments.reporting.results import Results
 
 
@@ -92,11 +91,6 @@ def test_claims_are_undecided_without_the_rows_they_need():
     assert (one_size["C3"], one_size["C5"], one_size["C7"], one_size["C8"]) == (True, None, None, None)
     assert verdicts(make_rows(), truth=None)["C10"] is None
     assert all(v.lacks_data for v in claims(make_rows().where(model=()), "param_shift", TRUTH))
-
-
-@pytest.mark.parametrize(("parts", "holds"), [([True, True], True), ([True, None], None), ([None, False, True], False)])
-def test_all_of_is_a_conjunction_of_three_values(parts, holds):
-    assert all_of((part, "") for part in parts)[0] is holds
 
 
 # As in Table 2, and other baselines behind: means for the hybrid, the best of the seeds for the rest.

@@ -1,22 +1,30 @@
-"""A terminal and a file show every word and number whole; a committed report is what its program makes."""
+"""A terminal and a file show every word and number whole; reports, committed ones too, are what their program makes."""
 
 import io
 import json
+import math
 import re
 import time
 
+import matplotlib as mpl
 import numpy as np
 import PIL.Image
 import pytest
-from reports import make_report, make_rows
+from reports import TRUTH, changed, make_report, make_rows
 from rich.cells import cell_len
 from rich.console import Console
 
+from experiments.paper.figures import ranking, scores
+from experiments.paper.lanes import by_altitude
+from experiments.paper.study import placeholder
 from experiments.redraw import REFERENCE, report_of, written
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import MEANINGLESS, write_report
-from experiments.reporting.tables import print_table
+from experiments.reporting.results import Results
+from experiments.reporting.tables import measured, print_table
 from experiments.runner.progress import Line
+from experiments.runner.run_record import PACKAGES
+from hybrid_jax.sim.flight import SplitSpec
 
 ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
@@ -98,3 +106,62 @@ def test_its_pictures_are_what_the_program_draws(folder, tmp_path):
         assert own.size == committed.size
         # Another version of matplotlib may draw a letter elsewhere.
         assert np.abs(np.asarray(own, float) - np.asarray(committed, float)).mean() < 2
+
+
+def test_report_json_keeps_the_contract(tmp_path):
+    rows = changed(make_rows(seeds=1), "no_physics", "fine_tuned", 500, test_mse=math.nan, status="diverged")
+    rows = rows.where(lambda row: (row["model"], row["mode"]) != ("hybrid", "target_only"))
+    write_report(tmp_path, make_report(rows, wind_sine_mse=1e-3, odd=np.array([1.0, math.inf])))
+    assert len((tmp_path / "rows.csv").read_text().splitlines()) == 1 + len(rows)
+    record = json.loads((tmp_path / "report.json").read_text(), parse_constant=pytest.fail)
+    assert {"experiment", "config", "environment", "rows", "claims", "not_judged"} <= set(record)
+    assert set(record["environment"]) >= {"versions", "hardware", "seconds"}
+    assert set(PACKAGES) < set(record["environment"]["versions"])
+    assert Results(record["rows"], record["tags"]) == rows
+    assert any(row["test_mse"] is None and row["rho"] is None for row in record["rows"])
+    assert all(set(claim) == {"id", "text", "holds", "measured"} for claim in record["claims"])
+    assert {claim["holds"] for claim in record["claims"]} <= {True, False, None}
+    assert {claim["id"] for claim in record["not_judged"]} == {"C7"}
+    assert all(claim["why"] for claim in record["not_judged"])
+    assert (record["format"], record["odd"], record["wind_sine_mse"]) == (2, [1.0, None], 1e-3)
+    assert record["truth_theta"] == TRUTH
+
+
+def test_errors_by_altitude_are_means_over_the_windows_of_each_band():
+    windows = placeholder(SplitSpec(3, 10))
+    windows.x[..., 2] = [[1.0], [1.0], [0.3]]
+    windows.x0[:, 2] = 1.0
+    windows.x[1, 4, 2] = 0.6  # the lowest state counts
+    errors = np.array([[1.0, 3.0, 5.0], [1.0, 3.0, math.inf]])
+    found = by_altitude("test_mse", windows, errors)
+    np.testing.assert_array_equal(found["test_mse_high"], [2.0, 2.0])
+    np.testing.assert_array_equal(found["test_mse_middle"], [5.0, math.inf])
+    assert np.isnan(found["test_mse_low"]).all()
+
+
+def test_nothing_is_written_if_a_value_has_no_json_form(tmp_path):
+    for extra in (object(), "\ud800"):
+        with pytest.raises(ValueError):  # noqa: PT011  two refusals, two messages
+            write_report(tmp_path / "new", make_report(make_rows(), extra=extra))
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("mean", "std", "text"),
+    [(0.0671, 0.0093, "0.067 ± 0.009"), (0.6944, 0.0131, "0.694 ± 0.013"), (22.31, 0.44, "22.3 ± 0.4"),
+     (3.21e-4, 2.2e-5, "(3.2 ± 0.2)e-04"), (-0.26, 0.021, "-0.26 ± 0.02"), (0.2, 14.2, "0 ± 14"),
+     (2.204, 0.0, "2.2 ± 0"), (2.204, math.nan, "2.2"), (math.inf, 1.0, "inf ± 1")],
+)  # fmt: skip
+def test_a_mean_ends_with_the_last_digit_that_its_deviation_leaves(mean, std, text):
+    assert measured(mean, std) == text
+
+
+def test_figures_of_failed_runs_too_are_reproducible_and_keep_matplotlibs_settings(tmp_path):
+    before, rows = dict(mpl.rcParams), make_rows() + make_rows(domain="external_force")
+    rows = changed(rows, "no_physics", "fine_tuned", 500, test_mse=math.inf, status="diverged")
+    ranking(rows, "Ranking", {"external_force": 0.01}).savefig(io.BytesIO(), format="png", dpi=30)
+    own = rows.where(domain="parameter_shift")
+    drawn = {name: (scores(own, "Scores", floor=0.01), "A") for name in ("one", "two")}
+    assert save_figures(tmp_path, drawn) == dict.fromkeys(("one.png", "two.png"), "A")
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    assert dict(mpl.rcParams) == before

@@ -1,5 +1,7 @@
-"""Both experiments from their command lines, in the smallest preset: their files, and the input they refuse."""
+"""Experiments and programs from their command lines: help, what a run leaves, and the input that is refused."""
 
+import csv
+import dataclasses
 import json
 import re
 import shutil
@@ -7,6 +9,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -15,7 +18,9 @@ from scipy.integrate import cumulative_trapezoid
 from smoke import ROOT, experiments, refused, smallest, unbegun
 
 import hybrid_jax
+import hybrid_jax as hj
 from experiments.external_force import sine_floor
+from experiments.identification import emps, record, tanks
 from experiments.paper.config import SMOKE
 from experiments.paper.lanes import physics_in
 from experiments.paper.study import placeholder, study
@@ -23,24 +28,18 @@ from hybrid_jax.sim.domain import PARAMETER_SHIFT
 from hybrid_jax.sim.flight import SplitSpec
 from hybrid_jax.vehicle import IRIS
 
-EXPERIMENTS = ("param_shift", "external_force")
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("experiments")
-
-
-@pytest.fixture(scope="module")
-def finished(folder):
-    """Each experiment run once; the second finds the first one's pre-training in the cache."""
-    runs = dict(zip(EXPERIMENTS, experiments("shifts", *EXPERIMENTS, folder=folder), strict=True))
-    assert {name: run.returncode for name, run in runs.items()} == dict.fromkeys(EXPERIMENTS, 0), runs
-    return runs
+    """Left by a run of an experiment."""
+    folder = tmp_path_factory.mktemp("experiments")
+    (run,) = experiments("shifts", "param_shift", folder=folder)
+    assert run.returncode == 0, run.stderr
+    return folder
 
 
 @pytest.mark.slow
-def test_every_row_has_a_model_that_loads_and_predicts(folder, finished):
+def test_every_row_has_a_model_that_loads_and_predicts(folder):
     at_rest = placeholder(SplitSpec(2, 5))
     out = folder / "out" / "param_shift"
     rows = json.loads((out / "report.json").read_text())["rows"]
@@ -56,17 +55,9 @@ def test_every_row_has_a_model_that_loads_and_predicts(folder, finished):
 
 
 @pytest.mark.slow
-def test_the_second_experiment_reuses_the_pretraining_of_the_first(finished):
-    assert "pre-training" not in [line for line in finished["param_shift"].stderr.splitlines() if "cache" in line]
-    reused = [line for line in finished["external_force"].stderr.splitlines() if "as found in the cache" in line]
-    assert len(reused) == 3
-    assert all("pre-training" in line for line in reused)
-
-
-@pytest.mark.slow
 @pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=["TERM", "INT"])
-def test_a_signal_saves_the_state_and_a_second_run_is_refused(sent, code, folder, finished):
+def test_a_signal_saves_the_state_and_a_second_run_is_refused(sent, code, folder):
     forever = ["--patience.hybrid-pretraining.minimum", "10000000", "--max-epochs", "10000000"]
     options = ["--preset", "smoke", "--models", "physics_only", *forever, "--cache", str(folder / "cache")]
     run = [sys.executable, "-m", "experiments.param_shift", *options, "--out", str(folder / sent.name)]
@@ -139,7 +130,7 @@ def test_an_out_that_is_a_file_is_refused_and_kept(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pattern", ["flights-source-*.npz", "stages/pre-training-hybrid-*.npz"])
-def test_a_truncated_file_in_the_cache_is_named_and_nothing_is_overwritten(pattern, folder, finished):
+def test_a_truncated_file_in_the_cache_is_named_and_nothing_is_overwritten(pattern, folder):
     file = min((folder / "cache").glob(pattern))
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
@@ -162,3 +153,90 @@ def test_sine_floor_is_the_mean_error_over_phases():
     squares = (velocity**2 + cumulative_trapezoid(velocity, fine, initial=0) ** 2)[:, 1000::1000]
     # The trapezoidal rule at a step of 1e-4 is good to 1e-8.
     np.testing.assert_allclose(sine_floor(mass, times), squares.mean(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["identification.crazypad", "identification.nanobench"])
+@pytest.mark.parametrize(("arguments", "code"), [(["--help"], 0), ([], 2), (["none"], 2)], ids=str)
+def test_the_command_line_is_explained_or_refused_in_one_line(name, arguments, code, monkeypatch, capsys):
+    """--help was taken for a folder, and without an argument there was a traceback."""
+    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda: None)  # JAX has begun in this process
+    with pytest.raises(SystemExit) as stop:
+        import_module(f"experiments.{name}").main(arguments)
+    assert stop.value.code == code
+    said = capsys.readouterr()
+    assert f"usage: python -m experiments.{name}" in said.out if code == 0 else said.err.startswith(f"{name}: ")
+    assert len(said.err.splitlines()) == (code != 0)
+
+
+MAIN = {
+    name: f"experiments.{name}.__main__"
+    for name in ("closed_loop", "excitation", "online", "reaction_diffusion", "real_flight", "worlds")
+}
+NAMES = "ablation changes closed_loop comparison coverage excitation external_force online param_shift worlds"
+
+
+@pytest.mark.parametrize("name", [*NAMES.split(), "reaction_diffusion", "real_flight", "make_flights"])
+def test_help_has_a_screen_of_options_for_users(name, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as stop:
+        import_module(MAIN.get(name, f"experiments.{name}")).main(["--help"])
+    said = capsys.readouterr().out.splitlines()
+    assert stop.value.code == 0
+    assert 4 <= sum(line.startswith("  --") for line in said) <= 12
+    assert len(said) <= 50
+    assert max(map(len, said)) <= 80
+
+
+def write(path, columns, t, u, y):
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([("t", *columns), *zip(t, u, y, strict=True)])
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def slide(tmp_path_factory):
+    """Two records of a slide that is pushed to and fro."""
+    paths = []
+    for name, phase in (("one", 0.0), ("two", 1.0)):
+        t = np.arange(0, 6, 0.01)
+        u = 90 * np.sin(2 * t + phase) + 40 * np.sin(5.3 * t)
+        model, _ = emps.candidate()
+        made = hj.Record.of(name, u=(t, u), q=(t, 0 * t))
+        q = hj.simulate(model, made, (0.0, 0.0), dt=0.01, between="linear", substeps=2)[0]["q"][:, 0]
+        path = tmp_path_factory.mktemp("slide") / f"{name}.csv"
+        paths.append(write(path, ("u", "q"), t, u, q + 1e-4 * np.random.default_rng(0).normal(size=len(t))))
+    return paths
+
+
+@pytest.mark.slow
+def test_the_model_that_made_a_record_predicts_another(slide, capsys):
+    one = dataclasses.replace(emps.BENCHMARK, candidates={"physics": emps.candidate}, parts=2)
+    record.main(one, "identification.emps", [slide[0], "--test", slide[1]])
+    said = capsys.readouterr().out
+    assert "Chosen: physics" in said
+    assert float(said.split("two.csv: ")[1].split(" mm")[0]) < 2.0
+
+
+def test_a_sensor_with_play_stays_at_a_reversal_and_then_follows():
+    field, play = tanks.physics("log_play"), 0.15
+    rate = field(np.array([4.0, 6.0, 0.0]), np.array([3.0]))[1]
+    for z, share in ((0.0, 1.0), (-np.sign(rate) * play, 1.0), (np.sign(rate) * play, 0.0)):
+        change = field(np.array([4.0, 6.0, z]), np.array([3.0]))
+        np.testing.assert_allclose(change[2], share * change[1], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "said"),
+    [
+        (("t", "u", "y"), (0, 1, 2), "has no column q; it has t, u, y"),
+        (("t", "u", "q"), (0, "x", 2), "row 2: three numbers expected"),
+    ],
+)
+def test_a_wrong_record_is_refused_in_a_line(tmp_path, header, row, said, capsys):
+    path = tmp_path / "wrong.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([header, row])
+    with pytest.raises(SystemExit) as ended:
+        record.main(emps.BENCHMARK, "identification.emps", [str(path)])
+    assert ended.value.code == 2
+    assert said in " ".join(capsys.readouterr().err.split())

@@ -84,12 +84,6 @@ def test_each_claim_fails_where_it_should(change, times, fails):
     assert {each.header[0] for each in tables(rows(**change))} >= {"change"}
 
 
-def test_a_flight_that_ends_early_has_no_coverage():
-    short = rows(inside=None)
-    assert {*tables(short)[-1].lines[0][1:]} == {"nan"}
-    assert judged(short)["O4"] is None
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "noise", "named"),

@@ -75,16 +75,15 @@ def test_runs_have_the_table_s_rates_and_patience(model, mode, table):
 
 
 @pytest.mark.parametrize(
-    ("model", "minimum", "patience"), [("hybrid", 100, 20), ("no_physics", 300, 50), ("physics_only", 100, 20)]
+    ("model", "rule", "rates"),
+    [("hybrid", (100, 20), [1e-2, 1e-4]), ("no_physics", (300, 50), [1e-4]), ("physics_only", (100, 20), [1e-2])],
 )
-def test_pretraining_lanes_use_all_source_flights(model, minimum, patience):
+def test_pretraining_lanes_use_all_source_flights(model, rule, rates):
     _, plans = pretraining(model, fresh_fields(model, IRIS, SMALL), SMALL)
-    for seed in range(SMALL.seeds):
-        plan = lane(plans, seed)
-        assert numbers(plan) == (10_000, minimum, patience, 2000)
+    for plan in map(partial(lane, plans), range(SMALL.seeds)):
+        assert numbers(plan) == (10_000, *rule, 2000)
         np.testing.assert_array_equal(np.sort(plan.subset), np.arange(10_000))
-        expected = {"hybrid": [1e-2, 1e-4], "no_physics": [1e-4], "physics_only": [1e-2]}[model]
-        np.testing.assert_allclose(jax.tree.leaves(plan.rates), expected, rtol=1e-6)
+        np.testing.assert_allclose(jax.tree.leaves(plan.rates), rates, rtol=1e-6)
 
 
 def test_pretraining_goes_on_from_the_best_with_all_rates_times_each_decay():
@@ -227,17 +226,11 @@ def test_noise_has_its_size_and_spares_the_test_split():
     np.testing.assert_allclose(np.linalg.norm(noisy.splits["train"].x0[:, 3:7], axis=1), 1, rtol=1e-6)
 
 
-def windows(count, steps):
-    flights = placeholder(SplitSpec(count, steps))
-    flights.x[..., 0] = np.arange(count)[:, None]
-    return flights
-
-
 @pytest.fixture
 def file(tmp_path):
-    path = tmp_path / "flights.npz"
-    splits = {"train": windows(8, 10), "validation": windows(4, 10)}
-    save_dataset(path, Dataset(splits, {"config": SOURCE.describe() | {"seed": 3}}))
+    path, flights = tmp_path / "flights.npz", placeholder(SplitSpec(8, 10))
+    flights.x[..., 0] = np.arange(8)[:, None]
+    save_dataset(path, Dataset({"train": flights}, {"config": SOURCE.describe() | {"seed": 3}}))
     return path
 
 

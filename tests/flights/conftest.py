@@ -38,32 +38,24 @@ def flight():
     path = CubicSpline(fine, np.sum(swing, axis=0) + 2.0)
     force = path(fine, 2) + np.array([0.0, 0.0, IRIS.gravity])
     yaw = 0.8 * np.sin(1.3 * fine) + 0.02 * np.sin(9 * fine)
-    q = np.roll(Rotation.from_matrix(_axes(force, yaw)).as_quat(), 1, axis=1)
+    z = force / np.linalg.norm(force, axis=1, keepdims=True)
+    y = np.cross(z, np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=1))  # x is as near to the heading as z allows
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    q = np.roll(Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=2)).as_quat(), 1, axis=1)
     q *= np.cumprod([1.0, *np.sign((q[1:] * q[:-1]).sum(axis=1))])[:, None]
     attitude, slope = Rotation.from_quat(np.roll(q, -1, axis=1)), CubicSpline(fine, q)(fine, 1)
     omega = 2 * (attitude.inv() * Rotation.from_quat(np.roll(slope, -1, axis=1))).as_quat()[:, :3]
     omega *= np.linalg.norm(slope, axis=1, keepdims=True)
     inertia = np.array(IRIS.inertia)
     torque = inertia * CubicSpline(fine, omega)(fine, 1) + np.cross(omega, inertia * omega)
-    squares = _squares(IRIS.mass * np.linalg.norm(force, axis=1), torque)[51:-49:2]
+    arms, k = np.array(IRIS.rotor_positions), IRIS.thrust_coefficient
+    mixer = np.stack([k * np.ones(4), k * arms[:, 1], -k * arms[:, 0], IRIS.torque_coefficient * np.array(IRIS.spin)])
+    wrench = np.concatenate([IRIS.mass * np.linalg.norm(force, axis=1, keepdims=True), torque], axis=1)
+    squares = np.linalg.solve(mixer, wrench.T).T[51:-49:2]
     assert squares.min() > 0
     x = np.concatenate([path(fine), q, path(fine, 1), omega], axis=1)
     # Motors of the middle of each interval are its mean, but for second order.
     return FlightLog(fine[50:-50:2], x[50:-50:2], np.sqrt(squares), "constructed")
-
-
-def _axes(force, yaw):
-    """Body axes whose z is along the force and whose x is as near to the heading as that allows."""
-    z = force / np.linalg.norm(force, axis=1, keepdims=True)
-    y = np.cross(z, np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=1))
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
-    return np.stack([np.cross(y, z), y, z], axis=2)
-
-
-def _squares(thrust, torque):
-    arms, k = np.array(IRIS.rotor_positions), IRIS.thrust_coefficient
-    mixer = np.stack([k * np.ones(4), k * arms[:, 1], -k * arms[:, 0], IRIS.torque_coefficient * np.array(IRIS.spin)])
-    return np.linalg.solve(mixer, np.concatenate([thrust[:, None], torque], axis=1).T).T
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""A log in other names, units, orders and frames becomes the same flight as in the library's own."""
+"""A log in other names, units, orders and frames, or with lines between slow samples, is the same flight."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,11 @@ from hypothesis import strategies as st
 from surface import outcome, refusal
 from writers import MAP, foreign, table_of
 
+from hybrid_jax.flights import attitude
+from hybrid_jax.flights.attitude import Frames, from_euler, rotation_of
+from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.column_map import load_column_map
+from hybrid_jax.flights.formats.raw import Samples, own_samples, record
 from hybrid_jax.flights.load import load_log
 
 EULER = [('["q1", "q2", "q3", "q4"]', '["roll", "pitch", "yaw"]'), ('"xyzw"', '"deg"')]
@@ -74,3 +78,119 @@ def test_any_map_is_read_or_refused(tmp_path_factory, text, at):
     path = tmp_path_factory.getbasetemp() / "fuzzed.toml"
     path.write_bytes((MAP[:at] + text + MAP[at:]).encode("utf-8", "replace"))
     outcome(load_column_map, path, naming=str(path))
+
+
+def drawn(t, own, values):
+    return np.stack([np.interp(t, own, column) for column in values.T], axis=1)
+
+
+@pytest.mark.parametrize("beside", [0.0, 0.004])
+def test_lines_become_the_samples_at_their_bends(beside):
+    rng, t = np.random.default_rng(0), 0.01 * np.arange(501)
+    own = np.append(0.1 * np.arange(50) + beside * (np.arange(50) % 3 == 1), 5.0)
+    values = rng.normal(size=(51, 4))
+    values[30:33] = values[29] + np.arange(1, 4)[:, None] * 0.5  # a line over three intervals
+    found, rows = own_samples(t, drawn(t, own, values))
+    assert len(found) == len(own)
+    np.testing.assert_allclose(np.delete(found, [30, 31, 32]), np.delete(own, [30, 31, 32]), atol=1e-6)
+    np.testing.assert_allclose(rows, drawn(found, own, values), atol=1e-5)
+
+
+def test_a_line_over_a_gap_is_no_measurement():
+    t, own = 0.01 * np.arange(501), np.delete(0.1 * np.arange(51), np.arange(20, 29))
+    found, _ = own_samples(t, drawn(t, own, np.random.default_rng(3).normal(size=(42, 4))))
+    np.testing.assert_allclose(found, own, atol=1e-6)
+
+
+def test_noise_steps_and_rest_stay_as_they_are():
+    rng, t = np.random.default_rng(1), 0.01 * np.arange(500)
+    noise = rng.normal(size=(500, 3))
+    smooth = np.sin(3 * t)[:, None]
+    for values in (noise, smooth, np.round(smooth, 2), 0 * noise, np.where(t[:, None] > 2, noise, 0.0), noise * np.nan):
+        assert own_samples(t, values)[1] is values
+
+
+@pytest.mark.parametrize("rows", [[2], [3], [3, 3, 4], [10]], ids=str)
+def test_values_that_were_repeated_are_samples_once(rows):
+    """Forward-filled, as by pandas; while it rests, a value counts as often as when it changes."""
+    counts = np.resize(rows, 60)
+    values = np.repeat(np.random.default_rng(1).normal(size=(60, 3)), counts, axis=0)
+    values = np.concatenate([values, np.repeat(values[-1:], 200, axis=0)])
+    t = 0.01 * np.arange(len(values))
+    own, _ = own_samples(t, values)
+    np.testing.assert_allclose(own[:60], t[np.cumsum([0, *counts[:-1]])])
+    assert np.median(np.diff(own)) == pytest.approx(0.01 * rows[0], abs=0.011)
+    assert np.diff(own).max() < 0.01 * (max(rows) + 1.5)
+    assert own_samples(t, values, repeated=False)[1] is values
+
+
+def test_a_recording_says_which_signals_were_lines():
+    rng, t = np.random.default_rng(2), 0.01 * np.arange(501)
+    slow = drawn(t, 0.1 * np.arange(51), rng.normal(size=(51, 4)))
+    parts = {"command": Samples(t, slow, "motors"), "rates": Samples(t, rng.normal(size=(501, 3)), "gyro")}
+    found = record("log", parts)
+    assert (len(found.signals["command"]), len(found.signals["rates"])) == (51, 501)
+    (note,) = found.notes
+    assert note.startswith("motors: values repeated, or lines between samples 0.1 s apart")
+
+
+NED, LEVEL = Frames("NED", "FRD", "world"), np.array([[1.0, 0, 0, 0]])
+NONE, DEG = np.zeros((1, 3)), np.pi / 180
+
+
+def to_library(p, q, v, omega, frames):
+    """By the conversion of readers, whose recordings become flights."""
+    velocity = "body_velocity" if frames.velocity == "body" else "velocity"
+    parts = {"position": p, "attitude": q, velocity: v, "rates": omega}
+    parts = {name: raw.Samples(np.zeros(len(q)), values, name) for name, values in parts.items()}
+    p, q, v, omega = (part.values for part in raw.turned(parts, frames.world, frames.body).values())
+    return np.concatenate([p, q, rotation_of(q).apply(v) if frames.velocity == "body" else v, omega], axis=1)
+
+
+def row(*numbers):
+    return np.array([numbers], float)
+
+
+def axes(x):
+    """Where the body's forward, left and up point in the world."""
+    return rotation_of(x[:, 3:7]).as_matrix()[0].T
+
+
+def test_level_and_north_in_ned_is_level_and_north_in_enu():
+    x = to_library(row(1, 2, -3), LEVEL, row(4, 5, -6), row(0.1, 0.2, 0.3), NED)
+    np.testing.assert_allclose(x[0, :3], [2, 1, 3])  # east, north, up
+    np.testing.assert_allclose(x[0, 7:10], [5, 4, 6])
+    np.testing.assert_allclose(x[0, 10:], [0.1, -0.2, -0.3])
+    np.testing.assert_allclose(axes(x), [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-12)  # nose north, left west
+    x = to_library(NONE, from_euler(row(0, 0, 90 * DEG)), NONE, NONE, NED)  # yaw to the east is the identity
+    np.testing.assert_allclose(np.abs(x[0, 3:7]), [1, 0, 0, 0], atol=1e-12)
+
+
+def test_pitch_and_roll_in_frd():
+    forward, left, up = axes(to_library(NONE, from_euler(row(0, 30 * DEG, 90 * DEG)), NONE, NONE, NED))
+    np.testing.assert_allclose(forward, [np.sqrt(0.75), 0, 0.5], atol=1e-12)  # east and up
+    np.testing.assert_allclose(left, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(up, [-0.5, 0, np.sqrt(0.75)], atol=1e-12)  # thrust brakes
+    _, left, _ = axes(to_library(NONE, from_euler(row(20 * DEG, 0, 90 * DEG)), NONE, NONE, NED))
+    assert left[2] == pytest.approx(np.sin(20 * DEG))
+
+
+def test_body_velocity_is_rotated_into_the_world():
+    q = from_euler(row(0, 0, 90 * DEG))
+    x = to_library(NONE, q, row(3, 1, -2), NONE, Frames("NED", "FRD", "body"))  # forward, right, up
+    np.testing.assert_allclose(x[0, 7:10], [3, -1, 2], atol=1e-12)  # east, south, up
+    x = to_library(NONE, from_euler(row(0, 0, 90 * DEG)), row(3, 1, 2), NONE, Frames("ENU", "FLU", "body"))
+    np.testing.assert_allclose(x[0, 7:10], [-1, 3, 2], atol=1e-12)
+
+
+def test_euler_angles_turn_yaw_first():
+    forward = rotation_of(from_euler(row(0, 90 * DEG, 90 * DEG))).apply([1.0, 0, 0])[0]
+    np.testing.assert_allclose(forward, [0, 0, -1], atol=1e-12)  # z up: positive pitch is nose down
+    left = rotation_of(from_euler(row(90 * DEG, 0, 90 * DEG))).apply([0.0, 1, 0])[0]
+    np.testing.assert_allclose(left, [0, 0, 1], atol=1e-12)
+
+
+def test_rates_between_are_the_rates_of_the_flight(flight):
+    middle = 0.5 * (flight.x[1:, 10:] + flight.x[:-1, 10:])
+    # Second order in the interval: ω̈ dt² / 12 with ω̈ up to some hundred rad/s³.
+    np.testing.assert_allclose(attitude.rates_between(flight.t, flight.x[:, 3:7]), middle, atol=5e-3)

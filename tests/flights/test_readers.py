@@ -80,15 +80,6 @@ def test_motors_at_rest_and_beyond_their_limits_fail(flight, written):
     assert "rotor_speed of motor 1 is 1.047e+05 at 3 s, must be from 0 to 1100" in line
 
 
-def test_a_voltage_that_is_no_number_is_left_out_and_said(flight, written):
-    volts = np.where(np.arange(len(flight.t)) > 500, np.nan, 3700.0)
-    recording = read_recording(written(crazyflie(flight, **{"pm.vbatMV": volts})))
-    assert len(recording.signals["voltage"]) == 501
-    assert any("pm.vbatMV: voltage is no number in" in note and "at 5.01 s" in note for note in recording.notes)
-    path = written(crazyflie(flight, **{"gyro.x": volts}))
-    refusal(lambda: read_recording(path), path, "gyro.x", "x is nan at 5.01 s")
-
-
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
 def test_a_bag_is_the_flight_it_holds(flight, tmp_path, plugin):
     path = bag(tmp_path / "run", flight, plugin)
