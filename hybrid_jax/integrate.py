@@ -20,10 +20,18 @@ from hybrid_jax.runtime import entry, jit_by_size
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
+NEWTON_STEPS = 50  # of Newton's method in a stage of an implicit solver
 LONG = 1000  # intervals in which solvers change the norm of a quaternion by more than rounding
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
 _infer = jit_by_size()(lambda field, x, u: as_field(field).infer_batch(x, u))
+
+
+class _Newton(optimistix.Newton):
+    """Newton's method that ends when its update is small, and not, as diffrax's default, at the first that grows."""
+
+    def terminate(self, fn, y, args, options, state, tags):
+        return state.diffsize < 1, state.result
 
 
 class RK4(diffrax.AbstractSolver):
@@ -96,7 +104,7 @@ def integrate(
     term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
     substeps *= solver.substeps if isinstance(solver, RK4) else 1
     begin, end = 0.0, dt / substeps
-    if isinstance(solver, diffrax.AbstractImplicitSolver):
+    if implicit := isinstance(solver, diffrax.AbstractImplicitSolver):
         begin, end = jnp.asarray(begin), jnp.asarray(end)  # its root finder accepts no plain numbers
 
     def interval(x, held):
@@ -104,8 +112,8 @@ def integrate(
         started = x, solver.init(term, begin, end, x, held)
 
         def step(carry, _):
-            x, _, _, state, _ = solver.step(term, begin, end, carry[0], held, carry[1], made_jump=False)
-            return (x, state), None
+            x, _, _, state, result = solver.step(term, begin, end, carry[0], held, carry[1], made_jump=False)
+            return (jnp.where(result == diffrax.RESULTS.successful, x, jnp.nan) if implicit else x, state), None
 
         # Training takes one step: that program has no loop in it. Many, written out, would take minutes to compile.
         (x, _), _ = step(started, None) if substeps == 1 else jax.lax.scan(step, started, length=substeps)
@@ -137,14 +145,14 @@ def _evaluate(field: AbstractVectorField, x, u):
 
 
 def _prepared(solver: Solver, dtype) -> Solver:
-    """The solver with tolerances for its root finder and a bounded loop, which `shard_map` can differentiate."""
+    """The solver with a root finder that converges and a bounded loop, which `shard_map` can differentiate."""
     if isinstance(solver, diffrax.HalfSolver):
         return eqx.tree_at(lambda half: half.solver, solver, _prepared(solver.solver, dtype))
     if isinstance(solver, diffrax.AbstractImplicitSolver) and not isinstance(solver.root_finder.rtol, float):  # pyright: ignore[reportAttributeAccessIssue]
         tolerance = 1e-5 if jnp.finfo(dtype).bits < 64 else 1e-10
-        tolerances = tolerance, tolerance, optimistix.max_norm
-        found = eqx.tree_at(lambda finder: (finder.rtol, finder.atol, finder.norm), solver.root_finder, tolerances)
-        solver = eqx.tree_at(lambda solver: solver.root_finder, solver, found)
+        # A step here is a whole interval, and is not tried again with a smaller one as diffrax's default expects.
+        newton = _Newton(tolerance, tolerance, cauchy_termination=False)
+        solver = dataclasses.replace(solver, root_finder=newton, root_find_max_steps=NEWTON_STEPS)
     if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
         return dataclasses.replace(solver, scan_kind="bounded")
     return solver
@@ -161,7 +169,8 @@ def rollout(
     """The trajectory of a field in inference mode: x[i] is the state (i + 1) dt after x0, u[i] the input before it.
 
     For more than a thousand intervals, attitudes in the field's state space are normalised after each one. A
-    trajectory that diverges continues as infinity or NaN; `Model.predict` raises instead.
+    trajectory that diverges continues as infinity or NaN, as does one in which an implicit solver finds no step;
+    `Model.predict` raises instead.
 
     Args:
         field: ẋ = f(x, u), a vector field or any function of a state (d,) and an input (m,).

@@ -162,3 +162,17 @@ def test_an_attitude_stays_one_however_long_it_turns():
     for many in (rollout_batch, predict):
         np.testing.assert_allclose(many(body, x0[None], u[None], 0.01)[0, :500], flown[:500], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(rollout(body, x0, u[:500], 0.01), flown[:500], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ImplicitEuler", "Kvaerno3", "Kvaerno5"])
+def test_an_implicit_solver_solves_its_equations_or_says_that_it_did_not(name):
+    """A state that follows the sine of a slow one, from a start beside it."""
+
+    def rolled(rate):
+        def field(x, u):
+            return jnp.stack([u[0] - 0.3 * x[0] - 0.1 * x[1] ** 2, rate * (jnp.sin(x[0]) - x[1])])
+
+        return rollout(field, jnp.array([0.3, 0.3015]), jnp.full((2, 1), 0.1), 0.1, getattr(diffrax, name)())[-1]
+
+    np.testing.assert_allclose(rolled(3.6e4), (0.3002, 0.2957), atol=1e-3)
+    assert jnp.isnan(rolled(1e13)).all()
