@@ -18,6 +18,7 @@ from hybrid_jax.status import Status, ended
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
 SMALLEST, LARGEST = 1e-12, 1e8  # damping: beyond, no direction leads down
 HIDDEN = 10  # times the rounding of one number: what rounding does to the sum of squares
+PROMISED = 1e-3  # of the cost: a fit that no step lowers has not converged if without damping so much was expected
 SLOW = 2  # steps in a row that lower the cost by less than the tolerance end the fit
 
 Move = tuple[Float[Array, " p"], Float[Array, ""]]  # a step, and by how much it should lower the cost
@@ -86,9 +87,14 @@ def judged(state: State, cost: Float[Array, ""], tolerance: float = 0.0) -> tupl
 
 
 def aimed(state: State, tried: PyTree, expected: Float[Array, ""], least: Float[Array, ""] | float = 0.0) -> State:
-    """Set the next point to try; it is the last one if the expected decrease is less than `least`."""
+    """Set the next point to try; it is the last one if the expected decrease is below `least` or rounding.
+
+    The damping of steps that failed is no reason to expect little: the fit then goes on until it stalls.
+    """
     hidden = HIDDEN * jnp.finfo(state.cost.dtype).eps * state.cost
-    return state._replace(tried=tried, expected=expected, last=expected <= jnp.maximum(least, hidden))
+    promised = expected * jnp.maximum(state.damping, 1)
+    last = (expected <= jnp.maximum(least, hidden)) & (promised <= jnp.maximum(100 * least, PROMISED * state.cost))
+    return state._replace(tried=tried, expected=expected, last=last)
 
 
 def minimise(

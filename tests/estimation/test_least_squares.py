@@ -17,6 +17,7 @@ from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.estimation import least_squares, levenberg_marquardt
 from hybrid_jax.integrate import RK4, rollout_batch
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.status import Status
 
 _mse, _flown = eqx.filter_jit(rollout_mse), eqx.filter_jit(rollout_batch)
 EXACT, DAMPED = swings(40, damping=0.0), swings(40)  # of a pendulum as the model has it, and of one with damping
@@ -170,3 +171,18 @@ def test_a_narrow_curved_valley_takes_few_steps():
         end = levenberg_marquardt.minimise(evaluate, aim, begun, 1000)
     np.testing.assert_allclose(end.best[0], 1.0, atol=1e-6)
     assert end.steps < 400  # 509 if the damping falls only after steps that are as good as expected
+
+
+@pytest.mark.parametrize(("slope", "status"), [(1.0, Status.STALLED), (1e-4, Status.OK)])
+def test_a_fit_that_no_step_lowers_has_not_converged_if_more_was_expected(slope, status):
+    """The cost rises where the derivative says that it falls, by much or by what may be rounding."""
+
+    def evaluate(z, _):
+        return 1 + slope * jnp.abs(z[0]), z
+
+    def aim(z, damping):
+        return (*levenberg_marquardt.move_of_equations(jnp.eye(1), jnp.full(1, slope), damping), 0.0)
+
+    begun = levenberg_marquardt.begin(jnp.zeros(1), jnp.zeros(1))
+    end = levenberg_marquardt.minimise(evaluate, aim, begun, 1000)
+    assert end.status == status
