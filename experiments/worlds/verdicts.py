@@ -45,8 +45,8 @@ def conclusion(rows: Results) -> list[str]:
     cases = _cases(rows)
     worst, own = next(iter(cases.items()))
     return [
-        f"In {sum(map(_sound, cases.values()))} of {len(cases)} cases the adapted model is never worse than its "
-        f"source: at most {MEAN} times its error in the mean, {EACH} times in a single adaptation.",
+        f"In {sum(map(_sound, cases.values()))} of {len(cases)} cases adaptation does no harm: the error is at most "
+        f"{MEAN} times the source's in the mean, and at most {EACH} times in a single adaptation.",
         f"The worst case is {label(*worst)}: {own.numbers('ratio').max():.3g} times its error.",
     ]
 
