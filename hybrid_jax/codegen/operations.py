@@ -160,10 +160,8 @@ class CTranslation(Translation[np.ndarray]):
     def _power(self, base: np.ndarray, exponent: int, shape) -> np.ndarray:
         if exponent < 0:
             return self.entrywise("div", (column([1.0]), self._power(base, -exponent, shape)), shape)
-        if exponent > 4:
+        if exponent > 4 or exponent == 0:
             return self.entrywise("pow", (base, column([float(exponent)])), shape)
-        if exponent == 0:
-            return column([1.0] * len(base))
         return reduce(lambda a, b: self.entrywise("mul", (a, b), shape), [base] * exponent)
 
     def _simple(self, name: str, operands: Sequence) -> Any:

@@ -39,7 +39,7 @@ code=$?
 kill $!
 exit $code
 """
-_LOCK = threading.Lock()  # programs are traced in several threads
+_LOCK, _BEGUN = threading.Lock(), dict[str, Future[str]]()  # programs are traced in several threads
 
 
 class Unusable(Exception):
@@ -67,12 +67,9 @@ def obstacle() -> str | None:
 def compiled(source: str) -> Future[str]:
     """Begin to compile and register a source, whose result is the prefix of its XLA targets, or the error Unusable."""
     with _LOCK:
-        return _begun(source)
-
-
-@cache
-def _begun(source: str) -> Future[str]:
-    result = Future[str]()
+        if source in _BEGUN:
+            return _BEGUN[source]
+        result = _BEGUN[source] = Future()
 
     def run() -> None:
         try:

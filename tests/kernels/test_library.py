@@ -26,12 +26,12 @@ needs_kernels = pytest.mark.skipif(library.obstacle() is not None, reason=kernel
 def anew():
     fields._KNOWN.clear()
     library.obstacle.cache_clear()
-    library._begun.cache_clear()
+    library._BEGUN.clear()
     yield
     fields._KNOWN.clear()
     fields.REFUSED.clear()
     library.obstacle.cache_clear()
-    library._begun.cache_clear()
+    library._BEGUN.clear()
 
 
 @pytest.fixture
