@@ -56,7 +56,8 @@ class FitResult(eqx.Module):
         best_epoch: its number, counted from 1; 0 for the initial field.
         field: the field after the last epoch.
         epochs: how many were trained.
-        status: how it ended; OK if it stopped early, RUNNING if it was interrupted.
+        status: how it ended; OK if it stopped early, STALLED if no epoch was better than the first, RUNNING if it was
+            interrupted.
         history: the losses of every epoch.
         state: the final state of the run.
     """

@@ -159,7 +159,8 @@ def _updated(state, plan, field, adam, key, train_loss, error) -> FitState:
     best = jax.tree.map(lambda new, old: jnp.where(better, new, old) if eqx.is_array(new) else new, field, state.best)
     best_epoch = jnp.where(better, finished, state.best_epoch)
     patient = (finished < plan.min_epochs) | (finished - best_epoch < plan.patience)
-    status = jnp.where(patient, jnp.where(finished >= plan.max_epochs, Status.CAPPED, Status.RUNNING), Status.OK)
+    stopped = jnp.where(best_epoch > 1, Status.OK, Status.STALLED)
+    status = jnp.where(patient, jnp.where(finished >= plan.max_epochs, Status.CAPPED, Status.RUNNING), stopped)
     # Python integers become 64 bit in double precision, but the loop carries 32 bit.
     status = jnp.where(finite, status, Status.DIVERGED).astype(jnp.int32)
     best_mse = jnp.where(better, error, state.best_mse)

@@ -126,12 +126,16 @@ def test_the_best_epoch_is_the_best_that_validation_saw():
 
 
 def test_it_stops_when_patience_is_spent_and_not_before_the_minimum(damped):
-    for state, minimum, patience in ((damped, 10, 10), (trained(pendulum(LENGTH, DAMPING), 0.0, patience=5), 10, 5)):
-        assert state.status == Status.OK
+    # With a rate of zero the first epoch is the best for ever: the error did not fall, and nothing converged.
+    still = trained(pendulum(LENGTH, DAMPING), 0.0, patience=5)
+    for state, minimum, patience, status in ((damped, 10, 10, Status.OK), (still, 10, 5, Status.STALLED)):
+        assert state.status == status
         assert state.epochs == max(minimum, state.best_epoch + patience)
-    # With a rate of zero the first epoch is the best for ever; no later one is better.
-    assert state.best_epoch == 1
-    for rules, ended in (({"min_epochs": 0, "patience": 7}, (Status.OK, 8)), ({"max_epochs": 7}, (Status.CAPPED, 7))):
+    assert still.best_epoch == 1
+    for rules, ended in (
+        ({"min_epochs": 0, "patience": 7}, (Status.STALLED, 8)),
+        ({"max_epochs": 7}, (Status.CAPPED, 7)),
+    ):
         state = trained(pendulum(LENGTH, DAMPING), 0.0, **rules)
         assert (state.status, state.epochs) == ended
 
