@@ -40,7 +40,7 @@ from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, maske
 from hybrid_jax.estimation.uncertainty import sandwich
 from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_by_size
-from hybrid_jax.status import ended
+from hybrid_jax.status import Status
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 
@@ -233,7 +233,8 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
     ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(blocks[1])))
     first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
     choice = Choice(*first, inherited, absorbed)
-    status = ended(found.converged, found.converged | ~jnp.isinf(ends).any())
+    finite = (found.status == Status.OK) | ~jnp.isinf(ends).any()
+    status = jnp.where(finite, found.status, Status.DIVERGED)
     return Solution(candidate(extended(field, train.x0.shape[1]), choice, taken), found.steps, status, choice)
 
 

@@ -45,7 +45,7 @@ class Fit(NamedTuple):
         noise: variance of one error over scale, from differences of successive errors.
         seen: which parameters change the predictions by more than rounding.
         steps: evaluations of the Jacobian.
-        converged: whether it stopped before the most steps, at a finite error.
+        status: how it ended, a `Status`.
     """
 
     theta: Float[Array, " p"]
@@ -53,7 +53,7 @@ class Fit(NamedTuple):
     noise: Float[Array, ""]
     seen: Bool[Array, " p"]
     steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    status: Int[Array, ""]
 
     def at(self, theta: Float[Array, " p"]) -> NormalEquations:
         (gram, score, square), move = self.equations, theta - self.theta
@@ -90,7 +90,7 @@ def fit_each(
         equations = jax.vmap(equations_of)(jacobian, r)
         seen = has_effect(equations, windows, scale)
         theta = ravel_parameters(found.field)[0]
-        fit = Fit(theta, masked(equations, seen), noise, seen, found.steps, found.converged)
+        fit = Fit(theta, masked(equations, seen), noise, seen, found.steps, found.status)
         return (jacobian, r, ~jnp.any(free)), fit  # where nothing is fitted, these are of the start
 
     shape = jax.eval_shape(weigh, smooth.x)
