@@ -68,11 +68,20 @@ def test_a_hundred_random_fields_are_those_of_jax(seed):
     arguments = draw(STATES, 21), draw(2, INPUTS, 21), draw(2, STATES, 21)
     arguments[0][3, 4] = np.nan
     assert calls(trained, field, *arguments[:2]), kernels.status()
-    found = eqx.filter_jit(partial(both_ways, partial(trained, dt=0.05)))(field, *arguments)
+
+    def both(of, *arguments):
+        found = eqx.filter_jit(partial(both_ways, partial(of, dt=0.05)))(*arguments)
+        return [np.asarray(one) for one in jax.tree.leaves(found)]
+
     with jax.enable_x64(True):
-        exact = eqx.filter_jit(partial(both_ways, partial(trained_by_jax, dt=0.05)))(*doubled((field, *arguments)))
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
-        np.testing.assert_array_equal(np.isnan(one), np.isnan(other))
-        known = ~np.isnan(other)
-        scale = np.abs(other[known]).max(initial=0)
-        np.testing.assert_allclose(one[known], other[known], rtol=0, atol=2e-6 * scale)
+        exact = both(trained_by_jax, *doubled((field, *arguments)))
+
+    def errors(found):
+        """The largest of each array, over its largest number; NaN is where double precision has it."""
+        for one, other in zip(found, exact, strict=True):
+            np.testing.assert_array_equal(np.isnan(one), np.isnan(other))
+            yield np.nanmax(np.abs(one - other), initial=0) / (np.nanmax(np.abs(other), initial=0) or 1)
+
+    own = np.array([*errors(both(trained, field, *arguments))])
+    if own.max() > 2e-6:  # where a sum cancels, JAX in single precision is as far off
+        assert (own <= np.maximum(2e-6, 2 * np.array([*errors(both(trained_by_jax, field, *arguments))]))).all()
