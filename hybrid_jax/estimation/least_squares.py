@@ -227,7 +227,8 @@ def fit_and_linearise(
         (z, upper), (before, found, jacobian, units) = tried, state.best
 
         def cost_and_errors(z):
-            r = own(jax.vmap(partial(errors, theta_at(z, units[0])))(windows))
+            at = jax.vmap(partial(errors, theta_at(z, units[0])))
+            r = own(in_chunks(at, windows, TOGETHER, distinct))
             return cost_of(z, r, units), r
 
         def correction(z, r):
