@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.signal
+import scipy  # not scipy.signal, which takes a second: it is imported where it is first used
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
