@@ -7,14 +7,18 @@ import signal
 import subprocess
 import time
 
+import jax
 import numpy as np
 import pytest
-from recorded import LOGS, READING, of_every_format, written
+from recorded import LOGS, READING, of_every_format, write, written
 from smoke import ROOT
 from writers import MAP
 
+from experiments.real_flight.simulated import vehicle_toml
+from experiments.worlds.cases import WORLDS
 from hybrid_jax.cli.command import VERBS
 from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.identification.learning import without_past
 from hybrid_jax.integrate import rollout
 from hybrid_jax.io.models import load, save
@@ -96,6 +100,30 @@ def test_from_logs_of_every_format_to_pages_and_a_program(fitted, ran, seen):
         (listed,) = re.findall(rf"^- `{verb}`:(.*?)^(?:- |\n)", guide, flags=re.MULTILINE | re.DOTALL)
         assert {*report(verb)} - {"format", "verb", "answer", "notes"} <= {*re.findall(r"`(\w+)`", listed)}, verb
     assert are_fine(fitted, seen) == {*VERBS, "identified"}
+
+
+@pytest.mark.slow
+def test_flights_of_another_simulator_become_an_adapted_model(tmp_path, ran):
+    """RotorPy's Hummingbird, whose aerodynamics are not ours, with noise and averaged rotor speeds."""
+    world, rng = WORLDS["hummingbird"], np.random.default_rng(0)
+    for seed, (folder, change) in enumerate({"before": "nothing", "after": "parameter_shift"}.items()):
+        flown = world.fly(change, "moving", 4, 11.0, jax.random.key(seed))
+        logs = zip(flown.states[:, :-1], flown.averaged, strict=True)
+        times = 0.01 * np.arange(flown.averaged.shape[1])
+        write(tmp_path / folder, [FlightLog(times, measured(x, rng), u, f"{i}.csv") for i, (x, u) in enumerate(logs)])
+    (tmp_path / "v.toml").write_text(vehicle_toml(world.vehicle))
+    learn = "Ix,Iy,Iz,k_rotors,rate_damping,drag,aerodynamic_moment"  # else the inertia takes a part of the drag
+    ran(tmp_path, f"fit before -o source.npz --vehicle v.toml --learn {learn}")
+    assert "Changed: " in ran(tmp_path, "adapt source.npz after -o adapted.npz")
+    found = json.loads((tmp_path / "runs" / "adapt" / "report.json").read_text())["parameters"]
+    for name, true in zip(("Ix", "Iy"), world.changed("parameter_shift").inertia, strict=False):
+        assert found[name]["value"] == pytest.approx(true, rel=0.05)
+
+
+def measured(x, rng):
+    x = x + np.repeat([1e-3, 1e-3, 0.02, 0.02], [3, 4, 3, 3]) * rng.normal(size=x.shape)
+    x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=1, keepdims=True)
+    return x
 
 
 @pytest.mark.slow
