@@ -1,7 +1,8 @@
 """Trajectories of a vector field with piecewise constant inputs, by any one-step ODE solver of diffrax."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import ClassVar
 
@@ -246,6 +247,16 @@ def check_solver(solver) -> None:
     # A step starts at time zero, of which a multistep method would remember the wrong ones.
     if solver.term_structure is not diffrax.AbstractTerm or isinstance(solver, diffrax.LeapfrogMidpoint):
         raise ValueError(f"solver must be a one-step method for ODEs of one term, got {type(solver).__name__}")
+
+
+@contextmanager
+def solver_errors(solver: Solver | None) -> Iterator[None]:
+    """Shorten the message of an implicit solver whose equations are not finite to one line."""
+    try:
+        yield
+    except eqx.EquinoxRuntimeError:
+        found = f"{type(solver).__name__} finds no step where the search went"
+        raise ValueError(f"solver: {found}; start nearer, or bound the field") from None
 
 
 def check_callable(field) -> None:

@@ -30,10 +30,10 @@ from hybrid_jax.dynamics.disturbance import (
     without_zeros,
 )
 from hybrid_jax.dynamics.rigid_body import uncorrected
-from hybrid_jax.estimation.least_squares import Solver, solver_errors
+from hybrid_jax.estimation.least_squares import Solver
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters, sandwich
 from hybrid_jax.extrapolation import features_of, shares_outside
-from hybrid_jax.integrate import checked, compact
+from hybrid_jax.integrate import checked, compact, solver_errors
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import CHUNK
 from hybrid_jax.networks.standardise import motion_of

@@ -1,8 +1,7 @@
 """Nonlinear least squares for the physical parameters θ_p, in the physics' own parametrisation."""
 
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -20,7 +19,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_l
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, corrected, judged, minimise, move_of_rows
-from hybrid_jax.integrate import compact, rollout
+from hybrid_jax.integrate import compact, rollout, solver_errors
 from hybrid_jax.runtime import entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories, errors_of
@@ -94,16 +93,6 @@ def fit_least_squares(
     if not checks.is_traced(found.discretisation):
         warn_of_steps(float(found.discretisation), "a solver with more substeps, such as RK4(substeps=2)")
     return found
-
-
-@contextmanager
-def solver_errors(solver: Solver) -> Iterator[None]:
-    """Shorten the message of an implicit solver whose equations are not finite to one line."""
-    try:
-        yield
-    except eqx.EquinoxRuntimeError:
-        found = f"{type(solver).__name__} finds no step where the search went"
-        raise ValueError(f"solver: {found}; start nearer, or bound the field") from None
 
 
 def warn_of_steps(discretisation: float, remedy: str) -> None:
@@ -227,8 +216,7 @@ def fit_and_linearise(
         (z, upper), (before, found, jacobian, units) = tried, state.best
 
         def cost_and_errors(z):
-            at = jax.vmap(partial(errors, theta_at(z, units[0])))
-            r = own(in_chunks(at, windows, TOGETHER, distinct))
+            r = own(in_chunks(jax.vmap(partial(errors, theta_at(z, units[0]))), windows, TOGETHER, distinct))
             return cost_of(z, r, units), r
 
         def correction(z, r):

@@ -21,12 +21,12 @@ from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
 from hybrid_jax.estimation.elimination import End, descend, reduced
-from hybrid_jax.estimation.least_squares import FINE, Solver, ravel_parameters, solver_errors, warn_of_steps
+from hybrid_jax.estimation.least_squares import FINE, Solver, ravel_parameters, warn_of_steps
 from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.estimation.record_search import TINY, size_of
 from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
-from hybrid_jax.integrate import RK4
+from hybrid_jax.integrate import RK4, solver_errors
 from hybrid_jax.records import Between, Record, Signal, on_grid
 from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
