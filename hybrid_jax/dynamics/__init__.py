@@ -1,4 +1,4 @@
-"""Vector fields ẋ = f(x, u): fields made of fields, the physics of a multirotor, grids, disturbances, hidden parts."""
+"""Vector fields ẋ = f(x, u): the physics of a multirotor, grids, hybrids, disturbances and hidden states."""
 
 from hybrid_jax.dynamics.actuators import Actuated, Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable

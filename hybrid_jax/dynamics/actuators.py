@@ -37,15 +37,15 @@ class Actuator:
     """The map from command to rotor speed: the table `[actuator]` of a vehicle file.
 
     Attributes:
-        curve: coefficients c0, c1, … of Σ ci command^i, in the unit of what it gives.
-        gives: "speed" of a rotor [rad/s], or its "thrust" [N].
-        time_constants: for speeding up and slowing down [s]; you can give one number for both.
-        nominal_voltage: V₀ [V]; 0 if the voltage does not matter.
-        voltage_exponent: γ.
-        delay: by how much commands act later than logged [s]; constant over a log.
+        curve: coefficients c0, c1, … of the polynomial Σ ci command^i, in the unit of `gives`.
+        gives: whether the curve gives the "speed" of a rotor [rad/s] or its "thrust" [N].
+        time_constants: τ_up and τ_down, for speeding up and slowing down [s]; you can give one number for both.
+        nominal_voltage: V₀, the battery voltage at which the curve is valid [V]; 0 if the voltage does not matter.
+        voltage_exponent: γ, for example 0 if the vehicle compensates for its voltage.
+        delay: the time from when a command is logged to when it acts [s], constant over a log.
 
     Raises:
-        ValueError: an invalid field, with what was expected and the value.
+        ValueError: if a field is invalid.
     """
 
     curve: tuple[float, ...]
@@ -81,17 +81,17 @@ class Actuated(AbstractVectorField):
 
     u has one command for each rotor, followed by the battery voltage if `nominal_voltage` is given.
 
-    Parameters are deviations from the nominal actuator that start at zero: of `curve` in units of its value at full
-    command, of time constants as logarithms, of the others in their own unit. `delay` shifts a log (`delayed`); the
+    Parameters are deviations from the nominal actuator that start at zero: `curve` in units of its value at full
+    command, time constants as logarithms, and the others in their own unit. `delay` shifts a log (`delayed`), and the
     equations do not use it.
 
     Attributes:
         body: the field driven by rotor speeds.
-        deviations: of each learned parameter, by name.
-        actuator: nominal values of the curve, the lag, the voltage and the delay.
+        deviations: the deviation of each learned parameter from its nominal value, by name.
+        actuator: the nominal curve, lag, voltage and delay.
 
     Raises:
-        ValueError: unknown names, or a voltage exponent without a nominal voltage.
+        ValueError: if a name is unknown, or a voltage exponent is learned without a nominal voltage.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -105,7 +105,7 @@ class Actuated(AbstractVectorField):
 
     @property
     def rotor_states(self) -> int:
-        """How many rotor speeds follow the 13 states of the body."""
+        """The number of rotor speeds after the 13 states of the body: 0 without lag."""
         lags = {"time_constant", "time_constants"} & self.deviations.keys() or self.actuator.time_constants[0]
         return self.body.vehicle.rotors if lags else 0
 
@@ -136,7 +136,7 @@ class Actuated(AbstractVectorField):
         return self.actuator.nominal_voltage > 0
 
     def theta(self) -> dict[str, Array]:
-        """The learned parameters of the body and of the actuator, in SI units."""
+        """Return the learned parameters of the body and of the actuator, in SI units."""
         return self.body.theta() | {name: self._value(name) for name in self.deviations}
 
     def _value(self, name: str) -> Array:
@@ -151,18 +151,18 @@ class Actuated(AbstractVectorField):
 
     @property
     def delay(self) -> Array:
-        """By how much commands act later than logged [s]."""
+        """The time from when a command is logged to when it acts [s]."""
         return self._value("delay")
 
     def time_constants(self) -> Float[Array, "2"]:
-        """τ_up and τ_down [s]."""
+        """Return τ_up and τ_down [s]."""
         if "time_constant" in self.deviations:
             nominal = np.maximum(self.actuator.time_constants, QUICKEST)
             return jnp.asarray(nominal) * jnp.exp(self.deviations["time_constant"])
         return self._value("time_constants")
 
     def steady_speeds(self, u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
-        """w∞ [rad/s]: the steady rotor speeds under commands and voltage."""
+        """Return w∞, the rotor speeds [rad/s] once they have settled under commands and voltage."""
         vehicle = self.body.vehicle
         commands = u[: vehicle.rotors]
         if self.reads_voltage:
@@ -174,7 +174,7 @@ class Actuated(AbstractVectorField):
         return jnp.sqrt(jnp.maximum(value / vehicle.thrust_coefficient, least**2))
 
     def speeds(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
-        """w [rad/s]: the rotor speeds in the state or, without lag, the steady ones."""
+        """Return the rotor speeds w [rad/s] of the state or, without lag, the steady ones."""
         return x[STATE_SIZE:] if self.rotor_states else self.steady_speeds(u)
 
     def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
@@ -189,7 +189,7 @@ class Actuated(AbstractVectorField):
         return jnp.concatenate([changed, residual[STATE_SIZE:]])
 
     def settled(self, u: Float[Array, "t m"], dt: float) -> Float[Array, " n"]:
-        """The rotor speeds [rad/s] after the inputs u (t, m), from equilibrium; exact for piecewise constant inputs.
+        """Return the rotor speeds [rad/s] after the inputs u (t, m), beginning at equilibrium; u is piecewise constant.
 
         Args:
             dt: duration of each input [s].
@@ -204,12 +204,12 @@ class Actuated(AbstractVectorField):
 
 
 def actuated(body: RigidBody, actuator: Actuator, learn: tuple[str, ...] = ()) -> Actuated:
-    """The body with its actuators.
+    """Return the body with its actuators.
 
     Args:
         body: the field driven by rotor speeds.
-        actuator: nominal values of the map from command to rotor speed.
-        learn: names of learned actuator parameters, from `actuators.NAMES`; by default none.
+        actuator: the nominal map from command to rotor speed.
+        learn: names of the actuator parameters to learn, from `actuators.NAMES`; by default none.
 
     Raises:
         ValueError: see `check_actuator_names`.
@@ -234,13 +234,13 @@ def check_actuator_names(learn: tuple[str, ...], actuator: Actuator, of_body: tu
 def rotor_speeds(
     field: Actuated, t: Float[np.ndarray, " n"], commands: Float[np.ndarray, "n m"], edges: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "k-1 r"]:
-    """The mean rotor speed [rad/s] in each interval, one row each, to convert a log of commands to rotor speeds.
+    """Convert commands to the mean rotor speeds [rad/s] of each interval, one row for each interval.
 
     Args:
         field: the body with its actuators.
-        t: times [s] (n,), from each of which an input is held until the next.
-        commands: inputs u of the field at these times, with the voltage [V] last if the field reads it (n, m).
-        edges: of the intervals, ascending (k,) [s].
+        t: times (n,) of the inputs [s]; each input is held until the next.
+        commands: inputs u (n, m) of the field at these times, with the voltage [V] last if the field reads it.
+        edges: ascending edges (k,) of the intervals [s].
     """
     u = np.asarray(held_means(jnp.asarray(t), jnp.asarray(commands), jnp.asarray(edges), field.delay))
     targets = np.asarray(field.steady_speeds(jnp.asarray(u.T)).T)

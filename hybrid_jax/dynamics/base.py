@@ -31,13 +31,13 @@ Columns = Float[Array, "d c"]  # derivatives of d numbers in c directions
 
 
 class AbstractVectorField(eqx.Module):
-    """ẋ = f(x, u). Every inexact array inside is learned (see `trainable`).
+    """A vector field ẋ = f(x, u). Every inexact array inside is learned (see `trainable`).
 
-    Other methods evaluate it on a batch, features first: x (d, b), u (m, b). The defaults work for single-sample code;
-    override those that you can make faster. `as_field` adds them to any function.
+    Write `__call__` for one sample. The other methods evaluate a batch, features first: x (d, b), u (m, b). Their
+    defaults work for any field; you can override those that you can make faster.
 
     Attributes:
-        accepts_batch: whether `__call__` also accepts x (d, b) and u (m, b), for example because it reads x[0], x[1], …
+        accepts_batch: whether `__call__` also accepts x (d, b) and u (m, b), for example if it only reads x[0], x[1], …
     """
 
     accepts_batch: ClassVar[bool] = False
@@ -47,58 +47,58 @@ class AbstractVectorField(eqx.Module):
         """ẋ of one sample, in inference mode."""
 
     def train_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
-        """ẋ on a minibatch in training mode: batch normalisation uses the moments of this minibatch."""
+        """Evaluate ẋ on a minibatch in training mode: batch normalisation uses the moments of this minibatch."""
         direct = self.features_first and not batch_norms(self)
         return self(x, u) if direct else over_samples(training_mode(self))(x, u)
 
     def infer_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
-        """ẋ of many samples in inference mode, a column for each."""
+        """Evaluate ẋ on a batch in inference mode, with one column for each sample."""
         return self(x, u) if self.features_first else over_samples(self)(x, u)
 
     def update_running_stats(self, x: Batch, u: Float[Array, "m b"]) -> Self:
-        """The field after one training batch: running statistics move, learned parameters do not."""
+        """Return the field with running statistics updated by a minibatch; learned parameters do not change."""
         return with_moved_stats(self, x, u)
 
     def apply_residual(self, x: Float[Array, " d *b"], residual: Float[Array, " d *b"]) -> Float[Array, " d *b"]:
-        """The contribution of a residual to ẋ of this physics; by default the residual itself.
+        """Return what a residual adds to ẋ of this physics; by default the residual itself.
 
         Args:
-            residual: output of a network, in units of ẋ (d,).
+            residual: the output (d,) of a network, in units of ẋ.
         """
         return residual
 
     def linearize(self, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns):
-        """ẋ of one sample in inference mode, and its derivatives (d, c) along c directions.
+        """Return ẋ of one sample in inference mode, and its derivatives (d, c) along c directions.
 
         Args:
-            dx: directions of the state, in columns (d, c).
-            du: directions of the input, in columns (m, c).
+            dx: directions (d, c) of the state, in columns.
+            du: directions (m, c) of the input, in columns.
         """
         return jvp_columns(self, (x, u), (dx, du))
 
     def parameter_columns(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Columns:
-        """The derivative of ẋ of one sample with respect to p learned numbers (d, p)."""
+        """Return the derivative (d, p) of ẋ of one sample with respect to p learned numbers."""
         theta, at = ravel_learned(self)
         return jax.jacfwd(lambda theta: at(theta)(x, u))(theta)
 
     def fuse_for_inference(self) -> "AbstractVectorField":
-        """The same map in inference mode, in a layout that is faster for few samples at a time."""
+        """Return the same map in inference mode, in a layout that is faster for few samples at a time."""
         return self
 
     @property
     def features_first(self) -> bool:
-        """Whether some part of it has a batched form, so that a batch is best kept on the last axis."""
+        """Whether a part of the field has a batched form, so that a batch is best kept on the last axis."""
         return self.accepts_batch
 
     @property
     def state_space(self) -> StateSpace:
-        """The state space; by default taken from the first field inside that has one, else empty."""
+        """The state space; by default that of the first field inside that has one, else empty."""
         spaces = (part.state_space for part in _fields_inside(self))
         return next((space for space in spaces if space.quantities), StateSpace())
 
     @property
     def parameter_units(self) -> dict[str, str]:
-        """Units of learned parameters by name, for example "kg m²"; by default taken from the fields inside."""
+        """The units of learned parameters by name, for example "kg m²"; by default those of the fields inside."""
         inside = (part.parameter_units for part in _fields_inside(self))
         return {name: unit for units in inside for name, unit in units.items()}
 
@@ -188,10 +188,10 @@ def jvp_columns(function, values: tuple, columns: tuple) -> tuple[Float[Array, "
 
 
 def trainable(field: Any) -> Any:
-    """A tree with True at each leaf that the optimiser may change, for `equinox.partition`.
+    """Return a tree with True at each leaf that the optimiser may change, for example for `equinox.partition`.
 
     Args:
-        field: any field; its floating-point arrays are learned unless frozen.
+        field: any field. Its floating-point arrays are learned unless they are inside `Frozen`.
     """
 
     def fixed(node) -> bool:

@@ -13,7 +13,7 @@ from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 
 
 class HoldState(AbstractVectorField):
-    """ẋ = 0: the state does not change."""
+    """A baseline with ẋ = 0: the state does not change."""
 
     accepts_batch: ClassVar[bool] = True
 
@@ -36,7 +36,7 @@ class Kinematics(AbstractVectorField):
 
 
 class FrozenRates(AbstractWrapper):
-    """The field inside with ω̇ = 0: thrust accelerates the vehicle at constant body rates."""
+    """A baseline with ω̇ = 0: thrust accelerates the vehicle, and its body rates stay constant."""
 
     def write(self, x, inside):
         return inside.at[BODY_RATES].set(0.0)

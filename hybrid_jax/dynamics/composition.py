@@ -71,11 +71,11 @@ class AbstractComposite(AbstractVectorField):
 
 
 class Hybrid(AbstractComposite):
-    """ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus a residual for unmodelled dynamics (paper, Eq. 4).
+    """A hybrid model ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus a residual for what it lacks (paper, Eq. 4).
 
     Attributes:
-        physics: f_p.
-        residual: f_d, a network or any other field; physics maps its output, see `apply_residual`.
+        physics: f_p, any field.
+        residual: f_d, a network or any other field. Physics may transform its output; see `apply_residual`.
     """
 
     physics: AbstractVectorField
@@ -124,7 +124,7 @@ class AbstractWrapper(AbstractComposite):
 
 
 class Frozen(AbstractWrapper, AbstractInferenceOnly):
-    """A field in inference mode that training does not change: neither parameters nor running statistics."""
+    """A field that training does not change. It is in inference mode, and keeps its running statistics."""
 
     def train_batch(self, x, u):
         return self.infer_batch(x, u)
@@ -134,10 +134,10 @@ class Frozen(AbstractWrapper, AbstractInferenceOnly):
 
 
 def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
-    """The field without its `Frozen` wrappers.
+    """Return the field without its `Frozen` wrappers, for example to train it further.
 
     Args:
-        field: any field, entirely or partly frozen.
+        field: any field that is frozen, or has parts that are.
     """
 
     def frozen(node) -> bool:

@@ -15,7 +15,7 @@ from hybrid_jax.dynamics.composition import Hybrid
 
 
 class ConstantDisturbance(AbstractVectorField):
-    """ẋ = d at the disturbed states and zero at the others, for all x and u.
+    """A constant ẋ = d: the value at the disturbed states and zero at the others, for all x and u.
 
     Attributes:
         value: d (k), one number for each disturbed state in its unit per second, or a scalar for every state.
@@ -37,13 +37,13 @@ class ConstantDisturbance(AbstractVectorField):
         return jnp.broadcast_to(self.vector(len(x)).reshape(-1, *(1,) * (x.ndim - 1)), x.shape)
 
     def vector(self, d: int) -> Float[Array, " d"]:
-        """ẋ at any x and u.
+        """Return ẋ (d,), which is the same for all x and u.
 
         Args:
             d: size of the state.
 
         Raises:
-            ValueError: indices out of range for d.
+            ValueError: if an index is out of range for d.
         """
         if self.value.ndim == 0:
             return jnp.broadcast_to(self.value, (d,))
@@ -58,15 +58,15 @@ class ConstantDisturbance(AbstractVectorField):
 
 
 def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None = None) -> AbstractVectorField:
-    """The field with a constant disturbance in its physics, zero unless it already has one.
+    """Return the field with a constant disturbance in its physics, which is zero unless the field already has one.
 
     Args:
-        field: physics, or physics and a residual.
+        field: physics alone, or a hybrid.
         indices: the disturbed states; by default given by the state space of the physics, for example v̇ and ω̇ of a
             rigid body, or each component of physics on a `Grid` (one number for all points).
 
     Raises:
-        ValueError: the field already has a nonzero disturbance of other states.
+        ValueError: if the field already has a nonzero disturbance of other states.
     """
     if (known := disturbance_of(field)) is not None:
         if indices is None or indices == known.indices:

@@ -11,18 +11,18 @@ from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 
 
 class DisturbanceModel(AbstractVectorField):
-    """ẋ = f(x, u) + D e and żᵢ = (e − zᵢ) / τᵢ, with e = W (z₁, …, z_k, x, 1), of the states (x, z₁, …, z_k).
+    """A disturbance that is predicted from its past: ẋ = f(x, u) + D e, żᵢ = (e − zᵢ) / τᵢ, e = W (z₁, …, z_k, x, 1).
 
-    e is the disturbance in the tangent space of the state, D its effect on ẋ, and zᵢ is e after a filter. While the
-    states are measured, e is the measured disturbance and not W (…): see `hybrid_jax.estimation.observe`. This is an
+    The state is (x, z₁, …, z_k). e is the disturbance in the tangent space of x, D its effect on ẋ, and zᵢ is e after a
+    filter. While x is measured, e is the measured disturbance instead: see `hybrid_jax.estimation.observe`. This is an
     innovations form of linear hidden dynamics (Ljung, System Identification, 1999, 4.3) with fixed poles.
 
     Attributes:
-        field: f, of d states with e numbers in their tangent space.
+        field: f, with d states and e numbers in their tangent space.
         weights: W (e, k e + n + 1), in the units of ẋ, z and x.
-        sizes: how much each number that W multiplies varied in the data of the first fit (k e + n + 1), in its unit;
+        sizes: by how much each number that W multiplies varied in the data of the first fit (k e + n + 1), in its unit;
             infinite for a state that did not vary.
-        time_constants: τ₁, …, τ_k of the filters [s].
+        time_constants: time constants τ₁, …, τ_k of the filters [s].
         states: indices of the n states that W reads.
     """
 
@@ -34,7 +34,7 @@ class DisturbanceModel(AbstractVectorField):
 
     @property
     def filters(self) -> int:
-        """How many numbers a state has after the states of the field."""
+        """The number of filter states, which follow the states of the field."""
         return len(self.time_constants) * len(self.weights)
 
     @property
@@ -43,10 +43,10 @@ class DisturbanceModel(AbstractVectorField):
         return own.padded(own.size + self.filters)
 
     def disturbance(self, x: Float[Array, " d+f"]) -> Float[Array, " e"]:
-        """The predicted disturbance e in a state, in its units per second.
+        """Predict the disturbance e (e,) in a state, in the state's units per second.
 
         Args:
-            x: state of the field, then of the filters.
+            x: the state of the field, followed by the states of the filters.
         """
         d = len(x) - self.filters
         return self.weights @ jnp.concatenate([x[d:], x[jnp.array(self.states, int)], jnp.ones(1, x.dtype)])

@@ -14,11 +14,11 @@ class AbstractEstimator(eqx.Module):
 
     @abstractmethod
     def begin(self, x: Float[Array, " d"]) -> Any:
-        """The state of the estimator before the first sample x."""
+        """Return the state of the estimator before the first sample x."""
 
     @abstractmethod
     def update(self, state: Any, x: Float[Array, " d"], u: Float[Array, " m"]) -> Any:
-        """The state of the estimator after one period, with mean input u and the sample x at its end.
+        """Return the state of the estimator after one period with mean input u and the sample x at its end.
 
         Args:
             state: of the estimator, as returned by `begin` and `update`.
@@ -26,14 +26,14 @@ class AbstractEstimator(eqx.Module):
 
     @abstractmethod
     def model(self, state: Any) -> AbstractVectorField:
-        """The prediction model of the controller.
+        """Return the prediction model for the controller.
 
         Args:
             state: of the estimator, as returned by `begin` and `update`.
         """
 
     def command(self, state: Any, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The input to command if the controller requests u at the state x; by default u.
+        """Return the input to command if the controller requests u in the state x; by default u.
 
         Args:
             state: of the estimator, as returned by `begin` and `update`.
@@ -41,7 +41,7 @@ class AbstractEstimator(eqx.Module):
         return u
 
     def effective(self, state: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The model input with the same effect as the system input u, the inverse of `command`; by default u.
+        """Return the model input with the same effect as the system input u, the inverse of `command`; by default u.
 
         Args:
             state: of the estimator, as returned by `begin` and `update`.

@@ -24,16 +24,16 @@ SEAM = 3.0  # times the usual step between neighbours that one across the edge m
 class Grid:
     """A periodic grid of equal spacing with one or more quantities at each point.
 
-    A state contains one quantity after the other, each in row-major order; further axes are samples. Methods take and
-    return `fields` of shape (components, *shape, *b).
+    A state has one quantity after the other, each in row-major order; further axes are samples. Methods take and
+    return arrays of shape (components, *shape, *b), as `fields` does.
 
     Attributes:
         shape: points along each axis of space, at least three.
-        spacing: between neighbours along every axis [m].
+        spacing: distance between neighbours along every axis [m].
         components: number of quantities at each point.
 
     Raises:
-        ValueError: a side of fewer than three points, a spacing that is not positive, no components.
+        ValueError: if a side has fewer than three points, the spacing is not positive, or there are no components.
     """
 
     shape: tuple[int, ...]
@@ -55,29 +55,29 @@ class Grid:
 
     @property
     def size(self) -> int:
-        """d, the size of a state."""
+        """The size d of a state."""
         return self.components * self.points
 
     @property
     def state_space(self) -> StateSpace:
-        """One quantity for each component."""
+        """The state space, with one quantity for each component."""
         components = (Quantity(f"component {i}", self.points, uniform=True) for i in range(self.components))
         return StateSpace(tuple(components))
 
     @property
     def axes(self) -> range:
-        """The axes of space in what `fields` returns."""
+        """The indices of the axes of space in an array that `fields` returns."""
         return range(1, 1 + len(self.shape))
 
     def fields(self, x: Float[Array, " d *b"]) -> Float[Array, " c *cells"]:
-        """The state as arrays over the grid (components, *shape, *b); ValueError if its size differs."""
+        """Return the state as an array (components, *shape, *b) over the grid; ValueError if its size differs."""
         if x.shape[0] != self.size:
             sides = " × ".join(map(str, (self.components, *self.shape)))
             raise ValueError(f"a grid of {sides} needs states of {self.size} numbers, got {x.shape[0]}")
         return x.reshape(self.components, *self.shape, *x.shape[1:])
 
     def laplacian(self, fields: Float[Array, " c *cells"]) -> Float[Array, " c *cells"]:
-        """Δ of each component: the sum over neighbours of (neighbour − value) / spacing², with an error of O(spacing²).
+        """Compute Δ of each component: Σ (neighbour − value) / spacing² over neighbours, with an error of O(spacing²).
 
         Args:
             fields: as returned by `fields`.
@@ -92,11 +92,11 @@ class Grid:
         return (sum(near[1:], near[0]) - len(near) * fields) / self.spacing**2
 
     def moved(self, fields: Float[Array, " c *cells"], kernel: int) -> list[Float[Array, " c *cells"]]:
-        """The fields of each of the kernel × … × kernel neighbours, in row-major order of their offsets.
+        """Return the values at each of the kernel × … × kernel neighbours, in row-major order of their offsets.
 
         Args:
             fields: as returned by `fields`.
-            kernel: points along each side of the neighbourhood, an odd number.
+            kernel: number of points along each side of the neighbourhood, odd.
         """
         if kernel == 1:
             return [fields]
@@ -109,12 +109,12 @@ class Grid:
         return jnp.pad(fields, [(reach * (i in self.axes),) * 2 for i in range(fields.ndim)], mode="wrap")
 
     def largest_step(self, diffusivity: float | Sequence[float] | np.ndarray | Array) -> float:
-        """The longest step [s] for which RK4 is stable, by linear theory; infinite without diffusion.
+        """Return the longest step [s] for which RK4 is stable, by linear theory; it is infinite without diffusion.
 
         The Laplacian's most negative eigenvalue is −4 n / spacing² in n dimensions, hence 2.785 spacing² / (4 n D).
 
         Args:
-            diffusivity: D [m²/s], one or several, of which the largest counts.
+            diffusivity: one or several D [m²/s], of which the largest counts.
         """
         most = float(np.max(np.abs(np.asarray(diffusivity))))
         return REAL_AXIS * self.spacing**2 / (4 * len(self.shape) * most) if most else float("inf")
@@ -128,19 +128,19 @@ def check_grid(
     substeps: int = 1,
     name: str = "windows",
 ) -> None:
-    """Reject windows that are not on the grid, not periodic, or too slowly sampled for the solver's steps.
+    """Raise an error if windows are not on the grid, not periodic, or sampled too slowly for the solver's steps.
 
-    Data count as not periodic if steps across an edge are more than three times as large as between neighbours.
+    Data count as periodic if differences across an edge are at most three times as large as between neighbours.
 
     Args:
         grid: the grid of each state.
         windows: the data.
-        diffusivity: one or several [m²/s], of which the largest bounds the step; 0 for no bound.
-        substeps: steps of the solver in each interval of the windows.
-        name: what messages call the windows.
+        diffusivity: one or several D [m²/s], of which the largest bounds the step; 0 for no bound.
+        substeps: number of solver steps in each interval of the windows.
+        name: name of the windows in messages.
 
     Raises:
-        ValueError: one of these, in one line with the bound and the substeps that you need.
+        ValueError: if one of these is true. The message has the bound and the number of substeps that you need.
     """
     size = check(windows, name).x0.shape[-1]
     if size != grid.size:
@@ -166,7 +166,7 @@ def check_grid(
 
 
 class Diffusion(AbstractVectorField):
-    """ẋ = D Δx on a grid.
+    """Diffusion ẋ = D Δx on a grid.
 
     Attributes:
         log_diffusivity: logarithm of D [m²/s] of each component (c).
@@ -190,19 +190,19 @@ class Diffusion(AbstractVectorField):
         return self(x, u), self(dx, u)  # it is linear
 
     def theta(self) -> dict[str, Float[Array, " c"]]:
-        """The diffusivities [m²/s]."""
+        """Return the diffusivities [m²/s]."""
         return {"diffusivity": jnp.exp(self.log_diffusivity)}
 
 
 def diffusion(grid: Grid, diffusivity: Sequence[float]) -> Diffusion:
-    """`Diffusion` from its diffusivities.
+    """Make a `Diffusion` from diffusivities.
 
     Args:
         grid: the grid of the state.
         diffusivity: D [m²/s] of each component.
 
     Raises:
-        ValueError: a diffusivity that is not positive, or a number of diffusivities other than `components`.
+        ValueError: if a diffusivity is not positive, or there is not one for each component.
     """
     if len(diffusivity) != grid.components:
         raise ValueError(f"diffusivity: {grid.components} expected, one for each component, got {len(diffusivity)}")

@@ -54,11 +54,11 @@ class AbstractHidden(eqx.Module):
 
 
 class Lag(AbstractHidden):
-    """Inputs with a first-order lag: ż = (u − z) / τ, and z acts on the field.
+    """Inputs with a first-order lag: ż = (u − z) / τ, and the field receives z instead of u.
 
     Attributes:
-        log_time_constant: ln τ of each of these inputs (k,), τ in seconds.
-        places: indices of the inputs.
+        log_time_constant: ln τ of each lagged input (k,), with τ in seconds.
+        places: indices of the lagged inputs.
     """
 
     log_time_constant: Float[Array, " k"]
@@ -81,9 +81,9 @@ class Delay(AbstractHidden):
     The response spreads by delay / √order about the delay (MacDonald, Time Lags in Biological Models, 1978).
 
     Attributes:
-        log_delay: ln of the delay, the delay in seconds.
-        places: indices of the inputs.
-        order: lags in the chain.
+        log_delay: logarithm of the delay in seconds.
+        places: indices of the delayed inputs.
+        order: number of lags in the chain.
     """
 
     log_delay: Float[Array, ""]
@@ -104,7 +104,7 @@ class Delay(AbstractHidden):
 
 
 class RandomWalk(AbstractHidden):
-    """A disturbance of ẋ that is a random walk under process noise, and constant without.
+    """A disturbance of ẋ that is a random walk if it has process noise, and constant otherwise.
 
     Attributes:
         places: indices of the states of the field that it acts on.
@@ -126,13 +126,13 @@ class RandomWalk(AbstractHidden):
 class Oscillator(AbstractHidden):
     """A damped oscillator that acts on the field, for example a load on a cable.
 
-    Its states are a and ȧ, with ä = −ω² a − 2 ζ ω ȧ + w · (x, u); g a is added to ẋ.
+    Its states are a and ȧ, with ä = −ω² a − 2 ζ ω ȧ + w · (x, u), and it adds g a to ẋ.
 
     Attributes:
-        log_frequency: ln ω, ω in rad/s.
+        log_frequency: ln ω, with ω in rad/s.
         log_damping: ln ζ.
-        drive: w, the weight of each state and input (d + m,).
-        gain: g of each state it acts on (k,).
+        drive: weight w of each state and input (d + m,).
+        gain: gain g of each state that it acts on (k,).
         places: indices of the states of the field that it acts on.
     """
 
@@ -155,12 +155,12 @@ class Oscillator(AbstractHidden):
 
 
 class LinearDynamics(AbstractHidden):
-    """Hidden linear dynamics: ż = A z + B (x, u), and C z is added to ẋ.
+    """Hidden linear dynamics: ż = A z + B (x, u), which adds C z to ẋ.
 
     Attributes:
-        a: A (k, k).
-        b: B, of each state and input (k, d + m).
-        c: C, of each state it acts on (s, k).
+        a: the matrix A (k, k).
+        b: the matrix B (k, d + m), with a column for each state and input.
+        c: the matrix C (s, k), with a row for each state that it acts on.
         places: indices of the states of the field that it acts on (s).
     """
 
@@ -198,14 +198,14 @@ class WithHidden(AbstractVectorField):
 
 
 def with_hidden(field: AbstractVectorField, *parts: AbstractHidden) -> WithHidden:
-    """A field with hidden parts, any number of each kind, whose states follow the states of the field.
+    """Add hidden parts to a field, any number of each kind. Their states follow the states of the field.
 
     Args:
         field: the field that the parts act on.
-        parts: for example `Lag`, `Delay`, `RandomWalk`, `Oscillator` and `LinearDynamics`; the first receives the
+        parts: for example `Lag`, `Delay`, `RandomWalk`, `Oscillator` and `LinearDynamics`. The first receives the
             inputs, each further one the output of the one before.
 
     Raises:
-        ValueError: no part, or something else.
+        ValueError: if there is no part, or something is not a part.
     """
     return WithHidden(field, tuple(checks.list_of("parts", parts, AbstractHidden)))

@@ -17,23 +17,23 @@ def _numbers(values) -> tuple[float, ...]:
 
 
 class StateSpaceModel(eqx.Module):
-    """ẋ = f(x, u) with measured outputs y = h(x, u), an initial state that may be unknown, and process noise.
+    """A field ẋ = f(x, u) with measured outputs y = h(x, u), a possibly unknown initial state, and process noise.
 
-    Every array inside the field and the outputs is learned, so an output may be a module with its own bias; Python
-    numbers are constants.
+    Every array inside the field and the outputs is learned; Python numbers are constants. For example, an output may
+    be a module that learns its own bias.
 
     Attributes:
-        field: f.
+        field: the vector field f.
         inputs: the names of the signals that make up u, in order.
-        outputs: h by name: each a function of the state (d,) and the input (m,) that returns a scalar or (k,).
+        outputs: the functions h by name. Each takes the state (d,) and the input (m,), and returns a scalar or (k,).
         start: the expected initial state (d,).
-        spread: the standard deviation of the initial state about `start` (d,): 0 if it is known, infinite if nothing
-            is known about it. An attitude in the field's state space has three numbers here, its rotation [rad].
-        process: the standard deviation of the process noise on each state, per square root of a second, one number
-            for each of `spread`; by default 0. A state with process noise and no dynamics is a random walk.
+        spread: the standard deviation of the initial state about `start` (d,): 0 if you know it, infinite if you know
+            nothing about it. An attitude has three numbers here, its rotation [rad].
+        process: the standard deviation of the process noise on each state, per square root of a second; by default 0.
+            It has the shape of `spread`. A state with process noise and no dynamics is a random walk.
 
     Raises:
-        ValueError: sizes that do not agree, or a negative deviation.
+        ValueError: if sizes do not agree, or a deviation is negative.
     """
 
     field: AbstractVectorField
@@ -56,7 +56,7 @@ class StateSpaceModel(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of states d."""
+        """The number d of states."""
         return len(self.start)
 
     @property
@@ -65,7 +65,7 @@ class StateSpaceModel(eqx.Module):
         return state_space(self.field, self.size)
 
     def begin(self, x0: Float[Array, " d"], u: Float[Array, "t m"], dt: float):
-        """The initial state of a piece of a record, and the inputs of its intervals.
+        """Return the initial state of a piece of a record, and the inputs of its intervals.
 
         Args:
             x0: the unknown initial state (d,).
@@ -75,7 +75,7 @@ class StateSpaceModel(eqx.Module):
         return x0, u
 
     def output(self, name: str, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " k"]:
-        """The measured output in a state.
+        """Compute an output in a state, in the unit of its measurement.
 
         Args:
             name: of the output.
@@ -88,7 +88,7 @@ class StateSpaceModel(eqx.Module):
         return y
 
     def error(self, name: str, predicted: Float[Array, " k"], y: Float[Array, " k"]) -> Float[Array, " e"]:
-        """The prediction minus the measurement.
+        """Subtract the measurement from the prediction.
 
         Args:
             name: of the output.

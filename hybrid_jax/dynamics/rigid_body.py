@@ -49,7 +49,7 @@ RIGID_BODY_SPACE = RigidBodySpace(
 
 
 class RigidBody(AbstractVectorField):
-    """A rigid body carried by its rotors, with further `Terms`: x as in state.py (13), u the rotor speeds [rad/s].
+    """A rigid body carried by its rotors, with further `Terms`; x (13) as in state.py, u the rotor speeds [rad/s].
 
         ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
         m f = C (τ_y, −τ_x, 0) − D Rᵀv − m c Rᵀv,   E = diag(1, 1, 0)
@@ -72,15 +72,15 @@ class RigidBody(AbstractVectorField):
     is applied to the log (`hybrid_jax.flights.checks.cleaning`): four more states would be unknown in each window.
 
     Attributes:
-        deviations: of each learned parameter, by name; for shapes see `shape_of`.
-        vehicle: its constants, which are the nominal values.
+        deviations: the deviation of each learned parameter from nominal, by name; for shapes see `shape_of`.
+        vehicle: the constants of the vehicle, which are the nominal values.
         terms: nominal values of further terms; those that are zero and not learned cost nothing.
         wrench: whether a residual is a force and a torque rather than an acceleration. Its v̇ and ω̇ are then given at
             nominal mass and inertia and scaled by nominal / m and nominal / I, so that a learned aerodynamic torque
             remains valid when the inertia changes.
 
     Raises:
-        ValueError: an unknown parameter name, two of which only the ratio or product is identifiable, or a wrong type.
+        ValueError: if a name is unknown, only a ratio or product of two parameters is identifiable, or a type is wrong.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -105,13 +105,13 @@ class RigidBody(AbstractVectorField):
         return UNITS
 
     def theta(self) -> dict[str, Float[Array, "..."]]:
-        """The learned parameters in SI units, by name; see `Vehicle` and `Terms`."""
+        """Return the learned parameters in SI units, by name; see `Vehicle` and `Terms`."""
         shapes = {name: shape_of(self.vehicle, name) for name in self.deviations}
         entries = self.entries().items()
         return {name: jnp.stack(rows).reshape(at) if (at := shapes[name]) else rows[0] for name, rows in entries}
 
     def entries(self) -> dict[str, Rows]:
-        """θ_p number by number."""
+        """Return the numbers of θ_p."""
         units, known = units_of(self.vehicle), nominal_values(self.vehicle, self.terms)
 
         def value(name: str, middle: float, deviation: Array) -> Array:
@@ -132,11 +132,11 @@ class RigidBody(AbstractVectorField):
         return equations.evaluate_columns(RigidBody.of_rows, by_number, x, u)
 
     def of_rows(self, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
-        """ẋ from the entries of x and u."""
+        """Compute ẋ from the entries of x and u."""
         return equations.derivative(self.vehicle, self.terms, self.entries(), x, u)
 
     def apply_residual(self, x, residual):
-        """The residual with its effect on ṗ: a force changes the position before the estimated velocity."""
+        """Return the residual with its effect on ṗ: a force changes the position before the estimated velocity."""
         if self.wrench:
             factors = jnp.ones(STATE_SIZE, residual.dtype)
             for name, at in INERTIAS.items():
@@ -154,7 +154,7 @@ class RigidBody(AbstractVectorField):
 def rigid_body(
     vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms | None = None, wrench: bool = False
 ) -> RigidBody:
-    """The rigid body at its nominal values.
+    """Make a rigid body at its nominal values.
 
     Args:
         vehicle: its constants.

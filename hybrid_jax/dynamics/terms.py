@@ -21,7 +21,7 @@ NONE = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Terms:
-    """Nominal values of the terms beyond a rigid body, absent by default; body frame. For equations see `RigidBody`.
+    """Nominal values of further terms of a `RigidBody`, in the body frame; all are absent by default.
 
     Attributes:
         torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
@@ -35,7 +35,7 @@ class Terms:
         motor_time_constant: lag of the rotors behind logged motor values [s]; applied to logs, not by the field.
 
     Raises:
-        ValueError: a term of another shape, or a number that is not finite.
+        ValueError: if a term has another shape, or a number is not finite.
     """
 
     torque_gain: Three = (1.0, 1.0, 1.0)

@@ -21,7 +21,7 @@ LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hy
 
 @dataclass(frozen=True)
 class VehicleModel:
-    """A vehicle and its learned parameters; ValueError as in `check_learned`.
+    """A vehicle and the names of its parameters to learn; ValueError if a name is unknown.
 
     Attributes:
         vehicle: its constants.
@@ -41,12 +41,12 @@ class VehicleModel:
         check_learned(self.learn, self.actuator)
 
     def physics(self) -> RigidBody:
-        """The field at its nominal values, driven by rotor speeds."""
+        """Return the field at its nominal values, driven by rotor speeds."""
         learned = tuple(name for name in self.learn if name != LAG and name not in NAMES)
         return rigid_body(self.vehicle, learned, self.terms)
 
     def commanded(self) -> Actuated:
-        """The field at its nominal values, driven by commands; ValueError without `[actuator]`."""
+        """Return the field at its nominal values, driven by commands; ValueError if there is no `[actuator]`."""
         if self.actuator is None:
             raise ValueError("the vehicle file has no table [actuator], which a log of commands needs")
         return actuated(self.physics(), self.actuator, tuple(name for name in self.learn if name in NAMES))
@@ -60,14 +60,14 @@ def check_learned(learn: tuple[str, ...], actuator: Actuator | None = None) -> N
 
 
 def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleModel:
-    """Read a TOML file of `[vehicle]`, `learn` and `[terms]`; by default a rigid body that learns Ix, Iy and k.
+    """Read a vehicle file: TOML with `[vehicle]`, `learn` and `[terms]`. By default Ix, Iy and k are learned.
 
     Args:
         path: the TOML file.
-        variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, e.g. the mass with a payload.
+        variant: name of a table `[vehicle.VARIANT]` that overrides constants, for example the mass with a payload.
 
     Raises:
-        ValueError: one line with the file, the key and what was expected.
+        ValueError: if a key is invalid, with the file, the key and what was expected.
     """
     tables = read_tables(path)
     require_known(str(path), tables, TABLES)
