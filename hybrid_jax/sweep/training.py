@@ -78,7 +78,8 @@ def sweep(
 
     Returns:
         The stacked final states as host arrays. A lane whose loss was not finite has status DIVERGED and the best epoch
-        before it; it affects no other lane.
+        before it; it affects no other lane. A lane's place in a chunk, which it leaves when others stop, may change
+        its rounding.
 
     Raises:
         ValueError: invalid data, an n_train that does not fit them, or a minibatch of one window with a BatchNorm.

@@ -144,13 +144,19 @@ def test_minibatches_are_of_the_lanes_windows_however_many_are_listed(listed):
 
 @pytest.mark.parametrize("width", [1, 3])
 def test_a_diverged_lane_changes_no_bit_of_another(width, final):
-    """A rate of 1e3 makes the pendulum's length vanish at the first step."""
-    wild = swept(starts(), [PLANS[0], plan(1e3, 40, seed=2), PLANS[2]], width=width)
-    tame = final if width == 1 else swept(starts(), PLANS, width=width)
-    for i in (0, 2):
-        assert same(lane(wild, i), lane(tame, i))
+    """A rate of 1e3 makes the pendulum's length vanish at the first step.
+
+    Lanes move up in a chunk when another stops, for whatever reason, and an optimised program rounds by the place.
+    """
+    wild, stopped = (
+        swept(starts(), [PLANS[0], other, PLANS[2]], width=width)
+        for other in (plan(1e3, 40, seed=2), plan(0.01, 40, minimum=1, cap=1, seed=2))
+    )
     assert wild.status[1] == Status.DIVERGED
     assert np.isfinite(wild.best.log_length).all()
+    for i in (0, 2):
+        assert same(lane(wild, i), lane(stopped, i))
+        assert width > 1 or same(lane(wild, i), lane(final, i))
 
 
 def test_stopped_lanes_are_run_no_more(monkeypatch):
