@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.state import STATE_SIZE
 
 SAME = 1e-3  # two dt that differ by less, relatively, are of clocks and not of windows
 
@@ -93,13 +92,6 @@ def overflows(trajectories: Trajectories) -> bool:
     states = np.asarray(trajectories.x0), np.asarray(trajectories.x)
     most = np.finfo(jax.dtypes.canonicalize_dtype(states[0].dtype)).max / states[0].shape[-1]
     return max(max(part.max(), -part.min()) for part in states) > most**0.5
-
-
-def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> None:
-    """Raise ValueError for states of 13 numbers (state.py) whose quaternions are not of norm 1."""
-    if trajectories.x0.shape[-1] == STATE_SIZE:
-        checks.unit_quaternions(f"{name}: x0", trajectories.x0)
-        checks.unit_quaternions(f"{name}: x", trajectories.x)
 
 
 def check_like(trajectories: Trajectories, windows: Trajectories, name: str, dt: bool = True) -> None:

@@ -14,7 +14,7 @@ from hybrid_jax import checks
 
 T = TypeVar("T")
 FEWEST_ROTORS, MOST_ROTORS = 3, 12
-TABLES = ("vehicle", "learn", "terms", "actuator", "purpose")  # of a vehicle file: see `dynamics.vehicle_file`
+TABLES = ("vehicle", "learn", "terms", "actuator")  # of a vehicle file: see `dynamics.vehicle_file`
 # Of vehicles that fly, the radius of gyration √(I / m) is 0.2 to 1 times the longest arm.
 LONGEST_ARM = 10.0  # m
 LEAST_GYRATION, MOST_GYRATION = 0.01, 10.0  # times the longest arm

@@ -161,7 +161,6 @@ def test_terms_and_learned_names_are_read(written):
         ("", "[terms]\nmotor_time_constant = -1", "motor_time_constant"),
         ("terms = 3", "", "table [terms]"),
         ("actuator = 1", "", "actuator"),
-        ("purpose = {a = 3}", "", "purpose"),
         ("vehicle", "", "readable TOML"),
     ],
 )

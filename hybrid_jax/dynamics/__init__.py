@@ -8,7 +8,7 @@ from hybrid_jax.dynamics.disturbance import ConstantDisturbance, with_disturbanc
 from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.grids import Diffusion, Grid, check_grid, diffusion
-from hybrid_jax.dynamics.hidden import Delay, Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
+from hybrid_jax.dynamics.hidden import Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import Terms
@@ -18,5 +18,5 @@ __all__ = ["AbstractVectorField", "Frozen", "FrozenRates", "HoldState", "Hybrid"
 __all__ += ["Actuated", "Actuator", "Diffusion", "Grid", "actuated", "check_grid", "diffusion", "rotor_speeds"]
 __all__ += ["AbstractEstimator", "ConstantDisturbance", "DisturbanceModel", "with_disturbance"]
 __all__ += ["RigidBody", "Terms", "VehicleModel", "load_vehicle_model", "rigid_body"]
-__all__ += ["Delay", "Lag", "LinearDynamics", "Oscillator", "RandomWalk", "with_hidden"]
+__all__ += ["Lag", "LinearDynamics", "Oscillator", "RandomWalk", "with_hidden"]
 __all__ += ["StateSpaceModel"]

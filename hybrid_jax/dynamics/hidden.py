@@ -54,41 +54,19 @@ class AbstractHidden(eqx.Module):
 
 
 class Lag(AbstractHidden):
-    """Inputs with a first-order lag: ż = (u − z) / τ, and the field receives z instead of u.
+    """Inputs with a lag, ż = (u − z) / τ, or a chain of equal lags, which delays them; the field receives z.
+
+    The response to a chain spreads by τ / √order about a delay of τ (MacDonald, Time Lags in Biological Models, 1978).
 
     Attributes:
-        log_time_constant: ln τ of each lagged input (k,), with τ in seconds.
+        log_time_constant: ln τ of each lagged input (k,), with τ in seconds: the sum over the chain.
         places: indices of the lagged inputs.
+        order: number of lags in the chain; choose four for a delay.
     """
 
     log_time_constant: Float[Array, " k"]
     places: Indices = eqx.field(static=True)
-
-    @property
-    def size(self) -> int:
-        return len(self.places)
-
-    def derivative(self, z, x, u):
-        return (u[jnp.array(self.places)] - z) / jnp.exp(self.log_time_constant)
-
-    def inputs(self, z, u):
-        return jnp.asarray(u).at[jnp.array(self.places)].set(z)
-
-
-class Delay(AbstractHidden):
-    """Delayed inputs, by a chain of equal lags whose time constants add up to the delay.
-
-    The response spreads by delay / √order about the delay (MacDonald, Time Lags in Biological Models, 1978).
-
-    Attributes:
-        log_delay: logarithm of the delay in seconds.
-        places: indices of the delayed inputs.
-        order: number of lags in the chain.
-    """
-
-    log_delay: Float[Array, ""]
-    places: Indices = eqx.field(static=True)
-    order: int = eqx.field(static=True, default=4)
+    order: int = eqx.field(static=True, default=1)
 
     @property
     def size(self) -> int:
@@ -97,7 +75,7 @@ class Delay(AbstractHidden):
     def derivative(self, z, x, u):
         chain = z.reshape(self.order, -1)
         before = jnp.concatenate([u[jnp.array(self.places)][None], chain[:-1]])
-        return ((before - chain) * self.order / jnp.exp(self.log_delay)).ravel()
+        return ((before - chain) * self.order / jnp.exp(self.log_time_constant)).ravel()
 
     def inputs(self, z, u):
         return jnp.asarray(u).at[jnp.array(self.places)].set(z.reshape(self.order, -1)[-1])
@@ -202,7 +180,7 @@ def with_hidden(field: AbstractVectorField, *parts: AbstractHidden) -> WithHidde
 
     Args:
         field: the field that the parts act on.
-        parts: for example `Lag`, `Delay`, `RandomWalk`, `Oscillator` and `LinearDynamics`. The first receives the
+        parts: for example `Lag`, `RandomWalk`, `Oscillator` and `LinearDynamics`. The first receives the
             inputs, each further one the output of the one before.
 
     Raises:

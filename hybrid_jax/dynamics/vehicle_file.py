@@ -2,8 +2,7 @@
 
 Above all tables `learn = ["Ix", "drag", …]`, names from `terms.SHAPES`; then `[vehicle]` with constants of `Vehicle`,
 `[vehicle.NAME]` with the overrides of a variant, `[terms]` with nominal values of `Terms`, and, for logs of commands
-instead of rotor speeds, `[actuator]` with values of `Actuator`, whose names you can add to `learn`. You can explain
-terms above the tables, for example `purpose = { cable_pull = "the load hangs on a cable" }`.
+instead of rotor speeds, `[actuator]` with values of `Actuator`, whose names you can add to `learn`.
 """
 
 from dataclasses import dataclass, field
@@ -28,14 +27,12 @@ class VehicleModel:
         terms: nominal values of further terms.
         actuator: the map from command to rotor speed; None for logs of rotor speeds.
         learn: names from `terms.SHAPES`, and "motor_time_constant" for the rotors' lag in logs.
-        purpose: names of the terms that the file explains.
     """
 
     vehicle: Vehicle
     terms: Terms = field(default_factory=Terms)
     actuator: Actuator | None = None
     learn: tuple[str, ...] = LEARNED
-    purpose: tuple[str, ...] = ()
 
     def __post_init__(self):
         check_learned(self.learn, self.actuator)
@@ -79,9 +76,5 @@ def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleM
             raise ValueError(f"{path}: {name} must be a table [{name}], got {checks.short_repr(table)}")
         if name in tables:
             parts[name] = from_table(kind, table, f"{path}: [{name}]")
-    purpose = tables.get("purpose", {})
-    if not isinstance(purpose, dict) or not all(isinstance(words, str) and words.strip() for words in purpose.values()):
-        raise ValueError(f'{path}: purpose must be {{ cable_pull = "why" }}, got {checks.short_repr(purpose)}')
-    check_learned(tuple(purpose))
-    parts |= {"purpose": tuple(purpose), "learn": tables.get("learn", LEARNED)}
+    parts["learn"] = tables.get("learn", LEARNED)
     return from_table(VehicleModel, parts, str(path))

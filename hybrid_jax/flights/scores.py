@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
-from hybrid_jax.trajectories import Trajectories, check, check_attitudes
+from hybrid_jax.trajectories import Trajectories, check
 
 CHUNK = 500  # windows at a time
 Errors = Float[Array | np.ndarray, "*n"]
@@ -51,10 +52,10 @@ def flight_errors(field: AbstractVectorField, windows: Trajectories) -> FlightEr
     Raises:
         ValueError: the windows are malformed, or their states are not a multirotor's.
     """
-    check(windows, "windows")
-    if windows.x.shape[-1] < STATE_SIZE:
+    if check(windows, "windows").x.shape[-1] < STATE_SIZE:
         raise ValueError(f"windows: states of {STATE_SIZE} expected, as in state.py, got {windows.x.shape[-1]}")
-    check_attitudes(windows, "windows")
+    RIGID_BODY_SPACE.check("windows: x0", windows.x0)
+    RIGID_BODY_SPACE.check("windows: x", windows.x)
     # The last part is padded, so that all flights share one program.
     parts = (np.arange(start, start + CHUNK) % len(windows) for start in range(0, len(windows), CHUNK))
     found = [jax.device_get(_errors(field, windows[part])) for part in parts]

@@ -12,8 +12,9 @@ import jax
 import numpy as np
 
 from hybrid_jax.checks import first_line
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.io.archive import digest, encode, load_archive, save_archive
-from hybrid_jax.trajectories import Trajectories, check, check_attitudes
+from hybrid_jax.trajectories import Trajectories, check
 
 FORMAT = "hybrid_jax dataset 1"
 ARRAYS = ("x0", "u", "x")
@@ -111,8 +112,9 @@ def _check_splits(path: Path | str, dataset: Dataset) -> None:
         raise ValueError(f"{path}: config must be a mapping, got {type(dataset.config).__name__}")
     for name, windows in dataset.splits.items():
         check(windows, f"{path}: split {name!r}")
-        if "vehicle" in dataset.config:
-            check_attitudes(windows, f"{path}: split {name!r}")
+        if "vehicle" in dataset.config and windows.x.shape[-1] == RIGID_BODY_SPACE.size:
+            RIGID_BODY_SPACE.check(f"{path}: split {name!r}: x0", windows.x0)
+            RIGID_BODY_SPACE.check(f"{path}: split {name!r}: x", windows.x)
 
 
 def _content(dataset: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -18,7 +18,7 @@ from hybrid_jax.vehicle import IRIS, Vehicle
 
 # Name → how many numbers the network reads besides u (and one of each rotor near the ground), or returns.
 INPUTS = {"all": STATE_SIZE, "no_xy": STATE_SIZE - 2, "no_xy_yaw": 10, "near_ground": 10, "body": 10, "body_motion": 9}
-OUTPUTS = {"all": STATE_SIZE, "accelerations": 6, "rotors": 6, "angular_acceleration": 3, "motion": 12}
+OUTPUTS = {"all": STATE_SIZE, "accelerations": 6, "rotors": 6, "motion": 12}
 FROM_THE_BODY = ("body", "body_motion")
 GO_WITH = {"motion": FROM_THE_BODY}  # outputs → the inputs that they go with, where these are not all
 
@@ -97,8 +97,8 @@ def multirotor_network(
             and Bennett 1955); "body": p_z, the direction of gravity and Rᵀv [m/s] in the body frame, and ω;
             "body_motion", Rᵀv, ω and Rᵀe_z, without the height, for flight away from the ground.
         outputs: "all" 13 derivatives; "accelerations", v̇ and ω̇; "rotors", these and the thrust of each rotor by a
-            second network (`RotorThrust`), initially zero; "angular_acceleration", only ω̇; "motion", corrections of
-            ṗ, of the body rates in q̇, of v̇ and of ω̇, in the body frame.
+            second network (`RotorThrust`), initially zero; "motion", corrections of ṗ, of the body rates in q̇, of v̇
+            and of ω̇, in the body frame.
         hidden: units of each network.
         norm: see `residual_network`.
         activation: see `residual_network`.

@@ -9,7 +9,7 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax import StateSpaceModel, fit_records, predict, simulate
-from hybrid_jax.dynamics.hidden import Delay, Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
+from hybrid_jax.dynamics.hidden import Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
 from hybrid_jax.estimation.record_search import check_rates
 from hybrid_jax.records import Record, on_grid
 
@@ -146,7 +146,7 @@ def oscillator():
     ("part", "extra", "at", "truth"),
     [
         (Lag(jnp.log(jnp.array([0.2])), (0,)), 1, lambda part: part.log_time_constant, np.log(0.2)),
-        (Delay(jnp.log(jnp.array(0.2)), (0,), 3), 3, lambda part: part.log_delay, np.log(0.2)),
+        (Lag(jnp.log(jnp.array([0.2])), (0,), 3), 3, lambda part: part.log_time_constant, np.log(0.2)),
         (oscillator(), 2, lambda part: part.log_frequency, np.log(5.0)),
     ],
     ids=["lag", "delay", "oscillator"],
