@@ -30,7 +30,7 @@ def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Flo
 
 @entry
 def rollout_mse(
-    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None, chunk: int = CHUNK
+    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None
 ) -> Float[Array, ""]:
     """L_MSE of a field in inference mode, mean over windows, on every `every`-th state; not finite if it diverges.
 
@@ -39,16 +39,15 @@ def rollout_mse(
         windows: the windows, each predicted from its initial state.
         every: count the state after each so many intervals.
         solver: a one-step method of diffrax; by default `RK4`.
-        chunk: windows predicted at a time, which bounds memory.
 
     Raises:
         ValueError: malformed windows, windows that do not match the field, or an `every` beyond their horizon.
     """
-    return jnp.mean(window_mse(field, windows, every, solver, chunk))
+    return jnp.mean(window_mse(field, windows, every, solver))
 
 
 def window_mse(
-    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None, chunk: int = CHUNK
+    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None
 ) -> Float[Array, " n"]:
     """L_MSE of each window; see `rollout_mse`.
 
@@ -57,10 +56,8 @@ def window_mse(
         windows: n windows.
         every: intervals between two states that count.
         solver: by default `RK4`.
-        chunk: windows predicted at a time.
     """
     windows = continuous(field, check(windows, "windows", missing=True))
-    checks.count("chunk", chunk)
     checks.count("every", every)
     if every > windows.horizon:
         raise ValueError(f"every={every} is more than the {windows.horizon} intervals of the windows")
@@ -69,4 +66,4 @@ def window_mse(
         predicted = predict(field, windows.x0, windows.u, windows.dt, solver)
         return mse(predicted[:, every - 1 :: every], jnp.asarray(windows.x)[:, every - 1 :: every])
 
-    return in_chunks(errors, windows, chunk)
+    return in_chunks(errors, windows, CHUNK)

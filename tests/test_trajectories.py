@@ -98,12 +98,13 @@ def test_single_and_empty_windows_are_refused():
 
 
 @pytest.mark.parametrize(("every", "chunk"), [(1, 250), (2, 7), (4, 250), (8, 20)])
-def test_an_error_is_the_definition_at_every_so_many_intervals(every, chunk):
+def test_an_error_is_the_definition_at_every_so_many_intervals(every, chunk, monkeypatch):
+    monkeypatch.setattr(metrics, "CHUNK", chunk)
     windows, field = swings(20), pendulum(0.6)
     predicted = np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt), np.float64)
     squares = np.square(predicted - np.asarray(windows.x)).sum(-1)
     rows = [i for i in range(8) if (i + 1) % every == 0]
-    found = metrics.rollout_mse(field, windows, every, chunk=chunk)
+    found = metrics.rollout_mse(field, windows, every)
     np.testing.assert_allclose(found, squares[:, rows].mean(), rtol=1e-5)  # float32 sums of 160 numbers
 
 

@@ -23,6 +23,7 @@ from hybrid_jax.state import POSITION, QUATERNION, Input, State
 Plant = Callable[[State, Input, Scalar], State]  # the state one period after time t [s], u held
 
 SATURATION_MARGIN = 0.01  # share of its range from a limit, within which a rotor speed counts as saturated
+FAR = 10.0  # m from the reference, beyond which a flight counts as crashed
 
 
 class Flight(eqx.Module):
@@ -229,27 +230,19 @@ def fly(
     return Flight(jnp.concatenate([x0[None], x]), u, plans, estimates, speeds)
 
 
-def performance(
-    flight: Flight,
-    reference: Float[Array, "n 13"],
-    controller: Controller,
-    ground: float = 0.0,
-    crash_distance: float = 10.0,
-) -> Performance:
+def performance(flight: Flight, reference: Float[Array, "n 13"], controller: Controller) -> Performance:
     """Compute the tracking performance after the initial state.
 
     Args:
         flight: a flight from `fly`.
         reference: a state for each period (n, 13).
         controller: the flight's controller, for the limits of the rotor speeds.
-        ground: altitude below which a flight counts as crashed [m].
-        crash_distance: distance from the reference beyond which a flight counts as crashed [m].
     """
     x, wanted = flight.x[1:], reference[1 : len(flight.x)]
     error = jnp.linalg.norm(x[:, POSITION] - wanted[:, POSITION], axis=-1)
     yaw_error = heading(x[:, QUATERNION]) - heading(wanted[:, QUATERNION])
     yaw_error = jnp.arctan2(jnp.sin(yaw_error), jnp.cos(yaw_error))
-    sound = jnp.isfinite(x).all(axis=-1) & (x[:, POSITION.stop - 1] >= ground) & (error <= crash_distance)
+    sound = jnp.isfinite(x).all(axis=-1) & (x[:, POSITION.stop - 1] >= 0) & (error <= FAR)
     low, high = controller.min_speed, controller.vehicle.max_rotor_speed
     margin = SATURATION_MARGIN * (high - low)
     at_limit = (flight.u < low + margin) | (flight.u > high - margin)

@@ -6,10 +6,9 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.control.cost import Scalar
 from hybrid_jax.control.sensitivities import advance
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.rotation import canonicalize_quaternion
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, State
 

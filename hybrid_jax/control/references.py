@@ -78,25 +78,23 @@ def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0
     return lambda t: (jnp.array(position) + 0 * t, jnp.asarray(yaw) + 0 * t)
 
 
-def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.5, yaw: float = 0.0) -> Path:
+def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.5) -> Path:
     """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, a [m], φ̇ constant; fastest at its centre, √2 a φ̇ [m/s].
 
     Args:
         top_speed: speed at the centre [m/s].
         half_width: a, the largest distance from the centre along x [m].
         altitude: height above the origin [m].
-        yaw: constant angle about the world's z axis [rad].
     """
     checks.positive("top_speed", top_speed)
     checks.positive("half_width", half_width)
     checks.number("altitude", altitude)
-    checks.number("yaw", yaw)
     rate = top_speed / (math.sqrt(2) * half_width)  # rad/s
 
     def path(t):
         phase = rate * t
         place = jnp.stack([jnp.sin(phase), jnp.sin(2 * phase) / 2, 0 * t])
-        return half_width * place + altitude * jnp.array(Z), yaw + 0 * t
+        return half_width * place + altitude * jnp.array(Z), 0 * t
 
     return path
 

@@ -1,12 +1,11 @@
 """Vector fields ẋ = f(x, u): the physics of a multirotor, grids, hybrids, disturbances and hidden states."""
 
 from hybrid_jax.dynamics.actuators import Actuated, Actuator, actuated, rotor_speeds
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.composition import Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, with_disturbance
 from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
-from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.grids import Diffusion, Grid, check_grid, diffusion
 from hybrid_jax.dynamics.hidden import Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
 from hybrid_jax.dynamics.outputs import StateSpaceModel

@@ -21,9 +21,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, state_space
 from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, with_disturbance
-from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import Interval, intervals
 from hybrid_jax.integrate import check_callable, check_field

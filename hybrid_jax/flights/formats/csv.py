@@ -58,10 +58,10 @@ def read_table(
     return np.concatenate(parts), () if block.endswith("\n") else (CUT,)
 
 
-def header_of(path: str | Path, delimiter: str = ",") -> list[str]:
+def header_of(path: str | Path) -> list[str]:
     """Return the column names; raises like `read_table`."""
     with readable(path) as file, contextlib.suppress(UnicodeDecodeError):
-        return _header(io.TextIOWrapper(file, encoding="utf-8-sig"), delimiter)[0]
+        return _header(io.TextIOWrapper(file, encoding="utf-8-sig"), ",")[0]
     return []
 
 
