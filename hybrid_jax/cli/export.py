@@ -51,20 +51,20 @@ class Options:
     """
 
     model: Annotated[Path, tyro.conf.Positional]
-    """A file that `hybrid-jax fit` or `adapt`, an experiment or hybrid_jax.save wrote."""
+    """Model that `hybrid-jax fit` or `adapt` wrote. Or an experiment, or hybrid_jax.save."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the files."""
     to: tuple[Literal["c", "casadi", "stablehlo"], ...] = ("c",)
-    """What to write, for example c,casadi."""
+    """What to write, by default c. For example c,casadi."""
     name: str = "model"
-    """Name of the C files, and prefix of their functions."""
+    """Name of the C files and prefix of functions."""
     double: bool = False
     """C in double precision."""
     smooth: float | None = None
-    """Replace ReLU by ½ (z + √(z² + 1/β²)) with this β for solvers of optimal control problems, and report how much ẋ
-    changes. They converge with 5 and mostly not with 30: see docs/howto/solvers.md."""
+    """Replace ReLU by ½ (z + √(z² + 1/β²)) with this β. This is for solvers of optimal control problems, which converge
+    with 5 and mostly not with 30: see docs/howto/solvers.md. The page says how much ẋ changes."""
     dt: float | None = None
-    """Length of a step [s]; by default the sample interval of the training flights."""
+    """Length of a step [s]. By default the sample interval of the training flights."""
     out: Path = Path("runs/export")
     """Folder of the page."""
     noise: Annotated[tuple[float, ...], RARE] = ()

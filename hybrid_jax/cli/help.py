@@ -14,13 +14,16 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type
 import tyro
 
 RARE = "rare"  # in the annotation of an option that only --help-all lists
-INDENT, WIDEST, LONG = 26, 100, 20  # columns; choices that are longer follow the text
+INDENT, WIDEST, LONG = 26, 100, 15  # columns; choices that are longer follow the text
 VALUES: dict[Any, str] = {bool: "", int: "N", float: "X", str: "NAME"}
 WORDS = {"N": "an integer", "X": "a number"}
 
 
 def short_help(kind: type, program: str, about: str, default: Any, common: Collection[str] | None) -> str:
-    """Return the help of a dataclass of options: those in `common`, or all without RARE in their annotation."""
+    """Return the help of a dataclass of options: those in `common`, or all without RARE in their annotation.
+
+    Of descriptions, it has the first paragraph of the program's, and the first sentence of each option's.
+    """
     said, hints = _documented(kind), get_type_hints(kind, include_extras=True)
     every = fields(cast(Any, kind))
     options: list[tuple[int, str, str]] = []
@@ -44,7 +47,12 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
     options.sort(key=lambda option: option[0])  # arguments, needed options, own ones, inherited ones
     width = min(shutil.get_terminal_size().columns, WIDEST) - 1
     needs = [name.partition(", ")[2] or name for place, name, _ in options if place < 2]
-    text = [f"usage: {' '.join([program, *needs])} [OPTIONS]", *_wrapped(about, width), ""]
+    text = [
+        f"usage: {' '.join([program, *needs])} [OPTIONS]",
+        "",
+        *textwrap.wrap(about.partition("\n\n")[0], width),
+        "",
+    ]
     for _, name, told in options:
         head = f"  {name}".ljust(INDENT)
         text += [head.rstrip()] * (len(head) > INDENT)
@@ -92,11 +100,3 @@ def expected(hint: Any) -> str:
     what = f"one of {one.replace('|', ', ')}" if "|" in one else WORDS.get(one, one)
     several = "" if many else f"{1 + len(more)} "
     return f"{several}{what.split()[-1]}s" if (many or more) and one in WORDS else what
-
-
-def _wrapped(text: str, width: int) -> list[str]:
-    """Wrap paragraphs, and leave indented ones as they are."""
-    lines: list[str] = []
-    for paragraph in text.split("\n\n"):
-        lines += ["", *(paragraph.splitlines() if paragraph[:1].isspace() else textwrap.wrap(paragraph, width))]
-    return lines

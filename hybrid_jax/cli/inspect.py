@@ -53,14 +53,14 @@ class Options(SpeedOptions):
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of logs, or one log."""
     vehicle: Path | None = None
-    """Vehicle file to check the logs against: number and order of motors, spin, thrust, largest speed."""
+    """Vehicle file to check the logs against. It tells number and order of motors, spin, thrust and largest speed."""
     write_vehicle: Path | None = None
     """Write an initial vehicle file. Hover, thrust, rotor positions, spin, lag and centre of thrust are estimated from
     logs that pass all checks; the rest is marked with a comment. Existing files are not overwritten."""
     mass: float | None = None
     """With --write-vehicle: mass [kg]. Logs cannot show it; thrust and inertia are proportional to it."""
     arm: float | None = None
-    """With --write-vehicle: distance of rotors from the centre [m]. Logs cannot show it; inertia scales with it."""
+    """With --write-vehicle: length of the arms [m]. Logs cannot show it; inertia scales with it."""
     dt: float = 0.01
     """Intended interval of the model [s]. A slower signal fails: half of its samples would be interpolated."""
     out: Path = Path("runs/inspect")

@@ -52,11 +52,11 @@ class LogOptions:
     """Options for reading logs."""
 
     columns: Path | None = None
-    """TOML file of the columns, units and frames of CSV logs: see docs/howto/logs.md."""
+    """TOML file about the columns of CSV logs. It names their units and frames, too: see docs/howto/logs.md."""
     topics: tuple[str, ...] = ()
-    """Topics of ROS bags, for example odometry=/odom motors=/rotors:data:rpm; also pose, imu, voltage."""
+    """ROS topics: odometry=/odom motors=/rotors:data:rpm …. Also pose, imu, voltage."""
     motor_order: tuple[int, ...] = ()
-    """Index in the log of each rotor's motor, from 0, for example 2,0,3,1."""
+    """Index of each rotor's motor in the log, as 2,0,3,1. Indices begin with 0."""
 
     @property
     def reading(self) -> dict[str, Any]:
@@ -75,9 +75,9 @@ class SpeedOptions(LogOptions):
     """Options for reading logs for models whose inputs are rotor speeds."""
 
     polynomial: tuple[float, ...] = ()
-    """For logs with commands but no rotor speeds: rotor speed [rad/s] = c0 + c1 command + c2 command² …, with commands
-    from 0 (stop) to 1 (full). You can measure it on a test stand, or at two points: 100,1000 if a motor starts at
-    100 rad/s and reaches 1100 at full command. PWM (1000 … 2000 µs) and DShot are scaled to 0 … 1 first."""
+    """c0, c1, …: rotor speed [rad/s] = c0 + c1 command …. For logs with commands, from 0 (stop) to 1 (full), but no
+    rotor speeds. You can measure it on a test stand, or at two points: 100,1000 if a motor starts at 100 rad/s and
+    reaches 1100 at full command. PWM (1000 … 2000 µs) and DShot are scaled to 0 … 1 first."""
     delay: Annotated[float, RARE] = 0.0
     """Delay to add to the motors [s], if a check found that they lead the gyro."""
 
@@ -87,7 +87,7 @@ class FlightOptions(SpeedOptions):
     """Options for converting logs to flights."""
 
     anyway: bool = False
-    """Also use logs that fail checks; the page then warns about them."""
+    """Also use logs that fail checks. The page then warns about them."""
 
 
 class Flights(NamedTuple):

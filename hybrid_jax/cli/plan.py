@@ -41,13 +41,13 @@ class Options:
     model: Annotated[Path, tyro.conf.Positional]
     """Model that `hybrid-jax fit` or `adapt` wrote."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """CSV file for the set points: time [s], position [m], yaw [rad], velocity [m/s]."""
+    """CSV file for the set points. Time [s], position [m], yaw [rad] and velocity [m/s]."""
     learn: tuple[str, ...] = ()
-    """Parameters that the flight should identify; by default all of the model's physics."""
+    """Parameters to identify. By default all of the model's physics."""
     seconds: float = 10.0
     """Length of the flight [s]."""
     low: tuple[float, float, float] = BOX.low
-    """Lower corner of the box, (x, y, z) [m]; z points up."""
+    """Lower corner of the box [m]. As x, y and z, which points up."""
     high: tuple[float, float, float] = BOX.high
     """The opposite corner [m]."""
     speed: float = BOX.speed

@@ -43,7 +43,7 @@ class Options(FlightOptions):
     flight: Annotated[Path, tyro.conf.Positional]
     """One log."""
     other: Path | None = None
-    """A second model to compare, for example the one before adaptation."""
+    """A second model to compare. For example the one before adaptation."""
     ahead: float = 0.5
     """Prediction horizon [s]."""
     seconds: float = 10.0

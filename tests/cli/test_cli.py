@@ -26,9 +26,10 @@ from hybrid_jax.vehicle import IRIS, load_vehicle
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_help_of_a_verb_has_at_most_a_dozen_options(called, verb):
+def test_help_of_a_verb_has_at_most_twenty_lines_and_a_dozen_options(called, verb, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     code, said, _ = called(verb, "--help")
-    assert code == 0
+    assert (code, len(said.splitlines()) <= 20) == (0, True)
     options = set(re.findall(r"^  (?:-\w, )?(--[a-z-]+)", said, flags=re.MULTILINE))
     assert 4 <= len(options) <= 12
     code, every, _ = called(verb, "--help-all")
