@@ -15,6 +15,7 @@ from experiments.runner.stages import stages_of
 from hybrid_jax.cli.command import BAD_INPUT, split_lists
 from hybrid_jax.cli.logs import Flights, read_flights, require_distinct
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
+from hybrid_jax.identification.learning import STEPS, learnable
 from hybrid_jax.sweep import hosts
 
 ABOUT = "How well do models that `hybrid-jax fit` and `adapt` learn predict other flights?"
@@ -71,7 +72,8 @@ def prepare(config: RealFlightConfig) -> tuple[VehicleModel, dict[str, Flights]]
     shared = not changed and config.folds_by == "manoeuvre"
     contents = [(each, name, content) for each, found in sets.items() for name, content in found.contents.items()]
     require_distinct([(f"--{each} {name}", (each * shared, content)) for each, name, content in contents])
-    return model, sets
+    source = sets["source"]
+    return learnable(model, source.seconds, STEPS * config.dt)[0], sets
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.flights.conversion import DT, missing_states
 from hybrid_jax.flights.load import read_recording
-from hybrid_jax.identification.learning import CANDIDATES, FROZEN, PAST, STEPS, Learned, learn
+from hybrid_jax.identification.learning import CANDIDATES, FROZEN, PAST, STEPS, Learned, learn, learnable
 from hybrid_jax.identification.prediction_errors import UNITS, ratio
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
@@ -53,12 +53,12 @@ class Options(FlightOptions):
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """File for the model."""
     vehicle: Path | None = None
-    """Vehicle file with the known constants and, in `learn`, the unknown ones: see docs/howto/vehicle.md. By default,
-    one is estimated from the logs, with a mass of 1 kg and arms of 0.1 m, which scale the results."""
+    """Vehicle file: see docs/howto/vehicle.md. It has what is known and, in `learn`, what to learn. By default, one is
+    estimated from the logs, with a mass of 1 kg and arms of 0.1 m, which scale the results."""
     learn: tuple[str, ...] = ()
-    """Parameters to learn, instead of the vehicle file's."""
+    """Parameters to learn, instead of the vehicle file's. If it has none: inertia, thrust and aerodynamics."""
     dt: float | None = None
-    """Interval of the model [s]; by default 0.01, or 0.005 if physics is identified."""
+    """Interval of the model [s]. By default 0.01, or 0.005 if physics is identified."""
     seed: int = 0
     """Random seed of the network."""
     out: Path = Path("runs/fit")
@@ -93,6 +93,7 @@ def run(options: Options) -> int:
         raise ValueError(f"{options.before}: has one flight; you need at least two, because one is held out")
     if flights.still and not options.anyway:
         raise ValueError(f"{options.before}: no flight excites anything: fly manoeuvres, or go on with --anyway")
+    model, left = learnable(model, flights.seconds, STEPS * dt)
     with step(f"learning from {len(flights.logs)} flights") as told:
         found = learn(model, flights.logs, options.seed)
         told(f"{found.chosen} predicts them best")
@@ -100,7 +101,7 @@ def run(options: Options) -> int:
     save(options.output, found.field, json_value(about))
     told = {name: each for name, each in about.items() if name not in OF_MODEL}
     told |= {"model": options.output, "adaptation": found.physics.to_dict()}
-    page.write(options.out, "fit", _page(options, flights, found, dt), told)
+    page.write(options.out, "fit", _page(options, flights, found, dt, left), told)
     return 0
 
 
@@ -135,7 +136,7 @@ def _about(options: Options, model: VehicleModel, flights: Flights, found: Learn
     }
 
 
-def _page(options: Options, flights: Flights, found: Learned, dt: float) -> page.Page:
+def _page(options: Options, flights: Flights, found: Learned, dt: float, left: str) -> page.Page:
     seconds, frozen = STEPS * dt, found.left_out[FROZEN][:, -1]
     better = ratio(frozen, found.left_out[found.chosen][:, -1])
     cells = [errors.texts(each) for each in (*found.expected, np.exp(np.log(frozen).mean(axis=0)))]
@@ -160,6 +161,7 @@ def _page(options: Options, flights: Flights, found: Learned, dt: float) -> page
             errors.BASELINE,
             *([REMEMBERS] if found.chosen.endswith(PAST) else []),
             *([f"Rotors follow the motors of the logs with {1000 * found.lag:.3g} ms."] if found.lag else []),
+            *[left] * bool(left),
             *errors.unknown(found.physics),
             *flights.warnings,
         ],

@@ -83,7 +83,7 @@ def _like(options: Any, folder: Path, model: Model) -> identify.Read:
     field = cast(Any, model.field)
     body = field.body if isinstance(field, Actuated) else field
     learned = tuple(name.partition("[")[0] for name in model.about["parameters"])
-    read = identify.read_checked(folder, options, body.vehicle, learned, lambda _: field)
+    read = identify.read_checked(folder, options, body.vehicle, learned, lambda _: (field, ""))
     told = "command" if isinstance(field, Actuated) else "rotor_speed"
     for log in read.logs:
         if told not in log.signals:

@@ -21,7 +21,8 @@ from hybrid_jax.flights.checks.consistency import FAILS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.recording import Recording, unit_of
 from hybrid_jax.identification import slow_commands
-from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, window_errors
+from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, measure_velocity, window_errors
+from hybrid_jax.identification.learning import learnable
 from hybrid_jax.identification.log_checks import compared, unlearned_drag
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
@@ -37,11 +38,12 @@ ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below co
 
 
 class Read(NamedTuple):
-    """Recordings, digests of them by file name, the initial field, lines for the page, and failed checks."""
+    """Recordings, digests of them by file name, the initial field and what it does not learn, lines, failed checks."""
 
     logs: list[Recording]
     contents: dict[str, str]
     field: Any
+    left: str
     said: list[str]
     failed: list[str]
 
@@ -71,14 +73,19 @@ def checked(options: Any, path: Path, model: VehicleModel) -> Read:
     if LAG in model.learn:
         mend = _learn(model.learn, (LAG,))
         raise ValueError(f"{path}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
-    start = partial(_field_of, path, model)
+    window = (options.dt or Layout.dt) * options.steps
+    start = partial(_field_of, path, model, window)
     return read_checked(options.before, options, model.vehicle, model.learn, start)
 
 
 def read_checked(
-    folder: Path, options: Any, vehicle: Vehicle, learn: Sequence[str], start: Callable[[Sequence[Recording]], Any]
+    folder: Path,
+    options: Any,
+    vehicle: Vehicle,
+    learn: Sequence[str],
+    start: Callable[[Sequence[Recording]], tuple[Any, str]],
 ) -> Read:
-    """Read and check the logs of a folder like `checked`, for the field that `start` makes for them."""
+    """Read and check the logs of a folder like `checked`; `start` makes a field for them, and says what it lacks."""
     raws, contents, said = recordings_of(folder, options)
     failed: list[tuple[str, str, str]] = []  # a log, a check and what it says
 
@@ -92,13 +99,13 @@ def read_checked(
             raise ChecksFailed(*grouped(failed), MEND)
 
     require(lambda log: check_recording(log, vehicle))
-    field = start([*raws.values()])
+    field, left = start([*raws.values()])
     require(lambda log: compared(log, field, learn))
     lines = [in_flags(": ".join(each)) for each in failed]
     said += [f"{name}: {note}" for name, log in raws.items() for note in log.notes] + lines * (not options.anyway)
     for line in lines:
         print(f"  {line}", file=sys.stderr)
-    return Read([*raws.values()], contents, field, said, lines * options.anyway)
+    return Read([*raws.values()], contents, field, left, said, lines * options.anyway)
 
 
 def identified(read: Read, layout: Layout) -> Identified:
@@ -118,14 +125,15 @@ def values_of(found: Identified) -> dict[str, Any]:
     }
 
 
-def _field_of(path: Path, model: VehicleModel, logs: Sequence[Recording]) -> Any:
+def _field_of(path: Path, model: VehicleModel, window: float, logs: Sequence[Recording]) -> tuple[Any, str]:
     """Make the initial field, with commands as inputs if the logs have any and the vehicle file has [actuator]."""
+    model, left = learnable(model, sum(log.duration for log in logs), window, measure_velocity(logs))
     for log in logs:
         if log.rotors != model.vehicle.rotors:
             raise ValueError(f"{log.name}: has {log.rotors} motors, {path} has {model.vehicle.rotors}")
     speeds_alone = [log.name for log in logs if "command" not in log.signals]
     if model.actuator is not None and not speeds_alone:
-        return model.commanded()
+        return model.commanded(), left
     for log in logs:
         if "rotor_speed" not in log.signals:
             mend = f"leave out {speeds_alone[0]}" if speeds_alone else "give it a table [actuator]; see --help"
@@ -133,7 +141,7 @@ def _field_of(path: Path, model: VehicleModel, logs: Sequence[Recording]) -> Any
     if lost := [name for name in model.learn if name in NAMES]:
         why = f"need commands, and {speeds_alone[0]} has only rotor speeds"
         raise ValueError(f"{path}: learn: {', '.join(lost)}: {why}: {_learn(model.learn, lost)}")
-    return model.physics()
+    return model.physics(), left
 
 
 def _learn(names: Sequence[str], without: Sequence[str]) -> str:
@@ -169,7 +177,8 @@ def _page(options: Any, found: Identified, read: Read, layout: Layout, values: M
 
 def warned(read: Read, converged: bool = True) -> list[str]:
     stopped = "The fit stopped before it converged: start closer, or learn fewer parameters."
-    return [ANYWAY.format(len(read.failed))] * bool(read.failed) + [stopped] * (not converged)
+    failed = ANYWAY.format(len(read.failed)) if read.failed else ""
+    return [*filter(None, (failed, "" if converged else stopped, read.left))]
 
 
 def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) -> list[str]:

@@ -13,6 +13,7 @@ POSITIVE = {"mass": (), "Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,),
 SIGNED = {"torque_gain": (3,), "centre_of_mass": (2,), "drag": (3,), "cable_pull": (2,), "aerodynamic_moment": (3, 3)}
 SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": ()}
 SHAPES = POSITIVE | SIGNED  # of all learnable parameters, for four rotors; see `shape_of`
+OF_VELOCITY = {"drag", "aerodynamic_moment", "velocity_lag", "velocity_gain"}  # no effect where it is not known
 CORRECTIONS = {"efficiency": (4,), "added_drag": (3,)}  # of a body that has changed; see `rigid_body.corrected`
 LOGARITHMIC = (*POSITIVE, "efficiency")
 Three = tuple[float, float, float]

@@ -11,10 +11,12 @@ from typing import Any
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.actuators import NAMES, Actuated, Actuator, actuated, check_actuator_names
-from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, rigid_body
+from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import Terms, check_names
 from hybrid_jax.vehicle import TABLES, Vehicle, from_table, read_tables, require_known, vehicle_of
 
+# Learned if a file does not say what: without the aerodynamics, inertia would take a part of them.
+LEARN = ("Ix", "Iy", "Iz", "k_rotors", "rate_damping", "drag", "aerodynamic_moment")
 LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.checks.cleaning`
 
 
@@ -32,7 +34,7 @@ class VehicleModel:
     vehicle: Vehicle
     terms: Terms = field(default_factory=Terms)
     actuator: Actuator | None = None
-    learn: tuple[str, ...] = LEARNED
+    learn: tuple[str, ...] = LEARN
 
     def __post_init__(self):
         check_learned(self.learn, self.actuator)
@@ -57,7 +59,7 @@ def check_learned(learn: tuple[str, ...], actuator: Actuator | None = None) -> N
 
 
 def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleModel:
-    """Read a vehicle file: TOML with `[vehicle]`, `learn` and `[terms]`. By default Ix, Iy and k are learned.
+    """Read a vehicle file: TOML with `[vehicle]`, `learn` and `[terms]`. Without `learn`, `LEARN` is learned.
 
     Args:
         path: the TOML file.
@@ -76,5 +78,5 @@ def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleM
             raise ValueError(f"{path}: {name} must be a table [{name}], got {checks.short_repr(table)}")
         if name in tables:
             parts[name] = from_table(kind, table, f"{path}: [{name}]")
-    parts["learn"] = tables.get("learn", LEARNED)
+    parts["learn"] = tables.get("learn", LEARN)
     return from_table(VehicleModel, parts, str(path))

@@ -19,6 +19,7 @@ from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, in_double, ravel_learned, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.hidden import RandomWalk, with_hidden
+from hybrid_jax.dynamics.terms import OF_VELOCITY
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.elimination import descend, reduced
 from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, inverses, masked
@@ -38,7 +39,6 @@ ROUNDS, MAX_STEPS = 3, 20  # of weights, and of Levenberg–Marquardt in each
 CANDIDATES = 8  # windows for each one that is fitted
 CLUSTER, FEWEST_CLUSTERS = 2.0, 6  # s of windows that are taken as one observation, at least so many of them
 OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "mass", "k", "k_rotors", "drag"}
-OF_VELOCITY = {"drag", "aerodynamic_moment", "velocity_lag", "velocity_gain"}
 FORCE_STEPS = 5  # times as many steps have windows of forces, which no instability limits
 AXES_OF = {"Ix": 0, "Iy": 1, "Iz": 2, "torque_coefficient": 2}
 TOLERANCE = 1e-5  # share of the cost: a step that lowers it by less is slow
@@ -95,8 +95,8 @@ def identify(
         known: covariance of the other parameters, which adds to the covariance of the fitted ones; by default zero.
 
     Returns:
-        A parameter that is not identifiable has an infinite interval and does not change, nor do those in `OF_VELOCITY`
-        if no recording has a velocity or position.
+        A parameter that is not identifiable has an infinite interval and does not change, nor do those in
+        `terms.OF_VELOCITY` unless each recording has a velocity or position.
 
     Raises:
         ValueError: a recording that lacks something, or too few windows, with name and what was expected.
@@ -256,6 +256,11 @@ def _widened(name: str, interval: Interval, shares) -> Interval:
     return Interval(value, low * share, np.divide(high, share, out=np.full((), np.inf), where=share > 0))
 
 
+def measure_velocity(recordings: Sequence[Recording]) -> bool:
+    """Whether each recording has a velocity, or a position."""
+    return all({"velocity", "body_velocity", "position"} & each.signals.keys() for each in recordings)
+
+
 def _names(field) -> list[tuple[str, str]]:
     physics = physics_of(field)
     leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(physics, trainable(physics)))[0]
@@ -269,7 +274,7 @@ def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) 
     for name in free or ():
         if name.partition("[")[0] not in dict(own):
             raise ValueError(f"free must be of {', '.join(dict(own))}, got {name!r}")
-    known = all({"velocity", "body_velocity", "position"} & each.signals.keys() for each in recordings)
+    known = measure_velocity(recordings)
     moves = [free is None or not {*names}.isdisjoint(free) for names in own]
     return np.array(moves, bool), np.array([known or name not in OF_VELOCITY for name, _ in own], bool)
 

@@ -1,6 +1,7 @@
 """Learn a vehicle from flights, with physics only or with a network, and adapt it to flights after a change."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,9 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
-from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
+from hybrid_jax.dynamics.rigid_body import LEARNED
+from hybrid_jax.dynamics.terms import OF_VELOCITY, shape_of
+from hybrid_jax.dynamics.vehicle_file import LAG, LEARN, VehicleModel
 from hybrid_jax.estimation import fit_disturbance
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
 from hybrid_jax.flights.log import FlightLog
@@ -29,6 +32,7 @@ from hybrid_jax.trajectories import Trajectories, split
 STEPS = 10  # intervals of a window
 LEVEL = 0.8  # of the interval of the error on a new flight
 TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
+ENOUGH = 10  # windows for each parameter that is learned by default, or its error exceeds its effect
 FOLDS = 3  # at most so many groups of flights are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
 PHYSICS, OUTPUTS = "theta_least_squares", "accelerations"
@@ -57,6 +61,30 @@ class Learned(NamedTuple):
     left_out: dict[str, Float[np.ndarray, "flights t 4"]]
     windows: Trajectories
     expected: Float[np.ndarray, "3 4"]
+
+
+def learnable(model: VehicleModel, seconds: float, window: float, moves: bool = True) -> tuple[VehicleModel, str]:
+    """Leave out of the parameters that are learned by default those that the logs do not determine.
+
+    Args:
+        model: is returned as it is if its file, or the user, named parameters.
+        seconds: of flight in all logs.
+        window: length of a window [s].
+        moves: whether the logs have a velocity.
+
+    Returns:
+        The model, and a line about what was left out, or an empty one.
+    """
+    if model.learn != LEARN:
+        return model, ""
+    learned, why = tuple(name for name in LEARN if moves or name not in OF_VELOCITY), ""
+    needed = ENOUGH * window * sum(np.prod(shape_of(model.vehicle, name)) for name in learned)
+    if seconds < needed:
+        learned, why = LEARNED, f"{seconds:.2g} s of flight are too few, {needed:.2g} s are needed"
+    elif not moves:
+        why = "not all logs have a velocity"
+    left = ", ".join(name for name in LEARN if name not in learned)
+    return replace(model, learn=learned), why and f"Not learned, as {why}: {left}."
 
 
 def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Learned:

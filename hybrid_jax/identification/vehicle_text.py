@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 
+from hybrid_jax.dynamics.terms import OF_VELOCITY
+from hybrid_jax.dynamics.vehicle_file import LEARN
 from hybrid_jax.identification.estimates import GRAVITY, Estimate
 
 ARM, MASS = 0.1, 1.0  # m and kg, where they were not given
-LEARN, OF_VELOCITY = ("Ix", "Iy", "Iz", "k_rotors", "rate_damping"), ("drag", "aerodynamic_moment")
 TOP = 1000.0  # rad/s at full command if speeds are unknown: only thrust matters
 
 
@@ -37,7 +38,7 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
     lines = [
         "# Written from logs by hybrid-jax inspect. Numbers with a # are explained; those marked",
         "# PLACEHOLDER are not identifiable from logs: measure them.",
-        f"learn = {json.dumps([*LEARN, *(OF_VELOCITY if found.moves else ())])}",
+        f"learn = {json.dumps([name for name in LEARN if found.moves or name not in OF_VELOCITY])}",
         "",
         "[vehicle]",
         f'name = "{name}"',

@@ -8,11 +8,31 @@ from recorded import LOGS
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.identification.learning import STEPS, choose, expected, with_past, without_past
+from hybrid_jax.dynamics.vehicle_file import LEARN, VehicleModel
+from hybrid_jax.identification.learning import STEPS, choose, expected, learnable, with_past, without_past
 from hybrid_jax.identification.prediction_errors import errors_of
 from hybrid_jax.vehicle import IRIS
 
 BODY = hj.rigid_body(IRIS)
+
+
+@pytest.mark.parametrize(
+    ("given", "learned", "told"),
+    [
+        ((LEARN, 23, True), LEARN, ""),
+        ((("Ix", "drag"), 1, False), ("Ix", "drag"), ""),
+        ((LEARN, 23, False), LEARN[:5], "Not learned, as not all logs have a velocity: drag, aerodynamic_moment."),
+        (
+            (LEARN, 21, True),
+            ("Ix", "Iy", "k"),
+            "Not learned, as 21 s of flight are too few, 22 s are needed: Iz, k_rot",
+        ),
+    ],
+)
+def test_what_is_learned_by_default_follows_from_the_logs(given, learned, told):
+    learn, seconds, moves = given
+    model, left = learnable(VehicleModel(IRIS, learn=learn), seconds, 0.1, moves)
+    assert (model.learn, left.startswith(told), bool(left)) == (learned, True, bool(told))
 
 
 def test_a_push_that_the_model_lacks_is_predicted_from_the_errors_before():
