@@ -36,15 +36,15 @@ class FlightBounds:
     """The box and the limits of a multirotor's flight.
 
     Attributes:
-        low: corner of the box with the least x, y and z [m]; z points up.
+        low: the corner of the box with the smallest x, y and z [m]; z points up.
         high: the opposite corner [m].
-        speed: highest speed [m/s].
-        tilt: largest angle between thrust and the vertical [rad], below π/2.
-        yaw: largest heading either side of 0 [rad].
-        rotor_speed: lowest and highest rotor speed, as shares of the vehicle's highest speed.
+        speed: the highest speed [m/s].
+        tilt: the largest angle between thrust and the vertical [rad], below π/2.
+        yaw: the largest heading to either side of 0 [rad].
+        rotor_speed: the lowest and highest rotor speed, as fractions of the vehicle's highest speed.
 
     Raises:
-        ValueError: an empty box, a limit that is not positive, or a tilt or share out of its range.
+        ValueError: if the box is empty, a limit is not positive, or the tilt or a fraction is out of range.
     """
 
     low: tuple[float, float, float] = (-3.0, -3.0, 0.5)
@@ -67,17 +67,17 @@ class FlightBounds:
 
 @dataclass(frozen=True)
 class InputBounds:
-    """The limits of any system's inputs, its first state, and optionally a box for its states.
+    """The limits of any system's inputs, its initial state, and optionally a box for its states.
 
     Attributes:
-        low: lower limit of each of the m inputs, in its own unit.
-        high: upper limit of each input.
-        start: the d numbers of the first state.
-        state_low: lower limit of each of the d states; None for no box. You must set it together with `state_high`.
-        state_high: upper limit of each state; None for no box.
+        low: the lower limit of each of the m inputs, in its own unit.
+        high: the upper limit of each input.
+        start: the initial state, d numbers.
+        state_low: the lower limit of each of the d states; None for no box. You must set it together with `state_high`.
+        state_high: the upper limit of each state; None for no box.
 
     Raises:
-        ValueError: an empty box, or tuples of different lengths.
+        ValueError: if the box is empty, or tuples have different lengths.
     """
 
     low: tuple[float, ...]

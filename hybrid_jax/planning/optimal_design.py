@@ -49,14 +49,15 @@ class Excitation:
     """The result of `excitation`: a plan of n intervals.
 
     Attributes:
-        reference: function of time t [s] that returns position [m] and yaw [rad] of a multirotor, else the inputs.
-        t: times of the states [s], from 0.
-        states: planned states at these times.
-        inputs: planned inputs, each held over an interval; rotor speeds [rad/s] of a multirotor.
-        parameters: names of the q requested parameters that the inputs excite.
-        information: their inverse covariance in the physics' own parametrisation, with the others unknown.
-        standard_errors: predicted for all requested parameters, in the units of `intervals`; infinite if not excited.
-        margins: least unused share of each limit, by the limit's name; 0 if all of it is used.
+        reference: a function of time t [s] that returns position [m] and yaw [rad] of a multirotor, else the inputs.
+        t: the times (n + 1,) of the states [s], from 0.
+        states: the planned states (n + 1, d) at these times.
+        inputs: the planned inputs (n, m), each held over an interval; rotor speeds [rad/s] for a multirotor.
+        parameters: the names of the q requested parameters that the inputs excite.
+        information: their inverse covariance (q, q) in the physics' own parametrisation, with the others unknown.
+        standard_errors: the predicted standard error of each requested parameter, in the units of `intervals`; infinite
+            if the inputs do not excite it.
+        margins: the unused fraction of each limit, by the limit's name; 0 if all of it is used.
     """
 
     reference: Callable[..., Any]
@@ -70,7 +71,7 @@ class Excitation:
 
     @property
     def log_det(self) -> float:
-        """log det of the information: D-optimality."""
+        """log det of the information, which a D-optimal design maximises."""
         return float(np.linalg.slogdet(self.information)[1])
 
 
@@ -89,30 +90,30 @@ def excitation(
     starts: int = 4,
     steps: int = 200,
 ) -> Excitation:
-    """Design the most informative flight, or inputs, for estimating parameters.
+    """Design the flight, or the inputs, from which you learn most about parameters.
 
     It maximises log det of the inverse covariance of `parameters` that `fit_least_squares(…, scale=noise)` will have on
-    windows of the flight. All other parameters of the model's physics are unknown as well: with
-    `with_disturbance(model)`, also a constant force and torque. Adam improves random series; a series outside the
-    limits is shrunk, so the result satisfies them and is at least as informative as any start. Note that the
-    prediction uses the plan, which the vehicle need not follow exactly.
+    windows of the flight. All other parameters of the physics count as unknown as well, for example a constant force
+    and torque with `with_disturbance(model)`. Adam improves random series. A series outside the limits is shrunk, so
+    the result satisfies them and is at least as informative as any start. Note that the predicted standard errors are
+    those of the plan, which the vehicle will not follow exactly.
 
     Args:
-        model: a multirotor with `FlightBounds`, else any field with `InputBounds`, with a guess of its parameters.
-        parameters: names as in `intervals`; by default all but a disturbance.
-        bounds: limits of the plan; you should leave room, since the vehicle follows it with an error.
-        key: random key of the series that the search starts from.
-        seconds: duration of the plan [s].
-        noise: standard deviation of each state's white noise; by default typical of motion capture for a multirotor.
-        window: length of the windows [s], a multiple of `dt`.
-        dt: interval between samples, over which an input is held [s].
-        bandwidth: highest frequency of the series [Hz].
-        starts: number of random series to start from; the best result is returned.
-        steps: of Adam.
+        model: any field with a guess of its parameters: a multirotor with `FlightBounds`, another with `InputBounds`.
+        parameters: names as in `intervals`; by default all except a disturbance.
+        bounds: the limits of the plan. You should leave room, since the vehicle follows it with an error.
+        key: random key of the initial series.
+        seconds: the duration of the plan [s].
+        noise: the standard deviation of each state's white noise; for a multirotor by default as in motion capture.
+        window: the length of the windows [s], a multiple of `dt`.
+        dt: the interval between samples, over which an input is held [s].
+        bandwidth: the highest frequency of the series [Hz].
+        starts: the number of random series to start from; you get the best result.
+        steps: the number of steps of Adam.
 
     Raises:
-        ValueError: an unknown parameter, bounds of the wrong kind, limits that rest violates, or parameters that
-            no start distinguishes. A parameter that no input excites causes a warning with its name.
+        ValueError: if a parameter is unknown, bounds are of the wrong kind, the vehicle at rest violates them, or no
+            start distinguishes the parameters. You get a warning with the name of a parameter that no input excites.
     """
     design = _design(model, bounds, seconds, window, dt, bandwidth)
     for name, value in (("starts", starts), ("steps", steps)):

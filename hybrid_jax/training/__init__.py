@@ -1,4 +1,4 @@
-"""Training: `fit` for one run, and `fit_gauss_newton`; losses, objectives, learning-rate groups and stages."""
+"""Training: `fit`, `fit_in_stages` and `fit_gauss_newton`, with their losses, objectives and learning rates."""
 
 from hybrid_jax.training.channels import Channel, ChannelLoss
 from hybrid_jax.training.driver import FitInterrupted, FitResult, History, fit

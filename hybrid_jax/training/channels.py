@@ -20,15 +20,15 @@ FLOOR = 1e-3  # least scale of a state over its size: one that hardly changes mu
 
 @dataclass(frozen=True)
 class Channel:
-    """Entries of the state whose error is one vector.
+    """Consecutive entries of the state whose error is one vector, for example the velocity.
 
     Attributes:
         start: the first entry, counted from 0.
         stop: one past the last entry.
-        scale: the error norm that counts as 1, in their unit.
+        scale: the norm of the error that counts as 1, in the unit of the entries.
 
     Raises:
-        ValueError: no entries, or a scale that is not positive.
+        ValueError: if there are no entries, or the scale is not positive.
     """
 
     start: int
@@ -43,17 +43,17 @@ class Channel:
 
 @dataclass(frozen=True)
 class ChannelLoss(TrajectoryLoss):
-    """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, instead of the square in `TrajectoryLoss`.
+    """A robust loss: Σ over channels of ρ(‖error‖ / scale), averaged over steps and windows.
 
-    You should use it where units differ: otherwise 1 rad/s in the body rates counts ten thousand times as much as 1 cm.
-    ρ(r) = r²; beyond `huber` it is 2 huber r − huber² (Huber 1964, doubled). As r is a norm, no direction is preferred.
+    You should use it if units differ: `TrajectoryLoss` counts an error of 1 rad/s ten thousand times as much as 1 cm.
+    ρ(r) = r² up to `huber`, and 2 huber r − huber² beyond (Huber 1964, doubled). No direction of an error is preferred.
 
     Attributes:
-        channels: one or more; state entries in no channel do not count.
-        huber: threshold on ‖error‖ / scale beyond which ρ is linear; by default none.
+        channels: one or more channels. Entries of the state that are in no channel do not count.
+        huber: threshold on ‖error‖ / scale beyond which ρ is linear; by default there is none.
 
     Raises:
-        ValueError: no channels, or a threshold that is not positive.
+        ValueError: if there are no channels, or the threshold is not positive.
     """
 
     channels: tuple[Channel, ...]
@@ -82,10 +82,10 @@ class ChannelLoss(TrajectoryLoss):
         return jnp.mean(in_chunks(errors, data, CHUNK))
 
     def error(self, difference: Float[Array, "*n d"]) -> Float[Array, "*n"]:
-        """Σ over channels of ρ(‖error‖ / scale).
+        """Return Σ over channels of ρ(‖error‖ / scale).
 
         Args:
-            difference: predicted minus true states (*n, d).
+            difference: predicted minus measured states (*n, d).
         """
 
         def one(channel: Channel):

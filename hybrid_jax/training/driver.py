@@ -36,10 +36,10 @@ Shared = tuple[PyTree, Settings, Optimiser]  # validation data as prepared by th
 
 
 class History(eqx.Module):
-    """The losses of every epoch.
+    """The losses of each epoch.
 
     Attributes:
-        train: training loss with the regulariser, mean over the minibatches of each epoch.
+        train: the training loss with the regulariser, averaged over the minibatches of each epoch.
         validation: the validation loss after each epoch.
     """
 
@@ -48,17 +48,17 @@ class History(eqx.Module):
 
 
 class FitResult(eqx.Module):
-    """A finished training run.
+    """The result of `fit`.
 
     Attributes:
         best: the field of the best validation epoch.
-        best_mse: its validation loss.
-        best_epoch: its number, counted from 1; 0 for the initial field.
+        best_mse: the validation loss of the best epoch.
+        best_epoch: the best epoch, counted from 1; 0 for the initial field.
         field: the field after the last epoch.
         epochs: how many were trained.
-        status: how it ended; OK if it stopped early, STALLED if no epoch was better than the first, RUNNING if it was
-            interrupted.
-        history: the losses of every epoch.
+        status: how the run ended: OK if it stopped early, STALLED if no epoch was better than the first, RUNNING if you
+            interrupted it.
+        history: the losses of each epoch.
         state: the final state of the run.
     """
 
@@ -73,7 +73,7 @@ class FitResult(eqx.Module):
 
 
 class FitInterrupted(KeyboardInterrupt):
-    """Ctrl-C during `fit`; `result` is the run up to the last complete block of epochs."""
+    """Raised by Ctrl-C during `fit`; `result` has the run up to the last complete block of epochs."""
 
     def __init__(self, result: FitResult):
         super().__init__(f"training was interrupted after epoch {result.epochs}; it is in `result` of this exception")
@@ -96,33 +96,32 @@ def fit(
     settings: Settings | None = None,
     progress: Report | bool | None = None,
 ) -> FitResult:
-    """Train a field on all windows of `train`; `result.best` is the field of the best validation epoch.
+    """Train a field by gradient descent with early stopping. `result.best` is the field of the best epoch.
 
-    A network without a scaling is scaled by the training windows first; see `with_scaling`.
+    If a network has no scaling of its inputs, the training windows determine one first; see `with_scaling`.
 
     Args:
-        field: the initial field, or another module that the objective of `settings` can evaluate.
-        train: training windows. NaN in x means not measured, and counts as no error; x0 and u must be whole.
-        validation: windows that determine the best epoch and early stopping; you should take other recordings.
+        field: the initial field, or another module that the objective in `settings` can evaluate.
+        train: the training windows. NaN in x means "not measured" and counts as no error; x0 and u must be finite.
+        validation: windows that determine the best epoch and early stopping. They should be from other recordings.
         key: random key for shuffling minibatches.
-        rates: learning rates of Adam, a tree prefix of the field: a number, by default 1e-2, or e.g.
+        rates: learning rates of Adam, a tree prefix of the field: one number, by default 1e-2, or for example
             `Hybrid(1e-2, 1e-3)` for physics and residual.
-        optimiser: any Optax optimiser instead of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
-            and are 1 by default.
-        min_epochs: no early stop before.
-        patience: stop after this many epochs without a better validation loss; noisy data should have more.
-        max_epochs: stop after this many epochs.
+        optimiser: any Optax optimiser instead of Adam, for example `optax.adamw(1e-3)`. `rates` then multiply its
+            updates, and are 1 by default.
+        min_epochs: training does not stop early before this epoch.
+        patience: training stops after this many epochs without a better validation loss. Noisy data need more.
+        max_epochs: training stops after this many epochs.
         regulariser_weight: λ, by default 1e-3.
         settings: by default minibatches of 100 windows, or of all if there are fewer, and no regulariser. For the
             paper's, use `Settings(regulariser=hybrid_jax.training.loss.trajectory_correlation)`.
-        progress: True for a bar on stderr, or a function of (epoch, state) that is called about twice a second.
+        progress: True for a bar on stderr, or a function of (epoch, state), which is called about twice a second.
 
     Raises:
-        ValueError: windows that the objective rejects, that do not match the field, or without unit quaternions for a
-            rigid body; fewer training windows than a minibatch; a batch norm that cannot be trained, e.g. with
-            minibatches of one window; a field with nothing to learn; rates that do not match the field; a weight
-            without a regulariser; another argument out of range.
-        FitInterrupted: Ctrl-C; a KeyboardInterrupt with the result so far.
+        ValueError: if windows are invalid or do not match the field, there are fewer training windows than in a
+            minibatch, batch normalisation has minibatches of one window, the field has nothing to learn, rates do not
+            match the field, a weight has no regulariser, or another argument is out of range.
+        FitInterrupted: if you press Ctrl-C; it has the result so far.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
     keep_programs("fit", train.x.shape)

@@ -37,9 +37,9 @@ class GaussNewtonFit(eqx.Module):
 
     Attributes:
         field: the best field found.
-        loss: L_MSE on the windows plus λ times the penalty.
-        steps: number of points tried.
-        status: how it ended; OK if it stopped before `max_steps`, at a finite loss.
+        loss: its loss, L_MSE on the windows plus λ times the penalty.
+        steps: the number of points that were tried.
+        status: how the fit ended: OK if it stopped before `max_steps`, at a finite loss.
     """
 
     field: AbstractVectorField
@@ -87,23 +87,23 @@ def fit_gauss_newton(
     solver: Solver | None = None,
     scale: Float[Array, " d"] | None = None,
 ) -> GaussNewtonFit:
-    """Minimise L_MSE + λ L_reg over all parameters of a field by Gauss–Newton; running statistics do not change.
+    """Fit all parameters of a field by Gauss–Newton: minimise L_MSE + λ L_reg. Running statistics do not change.
 
-    You should use it with up to a thousand parameters and little data with little noise: there is no early stopping.
+    You should use it for up to a thousand parameters, and few data with little noise: there is no early stopping.
 
     Args:
         field: the initial field.
-        windows: all are used in each step. A network without a scaling is scaled by them first, as in `fit`.
-        penalty: L_reg, for a `Hybrid`: "residual_norm" or "trajectory_correlation" of `training.loss`, or
+        windows: the data, all of which are used in each step. They scale a network without a scaling, as in `fit`.
+        penalty: L_reg of a `Hybrid`: "residual_norm" or "trajectory_correlation" of `training.loss`, or
             "neighbour_weights", the squared weights of a `GridNetwork` for all points except the centre.
-        weight: λ.
-        max_steps: largest number of points tried.
-        solver: by default `RK4`.
-        scale: divides the error of each state, as in `fit_least_squares`.
+        weight: λ, the weight of the penalty.
+        max_steps: the largest number of points to try.
+        solver: the integrator, by default `RK4`.
+        scale: a divisor for the error of each state, as in `fit_least_squares`.
 
     Raises:
-        ValueError: malformed windows, or windows that do not match the field; no parameters, or too many; an unknown
-            penalty, or one for a field that is not a `Hybrid`; a weight that is negative.
+        ValueError: if windows are invalid or do not match the field, there are no parameters or too many, the penalty
+            is unknown or the field is not a `Hybrid`, or the weight is negative.
     """
     checks.not_traced("fit_gauss_newton", field, windows)
     windows = check_windows(field, windows, missing=True)

@@ -23,21 +23,21 @@ Learner = Any  # an Equinox module: a vector field, or anything that the objecti
 
 
 class Objective(Protocol):
-    """Maps windows to a training and a validation loss; hashable. By default `batch` and `observe` change nothing."""
+    """What `fit` minimises: a hashable object with a training and a validation loss. Subclass it to define your own."""
 
     def prepare(self, windows: Trajectories, name: str) -> PyTree:
-        """The data of a run, with a length and indexed by arrays of integers.
+        """Return the data of a run. They must have a length, and be indexed by arrays of integers.
 
         Args:
             windows: the training or validation data of `fit`.
-            name: what messages call them, "train" or "validation".
+            name: what messages call the windows, "train" or "validation".
 
         Raises:
-            ValueError: windows that are unusable.
+            ValueError: if the windows are unusable.
         """
 
     def batch(self, picked: PyTree, settings: "Settings") -> PyTree:
-        """A minibatch in the layout that `loss` needs.
+        """Return a minibatch in the layout that `loss` needs; by default unchanged.
 
         Args:
             picked: the windows of the minibatch, indexed from the data of `prepare`.
@@ -48,7 +48,7 @@ class Objective(Protocol):
     def loss(
         self, field: Learner, batch: PyTree, settings: "Settings", weight: Float[Array, ""]
     ) -> tuple[Float[Array, ""], PyTree]:
-        """The loss on a minibatch, and the values that `observe` needs.
+        """Return the loss on a minibatch, and the values that `observe` needs.
 
         Args:
             field: what is trained.
@@ -59,7 +59,7 @@ class Objective(Protocol):
         ...
 
     def observe(self, field: Learner, batch: PyTree, seen: PyTree) -> Learner:
-        """The field with running statistics updated by the minibatch; learned parameters do not change.
+        """Return the field with running statistics updated by the minibatch; by default the field itself.
 
         Args:
             field: what is trained.
@@ -69,7 +69,7 @@ class Objective(Protocol):
         return field
 
     def validate(self, field: Learner, data: PyTree, settings: "Settings") -> Float[Array, ""]:
-        """The validation loss, for early stopping and the choice of the best epoch.
+        """Return the validation loss, for early stopping and the choice of the best epoch.
 
         Args:
             field: what is trained.
@@ -98,10 +98,10 @@ class TrajectoryLoss(Objective):
         return value, predicted
 
     def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
-        """The error of a minibatch.
+        """Return the error of a minibatch.
 
         Args:
-            difference: predicted minus true states (t, d, b), zero if not measured.
+            difference: predicted minus measured states (t, d, b), zero where x is not measured.
         """
         return jnp.mean(jnp.mean(jnp.sum(jnp.square(difference), axis=1), axis=0))
 
@@ -114,16 +114,16 @@ class TrajectoryLoss(Objective):
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a compiled training program, the same for all runs of a sweep.
+    """Settings of a training program, the same for all runs of a sweep.
 
     Attributes:
-        batch_size: windows of a minibatch, or all if there are fewer; you should try less for only a hundred.
-        regulariser: L_reg of a `Hybrid`, given the field, the minibatch and its predicted states; by default none.
-        solver: integrates from sample to sample, by default one step of RK4 each.
-        objective: training and validation loss, by default the squared error of trajectories.
+        batch_size: windows in a minibatch, or all if there are fewer. With only a hundred windows you should try 20.
+        regulariser: L_reg, a function of a `Hybrid`, the minibatch and its predicted states; by default there is none.
+        solver: the integrator from sample to sample, by default one step of RK4.
+        objective: the training and validation loss, by default the squared error of trajectories.
 
     Raises:
-        ValueError: an invalid batch size, regulariser, solver or objective.
+        ValueError: if the batch size, regulariser, solver or objective is invalid.
     """
 
     batch_size: int = 100

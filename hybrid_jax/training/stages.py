@@ -22,17 +22,17 @@ from hybrid_jax.trajectories import Trajectories
 class Stage:
     """One training run, with the learning rate of each group of parameters.
 
-    A group is named by the beginning of its path in the field, e.g. "physics", "residual/weight_out" or
+    A group has the beginning of its path in the field as its name, for example "physics", "residual/weight_out" or
     "physics/deviations/drag"; "" is the whole field. The longest name that matches counts. Other parameters are frozen.
 
     Attributes:
-        rates: learning rate by the name of a group.
-        steps: initial intervals of each window to train on; by default all.
-        epochs: stop after this many.
-        patience: or after this many without a better validation loss.
+        rates: the learning rate of each group, by its name.
+        steps: number of intervals at the start of each window to train on; by default all.
+        epochs: the stage stops after this many epochs.
+        patience: it also stops after this many epochs without a better validation loss.
 
     Raises:
-        ValueError: a rate that is negative or not finite, or a count below 1.
+        ValueError: if a rate is negative or not finite, or a count is below 1.
     """
 
     rates: Mapping[str, float]
@@ -49,14 +49,14 @@ class Stage:
 
 
 def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
-    """The learning rate of each learned array of a field, as a tree like the field; see `Stage`.
+    """Return the learning rate of each learned array, as a tree like the field; see `Stage`.
 
     Args:
-        field: its learned arrays get a rate each; 0 if they are in no group.
-        groups: learning rate by the name of a group.
+        field: any field. Learned arrays that are in no group have rate 0.
+        groups: the learning rate of each group, by its name.
 
     Raises:
-        ValueError: a group without a learned array; lists the paths that exist.
+        ValueError: if a group has no learned array; the message lists the paths that exist.
     """
     learned = eqx.filter(field, trainable(field))
     paths = list(named_leaves(learned))
@@ -100,23 +100,23 @@ def fit_in_stages(
     settings: Settings | None = None,
     progress: Report | bool | None = None,
 ) -> list[FitResult]:
-    """Train a field in stages, each from the best field of the one before; `results[-1].best` is the trained field.
+    """Train a field in stages, each from the best field of the stage before. `results[-1].best` is the trained field.
 
-    Every stage is validated on whole windows and kept only if its field is better there than its initial one.
+    Each stage is validated on whole windows, and kept only if it made the field better there.
 
     Args:
         field: the initial field.
-        train: training windows, of which each stage may use a shorter beginning.
-        validation: windows that determine the best epoch and early stopping of each stage.
+        train: the training windows, of which each stage may use a shorter beginning.
+        validation: windows that determine the best epoch and the early stopping of each stage.
         key: random key for shuffling minibatches.
-        stages: one training run each, in this order.
-        optimiser: any Optax optimiser instead of Adam, whose updates the rates of a stage then multiply.
+        stages: the stages, in their order.
+        optimiser: any Optax optimiser instead of Adam. The rates of a stage then multiply its updates.
         regulariser_weight: λ, by default 1e-3.
-        settings: of all stages; defaults as in `fit`.
-        progress: True for a bar on stderr, or a function of (epoch, state) that is called about twice a second.
+        settings: settings of all stages, with defaults as in `fit`.
+        progress: see `fit`.
 
     Raises:
-        ValueError: see `fit`; no stages; windows shorter than a stage needs; or rates of an unknown group.
+        ValueError: as in `fit`, or if there are no stages, windows are too short for a stage, or a group is unknown.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
     if not (stages := checks.list_of("stages", stages, Stage)):
