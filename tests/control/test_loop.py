@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from smoke import ROOT
 
 import hybrid_jax as hj
 from hybrid_jax import control
@@ -155,14 +154,6 @@ def test_mixed_precision_is_promoted(start, wanted):
             return control.fly(single, body, reference, x0, controller).x
 
         assert jax.eval_shape(fly, reference, reference[0].astype(start)).dtype == np.float64
-
-
-@pytest.mark.slow
-def test_the_guide_s_example_runs(capsys):
-    code = (ROOT / "docs" / "howto" / "control.md").read_text().split("```python\n")[1].partition("```")[0]
-    exec(compile(code, "example", "exec"), {})
-    away = float(capsys.readouterr().out.split()[3])
-    assert away < 0.01
 
 
 def test_a_controller_that_knows_the_lag_predicts_its_costs_and_pays_less():

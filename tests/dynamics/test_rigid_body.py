@@ -11,7 +11,7 @@ from evaluations import infer_batch, train_batch
 from jax.flatten_util import ravel_pytree
 from systems import ODD
 
-from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid, rollout, rollout_batch, rotation
+from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid, rollout_batch, rotation
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, perturbed, rigid_body
@@ -101,26 +101,6 @@ def test_hover_is_an_equilibrium():
     change = rigid_body(symmetric)(level(), jnp.full(4, symmetric.hover_speed))
     np.testing.assert_allclose(change, 0, atol=1e-14)  # round-off of g − g
     np.testing.assert_allclose(rigid_body(IRIS)(level(), jnp.full(4, IRIS.hover_speed))[VELOCITY], 0, atol=1e-14)
-
-
-def test_free_fall_is_exact():
-    start = level(v=[1.0, -2.0, 3.0])
-    seconds = 0.1 * np.arange(1, 6)[:, None]
-    path = rollout(rigid_body(IRIS), start, jnp.zeros((5, 4)), 0.1)
-    v0, g = np.array([1.0, -2.0, 3.0]), np.array([0, 0, -IRIS.gravity])
-    # A parabola is within the order of RK4: round-off alone remains.
-    np.testing.assert_allclose(path[:, VELOCITY], v0 + g * seconds, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(path[:, POSITION], v0 * seconds + g * seconds**2 / 2, rtol=0, atol=1e-13)
-
-
-def test_torque_free_spin_keeps_energy_and_angular_momentum():
-    path = rollout(rigid_body(ODD), level(w=[1.0, 4.0, 0.5]), jnp.zeros((200, 4)), 0.005)
-    momentum = np.array(ODD.inertia) * np.asarray(path[:, BODY_RATES])
-    energy = (momentum * path[:, BODY_RATES]).sum(1) / 2
-    assert np.ptp(path[:, 10]) > 1  # it tumbles: Iy lies outside, so all three rates move
-    # RK4's error over 1 s: (|ω| h)⁴ = 2e-7 at most.
-    np.testing.assert_allclose(energy, energy[0], rtol=1e-7)
-    np.testing.assert_allclose(np.linalg.norm(momentum, axis=1), np.linalg.norm(momentum[0]), rtol=1e-7)
 
 
 def test_theta_is_nominal_at_zero_and_positive_everywhere():

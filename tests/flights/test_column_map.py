@@ -166,30 +166,6 @@ def test_level_and_north_in_ned_is_level_and_north_in_enu():
     np.testing.assert_allclose(np.abs(x[0, 3:7]), [1, 0, 0, 0], atol=1e-12)
 
 
-def test_pitch_and_roll_in_frd():
-    forward, left, up = axes(to_library(NONE, from_euler(row(0, 30 * DEG, 90 * DEG)), NONE, NONE, NED))
-    np.testing.assert_allclose(forward, [np.sqrt(0.75), 0, 0.5], atol=1e-12)  # east and up
-    np.testing.assert_allclose(left, [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(up, [-0.5, 0, np.sqrt(0.75)], atol=1e-12)  # thrust brakes
-    _, left, _ = axes(to_library(NONE, from_euler(row(20 * DEG, 0, 90 * DEG)), NONE, NONE, NED))
-    assert left[2] == pytest.approx(np.sin(20 * DEG))
-
-
-def test_body_velocity_is_rotated_into_the_world():
-    q = from_euler(row(0, 0, 90 * DEG))
-    x = to_library(NONE, q, row(3, 1, -2), NONE, Frames("NED", "FRD", "body"))  # forward, right, up
-    np.testing.assert_allclose(x[0, 7:10], [3, -1, 2], atol=1e-12)  # east, south, up
-    x = to_library(NONE, from_euler(row(0, 0, 90 * DEG)), row(3, 1, 2), NONE, Frames("ENU", "FLU", "body"))
-    np.testing.assert_allclose(x[0, 7:10], [-1, 3, 2], atol=1e-12)
-
-
-def test_euler_angles_turn_yaw_first():
-    forward = rotation_of(from_euler(row(0, 90 * DEG, 90 * DEG))).apply([1.0, 0, 0])[0]
-    np.testing.assert_allclose(forward, [0, 0, -1], atol=1e-12)  # z up: positive pitch is nose down
-    left = rotation_of(from_euler(row(90 * DEG, 0, 90 * DEG))).apply([0.0, 1, 0])[0]
-    np.testing.assert_allclose(left, [0, 0, 1], atol=1e-12)
-
-
 def test_rates_between_are_the_rates_of_the_flight(flight):
     middle = 0.5 * (flight.x[1:, 10:] + flight.x[:-1, 10:])
     # Second order in the interval: ω̈ dt² / 12 with ω̈ up to some hundred rad/s³.

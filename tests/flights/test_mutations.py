@@ -1,31 +1,27 @@
-"""Damaged and forged files of every kind are read or refused in one line, in seconds and little memory."""
+"""Damaged files of every kind are read or refused in one line, in seconds and little memory."""
 
 import gzip
-import json
 import os
 import resource
-import subprocess
 import time
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from surface import is_finite, outcome, refusal
+from surface import outcome, refusal
 from writers import bag, blackbox, crazyflie, escs, ulog
 
 import hybrid_jax as hj
 from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.export import Program, export_program, load_program
-from hybrid_jax.export.stablehlo import FORMAT as PROGRAM
 from hybrid_jax.flights.checks.consistency import check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import COLUMNS
-from hybrid_jax.io.archive import load_archive, named_leaves, save_archive
-from hybrid_jax.io.datasets import FORMAT as DATASET
+from hybrid_jax.io.archive import named_leaves, save_archive
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.files import json_text, read_json, write_atomic
 from hybrid_jax.io.models import FORMAT as MODEL
@@ -126,57 +122,6 @@ def test_a_mutated_file_is_read_or_ends_in_a_line(tmp_path, wholes, capfd, name,
     assert slowest < SECONDS
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MEMORY
     assert capfd.readouterr().out == ""
-
-
-NAMES = ("os:system", "subprocess:Popen", "builtins:eval", "os", "../../x", "@Options", "x" * 200_000)
-NAMES += ("hybrid_jax.dynamics.composition:Frozen", "hybrid_jax.vehicle:Vehicle", "equinox.nn._linear:Linear")
-VALUES = (json.loads("[" * 300 + "]" * 300), None, True, -1, 0.0, 1e300, 10**30, "", [], {})
-VALUES += ({"array": "gone"}, {"named": "os.system"}, {"float": "nan"})
-
-
-def places(node):
-    """Every container in a tree of JSON, with each of its keys."""
-    for key, part in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
-        yield node, key
-        yield from places(part)
-
-
-def forged(metadata, arrays, rng):
-    """Content that no `save` wrote, under a checksum that is right."""
-    tree, arrays = json.loads(json.dumps(metadata)), {name: array.copy() for name, array in arrays.items()}
-    for _ in range(rng.integers(1, 4)):
-        found, name = [*places(tree)] or [(tree, "new")], str(rng.choice([*arrays]))
-        node, key = found[int(rng.integers(len(found)))]
-        match int(rng.integers(6)):
-            case 0:
-                node[key] = VALUES[int(rng.integers(len(VALUES)))]
-            case 1:
-                node["class" if "class" in node else key] = str(rng.choice(NAMES))
-            case 2:
-                node.pop(key) if key in node or isinstance(node, list) else None
-            case 3:
-                arrays[name] = np.full_like(arrays[name], rng.choice([np.nan, np.inf, 1e30, -1.0, 0.0]))
-            case 4:
-                arrays[name] = rng.normal(size=rng.integers(0, 4, size=rng.integers(0, 4)))
-            case 5:
-                arrays[name] = arrays[name].astype(str(rng.choice(["i4", "?", "f2", "f8"])))
-    return tree, arrays
-
-
-@COUNTS
-@pytest.mark.parametrize("name", ["model.npz", "set.npz", "program.npz"])
-def test_a_forged_archive_is_refused_or_holds_finite_numbers(tmp_path, wholes, monkeypatch, name, count):
-    for module, function in ((os, "system"), (subprocess, "Popen")):
-        monkeypatch.setattr(module, function, pytest.fail)
-    rng, path = random_numbers(), tmp_path / name
-    path.write_bytes(wholes[name])
-    form = {"model.npz": MODEL, "set.npz": DATASET, "program.npz": PROGRAM}[name]
-    whole = load_archive(path, form)
-    for _ in range(count):
-        tree, arrays = forged(*whole, rng)
-        outcome(save_archive, path, form, tree, arrays)
-        found = outcome(LOADERS[name], path, naming=str(path))
-        assert found is None or name == "program.npz" or is_finite(getattr(found, "field", None) or dict(found.splits))
 
 
 def test_what_is_said_of_a_file_is_short(tmp_path):
