@@ -1,7 +1,11 @@
 """Equations of motion of a multirotor on the entries of θ_p, x and u, without stacking them; see `rigid_body`."""
 
+from collections.abc import Callable
+from functools import partial
+
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax import rotation
 from hybrid_jax.dynamics.terms import Terms, nominal_values
@@ -101,3 +105,24 @@ def dot(a, b) -> Array:
 def is_present(term, absent: float = 0.0) -> bool:
     """Whether a term is learned or has an effect."""
     return any(not isinstance(number, int | float) or number != absent for number in term)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def evaluate_columns(of_rows: Callable, theta: PyTree, x: Float[Array, "13 b"], u: Float[Array, "rotors b"]):
+    """`of_rows(theta, x, u)` on a minibatch for scalar parameters; its derivative sums over it once per parameter."""
+    return of_rows(theta, tuple(x), tuple(u))
+
+
+def _columns_backward(of_rows, saved, d_derivative: Float[Array, "13 b"]):
+    theta, x, u = saved
+    own = jax.tree.map(lambda parameter: jnp.broadcast_to(parameter, x.shape[1:]), theta)  # one for each column
+    d_own, d_x, d_u = jax.vjp(of_rows, own, tuple(x), tuple(u))[1](d_derivative)
+    leaves, structure = jax.tree.flatten(d_own)
+    if leaves:
+        leaves = tuple(jnp.stack(leaves) @ jnp.ones(x.shape[1:], leaves[0].dtype))
+    return jax.tree.unflatten(structure, leaves), jnp.stack(d_x), jnp.stack(d_u)
+
+
+evaluate_columns.defvjp(
+    lambda of_rows, theta, x, u: (of_rows(theta, tuple(x), tuple(u)), (theta, x, u)), _columns_backward
+)

@@ -118,13 +118,22 @@ class RigidBody(AbstractVectorField):
             return middle * jnp.exp(deviation) if name in LOGARITHMIC else middle + units[name] * deviation
 
         def values(name: str, deviation) -> Rows:
-            each = jnp.ravel(deviation) if shape_of(self.vehicle, name) else (deviation,)
-            return tuple(value(name, *pair) for pair in zip(known[name], each, strict=True))
+            if not isinstance(deviation, tuple):
+                deviation = tuple(jnp.ravel(deviation)) if shape_of(self.vehicle, name) else (deviation,)
+            return tuple(value(name, *pair) for pair in zip(known[name], deviation, strict=True))
 
         return {name: values(name, self.deviations[name]) for name in sorted(self.deviations)}
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
-        return equations.derivative(self.vehicle, self.terms, self.entries(), tuple(x), tuple(u))
+        return self.of_rows(tuple(x), tuple(u))
+
+    def train_batch(self, x, u):
+        by_number = jax.tree.map(lambda leaf: tuple(jnp.ravel(leaf)) if jnp.ndim(leaf) else leaf, self)
+        return equations.evaluate_columns(RigidBody.of_rows, by_number, x, u)
+
+    def of_rows(self, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
+        """Compute ẋ from the entries of x and u."""
+        return equations.derivative(self.vehicle, self.terms, self.entries(), x, u)
 
     def apply_residual(self, x, residual):
         """Return the residual with its effect on ṗ: a force changes the position before the estimated velocity."""

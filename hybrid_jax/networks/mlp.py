@@ -127,8 +127,9 @@ class ResidualNetwork(AbstractVectorField):
         return self.scaling.concatenate(x, u)
 
     def train_batch(self, x, u):
-        active = function_of(self.activation)(self.norm.train(self.weight_in, self.inputs(x, u)))
-        return self.scaling.outputs(affine(self.weight_out, self.bias_out, active))
+        layers = self.weight_in, self.weight_out, self.bias_out
+        y = self.norm.train_layers(function_of(self.activation), *layers, self.inputs(x, u))
+        return self.scaling.outputs(y)
 
     def update_running_stats(self, x, u):
         norm = self.norm.observed(self.weight_in, self.inputs(x, u))

@@ -138,10 +138,17 @@ MINIBATCHES = {"rigid body": rigid_body(IRIS)} | {
 
 
 @pytest.mark.parametrize("field", MINIBATCHES.values(), ids=MINIBATCHES)
-def test_a_minibatch_is_its_samples(field):
+def test_a_minibatch_and_its_gradient_are_those_of_its_samples(field):
     field, (x, u) = moved(field), samples()
+    weights = jnp.asarray(np.random.default_rng(2).normal(size=(13, 6)))
+
+    def slope(evaluate):
+        return jax.jit(jax.grad(lambda field, x, u: jnp.sum(weights * evaluate(field, x, u)), (0, 1, 2)))(field, x, u)
+
     for evaluate in map(eqx.filter_jit, (train_batch, infer_batch)):
         np.testing.assert_allclose(evaluate(field, x, u), one_by_one(field, x, u), rtol=1e-12, atol=1e-11)
+    for ours, theirs in zip(jax.tree.leaves(slope(train_batch)), jax.tree.leaves(slope(one_by_one)), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-11)
 
 
 def test_all_terms_are_recovered_from_flights_made_with_them():

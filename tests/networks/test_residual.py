@@ -1,5 +1,7 @@
 """Laws of the network f_d and its normalisations."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -49,11 +51,23 @@ PLAIN = {
 
 
 @pytest.mark.parametrize("activation", PLAIN)
-def test_a_minibatch_is_that_of_the_plain_formula(activation):
+def test_the_derivative_written_by_hand_is_that_of_the_plain_formula(activation):
     with jax.enable_x64(True):
         field, (x, u) = network(activation=activation), batch()
-        expected = plain(field, x, u, activation=PLAIN[activation])
-        np.testing.assert_allclose(field.train_batch(x, u), expected, rtol=0, atol=1e-12)
+        weights = jax.random.normal(jax.random.key(9), (STATES, COLUMNS))
+
+        def gradients(formula):
+            parameters, rest = eqx.partition((field, x, u), eqx.is_inexact_array)
+            return jax.jit(jax.grad(lambda p: jnp.sum(weights * formula(*eqx.combine(p, rest)))))(parameters)
+
+        formula = partial(plain, activation=PLAIN[activation])
+        np.testing.assert_allclose(field.train_batch(x, u), formula(field, x, u), rtol=0, atol=1e-12)
+        found, expected = (jax.tree.leaves(gradients(one)) for one in (train_batch, formula))
+        assert len(found) == len(expected) == 9  # four weights, gain … running statistics (zero), x, u
+        for one, other in zip(found, expected, strict=True):
+            # Round-off of float64 on gradients of up to about 100.
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-10)
+        assert sum(float(jnp.abs(leaf).max()) > 1e-3 for leaf in expected) == 7
 
 
 @pytest.mark.parametrize("activation", PLAIN)
@@ -169,6 +183,21 @@ def test_without_a_batch_s_statistics_training_is_deployment_and_both_the_plain_
         # A sample's result does not depend on its neighbours, and nothing is remembered of them.
         np.testing.assert_allclose(field.train_batch(x[:, :3], u[:, :3]), expected[:, :3], rtol=0, atol=1e-12)
         assert eqx.tree_equal(field.update_running_stats(x, u), field)
+
+
+@pytest.mark.parametrize("norm", ["layer", "none"])
+def test_the_gradient_of_a_minibatch_is_that_of_its_samples_one_by_one(norm):
+    with jax.enable_x64(True):
+        field, (x, u) = unbatched(norm), batch()
+
+        def one_by_one(field):
+            return sum(jnp.sum(plain_one(field, x[:, i], u[:, i]) ** 2) for i in range(3))
+
+        found = jax.jit(jax.grad(lambda field: jnp.sum(field.train_batch(x[:, :3], u[:, :3]) ** 2)))(field)
+        expected = jax.jit(jax.grad(one_by_one))(field)
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)  # round-off of float64
+        assert all(jax.tree.leaves(base.trainable(field)))
 
 
 def test_without_normalisation_the_bias_starts_as_a_linear_layer_s():
