@@ -37,10 +37,10 @@ ATTITUDE_GAIN, RATE_GAIN = 30.0, 10.0
 
 
 class Plan(eqx.Module):
-    """State of the controller between calls.
+    """The state of the controller between calls.
 
     Attributes:
-        variables: (t, rotors); tanh maps them to shares of the rotor speeds' range, constant in each interval.
+        variables: numbers (t, rotors) that tanh maps to the range of rotor speeds, constant in each interval.
         cost: cost predicted by the controller's model.
         damping: damping of the best Gauss–Newton step.
     """
@@ -71,21 +71,21 @@ def checked_states(
 
 @dataclass(frozen=True)
 class Controller:
-    """Model predictive controller with hyper-parameters only; you pass the plan in and get the new one back.
+    """A model predictive controller. It has settings only: you pass its plan to a call, and get the next one back.
 
     Attributes:
         vehicle: defines the limits and the initial guess (hover); the dynamics are the model that you pass to a call.
         weights: weights of the cost.
-        steps: intervals of the horizon.
-        interval: length of one [s]; one step of RK4.
+        steps: number of intervals of the horizon.
+        interval: length of an interval [s], which is one step of RK4.
         period: time between two calls [s].
-        iterations: Gauss–Newton steps per call.
+        iterations: Gauss–Newton steps in each call.
         damping: lower bound of the damping.
         min_speed: lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's.
         rotor_lag: time constant of the rotors [s]; see `lagged_speeds`.
 
     Raises:
-        ValueError: an argument has a wrong type or value, or `interval` is not a multiple of `period`.
+        ValueError: if an argument is invalid, or `interval` is not a multiple of `period`.
     """
 
     vehicle: Vehicle
@@ -118,7 +118,7 @@ class Controller:
 
     @property
     def stride(self) -> int:
-        """Periods per interval."""
+        """The number of periods in an interval."""
         return max(round(self.interval / self.period), 1)
 
     def begin(self) -> Plan:
@@ -147,7 +147,7 @@ class Controller:
             i: index of the sample, from 0.
 
         Raises:
-            ValueError: a concrete i is negative, or its horizon ends after the reference.
+            ValueError: if i is not traced and negative, or its horizon ends after the reference.
         """
         checks.count("i", i, least=0)
         last = len(reference) - 1 - self.steps * self.stride

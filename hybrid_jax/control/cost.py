@@ -31,7 +31,7 @@ class Weights:
         terminal: factor on all deviations of the last state of the horizon.
 
     Raises:
-        ValueError: a weight is negative or not finite, or `position`, `yaw` or `change` is zero.
+        ValueError: if a weight is negative or not finite, or `position`, `yaw` or `change` is zero.
     """
 
     position: float = 10.0

@@ -48,9 +48,9 @@ class Flight(eqx.Module):
 class Hardware:
     """Latency, rotor lag and noise between controller and vehicle.
 
-    A sample at time t sets the command from t + latency on, and the rotors follow with a lag; the plant's input is
-    their mean speed over each period. Sensors add white noise to each entry of the state. Negative or infinite numbers
-    raise ValueError.
+    A sample at time t sets the command from t + latency on, and the rotors follow with a lag. The plant's input is
+    their mean speed over each period. Sensors add white noise to each entry of the state. You get a ValueError for a
+    negative or infinite number.
 
     Attributes:
         latency: time from a sample to its command [s], a multiple of the controller's period.
@@ -101,7 +101,7 @@ class Performance(eqx.Module):
         yaw_rmse: RMS yaw error [rad].
         largest_error: largest position error [m].
         crashed: whether it went below the ground, too far from the reference, or not finite.
-        saturation: share of the rotor speeds at a limit.
+        saturation: fraction of the rotor speeds that are at a limit.
     """
 
     position_rmse: Scalar
@@ -124,7 +124,7 @@ class Moment(eqx.Module):
 
 
 class Loop(NamedTuple):
-    """A closed loop that you can stop and continue; `fly` is made of it.
+    """A closed loop that you can stop and continue. `fly` uses it.
 
     Attributes:
         controller: plans at each period.
@@ -137,7 +137,7 @@ class Loop(NamedTuple):
     estimator: Any
 
     def begin(self, x0: State, plan: Plan, key: PRNGKeyArray) -> Moment:
-        """Begin at the state x0, with the rotors at the speeds of the plan.
+        """Return the first moment of a flight: the state x0, with the rotors at the speeds of the plan.
 
         Args:
             x0: true state (13,).
@@ -207,8 +207,8 @@ def fly(
         key: random key, required for noise.
 
     Raises:
-        ValueError: shapes do not match, the reference is not longer than the horizon, or noise has no key; for concrete
-            values also if one is not finite, a quaternion's norm is not 1, or the bandwidth is negative.
+        ValueError: if shapes do not match, the reference is not longer than the horizon, or noise has no key. Unless
+            traced, also if a number is not finite, a quaternion's norm is not 1, or the bandwidth is negative.
     """
     checks.not_negative("bandwidth", bandwidth)
     hardware = Hardware() if hardware is None else hardware

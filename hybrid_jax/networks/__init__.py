@@ -1,4 +1,4 @@
-"""Residual networks f_d: the paper's (`mlp`), on parts of a multirotor's state (`views`) and on grids (`grids`)."""
+"""Residual networks f_d: for any system, for parts of a multirotor's state, and for grids."""
 
 from hybrid_jax.networks.grids import GridNetwork, grid_network
 from hybrid_jax.networks.mlp import LinearResidual, ResidualNetwork, residual_network, smoothed, zero_output

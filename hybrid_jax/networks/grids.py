@@ -16,7 +16,7 @@ from hybrid_jax.networks.normalisation import AbstractScaling
 
 
 class GridNetwork(AbstractVectorField):
-    """ẋ at each point = network(values at the kernel × … × kernel points around it, u).
+    """A network that is the same at each point of a grid. It reads u and the kernel × … × kernel points around it.
 
     A kernel of 1 is a pointwise reaction. A kernel of 3 is a convolution of 3 × 3, then one of 1 × 1; unlike a kernel
     of 1, it can express derivatives in space, for example the Laplacian.
@@ -26,9 +26,9 @@ class GridNetwork(AbstractVectorField):
     takes half the time and a twentieth of the memory.
 
     Attributes:
-        network: what is evaluated at each point.
-        grid: the points and their components.
-        kernel: points along each axis that the network reads, odd.
+        network: the network that is evaluated at each point.
+        grid: the grid of the state.
+        kernel: number of points along each axis that the network reads, odd.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -57,14 +57,14 @@ class GridNetwork(AbstractVectorField):
         return found.reshape(-1, found.shape[-1])
 
     def points(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> tuple[Array, Array]:
-        """The network's input, a column for each point of each sample: neighbours (k, n), input (m, n)."""
+        """Return the network's input, with a column for each point of each sample: neighbours (k, n), input (m, n)."""
         near = jnp.concatenate(self.grid.moved(self.grid.fields(x), self.kernel))
         u = u[: self.network.weight_in.shape[1] - len(near)]
         held = jnp.broadcast_to(jnp.expand_dims(u, (*self.grid.axes,)), (len(u), *near.shape[1:]))
         return near.reshape(len(near), -1), held.reshape(len(u), near[0].size)
 
     def neighbour_weights(self) -> Float[Array, "h k"]:
-        """The first layer's weights for the values at all points except the centre."""
+        """Return the first layer's weights for the values at all points except the centre."""
         read = self.grid.components * self.kernel ** len(self.grid.shape)
         blocks = self.network.weight_in[:, :read].reshape(len(self.network.weight_in), -1, self.grid.components)
         middle = blocks.shape[1] // 2
@@ -93,7 +93,7 @@ def grid_network(
     norm: str = "none",
     scaling: AbstractScaling | None = None,
 ) -> GridNetwork:
-    """A network that is the same at every point of a grid.
+    """Make a network that is the same at each point of a grid, with the paper's initial weights.
 
     Args:
         grid: the points, and the components at each.
@@ -101,11 +101,11 @@ def grid_network(
         kernel: points along each axis that it reads, odd: 1 is pointwise, 3 a convolution.
         hidden: units at each point.
         activation: of the hidden units, by default smooth; see `residual_network`.
-        norm: batch normalisation, by default none; see `residual_network`.
-        scaling: of its inputs and outputs; see `residual_network`.
+        norm: normalisation of the hidden units, by default none; see `residual_network`.
+        scaling: scaling of inputs and outputs; see `residual_network`.
 
     Raises:
-        ValueError: a kernel that is even or wider than the grid, or an invalid argument of `residual_network`.
+        ValueError: if the kernel is even or wider than the grid, or an argument of `residual_network` is invalid.
     """
     checks.count("kernel", kernel)
     if kernel % 2 == 0 or kernel > min(grid.shape):

@@ -88,17 +88,17 @@ class FusedNetwork(AbstractVectorField):
 
 
 class ResidualNetwork(AbstractVectorField):
-    """ẋ = W₂ σ(norm(W₁ z)) + b₂ with z = [x, scaled u]; 17 → 64 → 13, batch normalisation and ReLU in the paper.
+    """A network with one hidden layer, ẋ = W₂ σ(norm(W₁ z)) + b₂ with z = [x, scaled u] (paper: 17 → 64 → 13).
 
-    W₁ has no bias: batch normalisation would remove it, and the others have a shift.
+    W₁ has no bias, because the normalisation has a shift or would remove it.
 
     Attributes:
-        weight_in: W₁ (h, m), with h hidden units and the m numbers of z.
+        weight_in: W₁ (h, m), for h hidden units and the m numbers of z.
         norm: normalisation of W₁ z before the activation.
         weight_out: W₂ (d, h).
         bias_out: b₂ (d,).
-        scaling: of its inputs and outputs; z is [x, u] after scaling.
-        activation: σ, by its name in `residual_network`, or a `SmoothRelu`.
+        scaling: scaling of inputs and outputs; z is [x, u] after scaling.
+        activation: σ, a name as in `residual_network`, or a `SmoothRelu`.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -117,11 +117,11 @@ class ResidualNetwork(AbstractVectorField):
         return self.scaling.outputs(affine(self.weight_out, self.bias_out, self.activations(x, u)))
 
     def activations(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
-        """The hidden units in inference mode, on which the output layer is linear."""
+        """Return the hidden units in inference mode. The output layer is linear in them."""
         return function_of(self.activation)(self.norm.infer(self.weight_in, self.inputs(x, u)))
 
     def inputs(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
-        """z = [x, scaled u]."""
+        """Return z = [x, scaled u]."""
         if len(x) + len(u) != (size := self.weight_in.shape[1]):
             raise ValueError(f"x and u must have {size} entries in total, got {len(x)} and {len(u)}")
         return self.scaling.concatenate(x, u)
@@ -143,7 +143,7 @@ class ResidualNetwork(AbstractVectorField):
         return self.fused_with(jnp.zeros((len(self.weight_out), self.weight_in.shape[1]), self.weight_in.dtype)) or self
 
     def fused_with(self, linear: Float[Array, "d m"]) -> FusedNetwork | None:
-        """The sum of this network and a linear map of z as one module, or None if the normalisation is not affine.
+        """Return the sum of this network and a linear map of z as one module, or None if its norm is not affine.
 
         Args:
             linear: the map (d, m).
@@ -157,10 +157,10 @@ class ResidualNetwork(AbstractVectorField):
 
 
 class LinearResidual(AbstractVectorField):
-    """ẋ = W [x, u] + b: the simplest correction of another field.
+    """A linear residual, ẋ = W [x, u] + b: the simplest correction of another field.
 
     Attributes:
-        weight: W (d, n), with the n numbers of [x, u], in units of ẋ over theirs.
+        weight: W (d, n), for the n numbers of [x, u], in units of ẋ over theirs.
         bias: b (d,), in units of ẋ.
     """
 
@@ -208,19 +208,19 @@ def residual_network(
     outputs: int | None = None,
     activation: str = "relu",
 ) -> ResidualNetwork:
-    """A network with weights uniform in ±1/√fan_in, the paper's initialisation.
+    """Make a network with weights uniform in ±1/√fan_in, as in the paper.
 
     Args:
         state_size: d, the size of x.
         input_size: m, the size of u; may be 0.
-        hidden: number of hidden units; with little data you should choose few, for example 16.
-        scaling: by default set from the training windows by `hybrid_jax.fit`; see `standardise.with_scaling`.
+        hidden: number of hidden units. With few data you should choose few, for example 16.
+        scaling: scaling of inputs and outputs; by default `hybrid_jax.fit` sets it from the training windows.
         norm: normalisation of the hidden units: "batch", "layer" or "none".
         outputs: size of the output, by default `state_size`.
-        activation: "relu" (paper), or for solvers that need derivatives you should choose "softplus", "tanh" or "silu".
+        activation: "relu" (paper), "softplus", "tanh" or "silu". For solvers that use derivatives, choose a smooth one.
 
     Raises:
-        ValueError: an unknown norm or activation, sizes that are not positive integers, or no random key.
+        ValueError: if the norm or activation is unknown, a size is not a positive integer, or key is not a random key.
     """
     for name, chosen, known in (("norm", norm, NORMS), ("activation", activation, tuple(ACTIVATIONS))):
         if chosen not in known:  # it may not be hashable
@@ -251,7 +251,7 @@ def _weights(key: PRNGKeyArray, fan_in: int, hidden: int, outputs: int, norm: st
 
 
 def zero_output(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with all output layers and linear skip connections at zero; ValueError if it contains no network.
+    """Set all output layers and linear skip connections to zero; ValueError if the field contains no network.
 
     Args:
         field: a network, or a field that contains one.
@@ -274,7 +274,7 @@ def zero_output(field: AbstractVectorField) -> AbstractVectorField:
 
 
 def smoothed(field: AbstractVectorField, beta: float) -> AbstractVectorField:
-    """The field with `SmoothRelu` instead of ReLU; other activations stay. ValueError unless β > 0.
+    """Replace each ReLU of a field by `SmoothRelu`; other activations stay. ValueError unless β > 0.
 
     You should use this for solvers with second derivatives, which are zero for ReLU except at its kink. It changes the
     networks of this library, and modules with `jax.nn.relu` as a field, for example Equinox' MLP.

@@ -38,11 +38,11 @@ class AbstractScaling(eqx.Module):
 
 
 class InputScaling(AbstractScaling):
-    """u ↦ (u − offset) / scale, the same for all inputs; x and the output are not scaled. ValueError unless scale > 0.
+    """Scale all inputs alike, u ↦ (u − offset) / scale, but neither x nor the output. ValueError unless scale > 0.
 
     Attributes:
-        offset: subtracted from each input, in its unit.
-        scale: divisor of each input, in its unit.
+        offset: the number to subtract from each input, in its unit.
+        scale: the divisor of each input, in its unit.
     """
 
     offset: float = eqx.field(static=True, default=0.0)

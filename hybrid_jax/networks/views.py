@@ -87,26 +87,26 @@ def multirotor_network(
     scaling: AbstractScaling | None = None,
     linear: bool = False,
 ) -> AbstractVectorField:
-    """A residual network that reads and returns part of a multirotor's state; by default all of it (paper).
+    """Make a residual network that reads and returns parts of a multirotor's state; by default all of it (paper).
 
     Args:
-        vehicle: its number of rotors; for "near_ground" and "rotors" also where they are, and their radius.
-        inputs: what it reads besides u. "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw": p_z, the world's up in
-            the body frame Rᵀe_z, v and ω, in world axes, in which a wind keeps its direction when the vehicle yaws;
+        vehicle: the vehicle, for its number of rotors; "near_ground" and "rotors" need its geometry and rotor radius.
+        inputs: what the network reads besides u: "all" of x; "no_xy", all except p_x and p_y; "no_xy_yaw", p_z, the
+            up direction in the body frame Rᵀe_z, v and ω, so that a wind keeps its direction if the vehicle yaws;
             "near_ground", these and R / h of each rotor after p_z, in which ground effect is nearly linear (Cheeseman
-            and Bennett 1955); "body": p_z, the direction of gravity and Rᵀv [m/s] in the body frame, and ω;
-            "body_motion", Rᵀv, ω and Rᵀe_z, without the height, for flight away from the ground.
+            and Bennett 1955); "body", p_z, the direction of gravity and Rᵀv [m/s] in the body frame, and ω;
+            "body_motion", Rᵀv, ω and Rᵀe_z, without the altitude, for flight away from the ground.
         outputs: "all" 13 derivatives; "accelerations", v̇ and ω̇; "rotors", these and the thrust of each rotor by a
             second network (`RotorThrust`), initially zero; "motion", corrections of ṗ, of the body rates in q̇, of v̇
             and of ω̇, in the body frame.
-        hidden: units of each network.
+        hidden: number of hidden units of each network.
         norm: see `residual_network`.
         activation: see `residual_network`.
         scaling: see `residual_network`.
         linear: add a linear skip connection (`LinearSkip`); the output is then initially zero.
 
     Raises:
-        ValueError: an unknown name, incompatible outputs and inputs (see `GO_WITH`), or no rotor radius.
+        ValueError: if a name is unknown, outputs do not go with inputs (see `GO_WITH`), or there is no rotor radius.
     """
     _check(inputs, outputs, vehicle)
     rotors, writes = vehicle.rotors, OUTPUTS[outputs]

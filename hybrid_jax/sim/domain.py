@@ -23,10 +23,10 @@ _DERIVED: Any = None  # a default that depends on the vehicle
 
 
 class Quadrotor(eqx.Module):
-    """ẋ = f(x, u, t) of one vehicle under a sum of forces.
+    """The true dynamics ẋ = f(x, u, t) of a vehicle under a sum of forces.
 
     Attributes:
-        parameters: the vehicle's constants, as arrays that may be traced.
+        parameters: the vehicle's constants as arrays, which may be traced.
         forces: functions of `hybrid_jax.sim.forces`, or of your own, that add to thrust and gravity.
     """
 
@@ -34,7 +34,7 @@ class Quadrotor(eqx.Module):
     forces: tuple[Force, ...] = eqx.field(static=True)
 
     def derivative(self, x: State, u: Input, t: Scalar) -> State:
-        """ẋ for rotor speeds u [rad/s] at time t [s].
+        """Return ẋ for rotor speeds u [rad/s] at time t [s].
 
         Args:
             x: state (13,).
@@ -50,7 +50,7 @@ class Quadrotor(eqx.Module):
         return jnp.concatenate([x[VELOCITY], turning, scene.accelerations(self.parameters, x, u, applied)])
 
     def step(self, x: State, u: Input, t: Scalar, dt: Scalar | float) -> State:
-        """The state after dt [s] with constant u from time t on: one step of classical RK4.
+        """Return the state after dt [s] with constant u from time t on, by one step of classical RK4.
 
         Args:
             x: state (13,).
@@ -79,14 +79,14 @@ class Domain:
     """A simulated system: a vehicle and the forces on it beyond thrust and gravity.
 
     Attributes:
-        name: name of the system; flights depend on it.
+        name: name of the system. Simulated flights depend on it.
         vehicle: the true vehicle.
-        drag_coefficient: C_D [kg/s]; by default the Iris's, times the square of the size.
+        drag_coefficient: C_D [kg/s]; by default that of the Iris, scaled by the square of the vehicle's size.
         forces: functions of `hybrid_jax.sim.forces`, or of your own, that add to thrust and gravity.
         nominal: the vehicle that the pilot of random flights is tuned for; by default the true one.
 
     Raises:
-        ValueError: not a vehicle, a drag coefficient that is negative or not finite, or a force that is not a function.
+        ValueError: if the vehicle is invalid, the drag is negative or not finite, or a force is not a function.
     """
 
     name: str
@@ -107,11 +107,11 @@ class Domain:
             raise ValueError(f"forces must be a tuple of functions, got {checks.short_repr(self.forces)}")
 
     def quadrotor(self) -> Quadrotor:
-        """The dynamics of the system, in the current precision."""
+        """Return the dynamics of the system, in the current precision."""
         return Quadrotor(parameters_of(self.vehicle, self.drag_coefficient), self.forces)
 
     def describe(self) -> dict[str, Any]:
-        """Its fields as JSON values."""
+        """Return the attributes as JSON values."""
         return {
             "domain": self.name,
             "vehicle": asdict(self.vehicle),

@@ -36,11 +36,11 @@ SPARE = 2  # fly this many times the requested windows, so that few of those kep
 
 
 class Flights(NamedTuple):
-    """n flights of t decisions, float64.
+    """n simulated flights of t intervals, in float64.
 
     Attributes:
-        states: (n, t + 1, 13).
-        inputs: rotor speeds (n, t, rotors), held from one state to the next [rad/s].
+        states: states (n, t + 1, 13), as in `hybrid_jax.state`.
+        inputs: rotor speeds (n, t, rotors) [rad/s], held from one state to the next.
         lowest_rotor: altitude of the lowest rotor (n, t + 1) [m].
         start: time of the first state (n,) [s].
     """
@@ -58,12 +58,12 @@ def random_flights(domain: Domain, flights: int, seconds: float, key: PRNGKeyArr
 
     Args:
         domain: the simulated system.
-        flights: how many flights.
-        seconds: length of each [s].
+        flights: number of flights.
+        seconds: length of each flight [s].
         key: random key.
 
     Raises:
-        ValueError: flights or seconds are not positive, or key is not a random key.
+        ValueError: if flights or seconds are not positive, or key is not a random key.
     """
     checks.count("flights", flights)
     checks.positive("seconds", seconds)
@@ -116,11 +116,11 @@ def _fly_chunk(
 
 
 def gone_wrong(states: Float[Array | np.ndarray, "n t 13"], vehicle: Vehicle = IRIS) -> np.ndarray:
-    """Which flights (n,) of a vehicle diverged, left the arena, were too fast or crashed.
+    """Return which flights (n,) of a vehicle diverged, left the arena, were too fast or crashed.
 
     Args:
-        states: of n flights (n, t, 13).
-        vehicle: whose size sets the limits.
+        states: states (n, t, 13) of n flights.
+        vehicle: the vehicle, whose size sets the limits.
     """
     scale, altitude = pilot.scale_of(vehicle), states[..., POSITION][..., 2]
     far = np.linalg.norm(states[..., POSITION][..., :2], axis=-1) > MAX_DISTANCE * scale.length
@@ -131,11 +131,11 @@ def gone_wrong(states: Float[Array | np.ndarray, "n t 13"], vehicle: Vehicle = I
 
 @dataclass(frozen=True)
 class SplitSpec:
-    """The number of windows of a split, and of intervals of 0.01 s in each.
+    """The number of windows of a split, and their length.
 
     Attributes:
-        windows: windows of the split.
-        steps: intervals of each window.
+        windows: number of windows.
+        steps: number of intervals of 0.01 s in each window.
         flights: take the first windows of this many flights, in order; by default random windows of many flights.
     """
 
@@ -158,16 +158,16 @@ def make_dataset(
 ) -> Dataset:
     """Simulate flights until every split has its windows (float32). Splits share no flights.
 
-    A split depends on the domain's name, its own name and size and the seed, not on the other splits.
+    A split depends on the domain's name, on its own name and size, and on the seed, but not on the other splits.
 
     Args:
         domain: the simulated system.
-        splits: name → size of each split.
-        seed: of all random numbers, at least 0.
-        progress: called with the finished fraction of the work, 0 … 1.
+        splits: the size of each split, by its name.
+        seed: the seed of all random numbers, at least 0.
+        progress: a function that is called with the finished fraction of the work, 0 to 1.
 
     Raises:
-        ValueError: seed is negative, or no flight of this domain stays in bounds.
+        ValueError: if the seed is negative, or no flight of this domain stays in bounds.
     """
     checks.count("seed", seed, least=0)
     windows, tallies = {}, {}

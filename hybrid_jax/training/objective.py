@@ -81,7 +81,7 @@ class Objective(Protocol):
 
 @dataclass(frozen=True)
 class TrajectoryLoss(Objective):
-    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², mean over trajectories (paper, Sec. 3.3, Eq. 6), in training plus λ L_reg."""
+    """The default loss (paper, Eq. 6): L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², averaged over windows; λ L_reg in training."""
 
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
         return check(windows, name, missing=True)
