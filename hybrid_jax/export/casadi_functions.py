@@ -35,14 +35,14 @@ def casadi_function(
         dt: length of a step of RK4 with the input held [s], x⁺ = F(x, u); without it the function is ẋ.
         state_size: d; by default from the field's vehicle or its attribute of this name.
         input_size: m; by default from the field's vehicle or its attribute of this name.
-        name: of the function, as CasADi accepts it.
+        name: name of the CasADi function.
         smooth: β of ½ (z + √(z² + 1/β²)), which replaces the ReLU of networks (see `smoothed`). You should set it for
             solvers that use second derivatives, for example IPOPT.
 
     Raises:
-        ValueError: unknown sizes, more than 512 states, a field that does not accept such x and u, or an operation
-            that CasADi does not have, by its name.
-        ImportError: casadi is not installed.
+        ValueError: if sizes are unknown, there are more than 512 states, the field does not accept such x and u, or
+            CasADi does not have an operation.
+        ImportError: if casadi is not installed.
     """
     try:
         import casadi as ca

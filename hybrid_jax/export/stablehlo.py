@@ -27,14 +27,14 @@ BATCH = "b"  # name of the batch axis, whose length is symbolic
 
 @dataclass(frozen=True)
 class Program:
-    """ẋ = f(x, u), or x⁺ = F(x, u), read from a file; it works under `jax.jit`, not under `jax.vmap` or `jax.grad`.
+    """ẋ = f(x, u), or x⁺ = F(x, u), read from a file. You can use it under `jax.jit`, not `jax.vmap` or `jax.grad`.
 
     Attributes:
         dt: length of a step [s]; None for a field.
         state_size: d.
         input_size: m.
         batched: whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
-        platforms: platforms that can run it.
+        platforms: the platforms that can run it, for example "cpu".
         about: JSON values that describe the model.
     """
 
@@ -80,21 +80,21 @@ def export_program(
     """Write a field, or a step of it, in inference mode and single precision, to a file for `load_program`.
 
     Args:
-        path: of the file, an archive with the bytes of `jax.export.Exported.serialize`.
+        path: the file to write, an archive with the bytes of `jax.export.Exported.serialize`.
         field: ẋ = f(x, u), for one state x (d,) and one input u (m,).
         dt: length of a step of RK4 with the input held [s], x⁺ = F(x, u); without it ẋ is written.
         state_size: d; by default from the field's vehicle or its attribute of this name.
         input_size: m; by default from the field's vehicle or its attribute of this name.
         batched: take x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
-        platforms: a subset of PLATFORMS; each makes the file longer.
+        platforms: the platforms to export for, a subset of PLATFORMS; each makes the file longer.
         smooth: see `casadi_function`.
         about: JSON values to store with the program.
 
     Raises:
-        ValueError: unknown sizes, a field that does not accept such x and u, an unknown platform, `about` that is not
-            JSON, or a program with an external call, for example to LAPACK.
-        ImportError: flatbuffers is not installed (extra `export`).
-        OSError: the folder cannot be written.
+        ValueError: if sizes or a platform are unknown, the field does not accept such x and u, `about` is not JSON, or
+            the program has an external call, for example to LAPACK.
+        ImportError: if flatbuffers is not installed (extra `export`).
+        OSError: if the folder cannot be written.
     """
     if dt is not None:
         checks.positive("dt", dt, "a positive number of seconds")
@@ -116,14 +116,14 @@ def export_program(
 
 
 def load_program(path: str | Path) -> Program:
-    """Read a file of `export_program`; no Python of the file is run.
+    """Read a file of `export_program`. A file cannot run any Python code.
 
     Args:
-        path: of the file.
+        path: the file to read.
 
     Raises:
-        ValueError: the file is missing, damaged, not a program, or a program with an external call; one line.
-        ImportError: flatbuffers is not installed (extra `export`).
+        ValueError: if the file is missing, damaged, not a program, or has an external call.
+        ImportError: if flatbuffers is not installed (extra `export`).
     """
     _need_flatbuffers()
     metadata, arrays = load_archive(path, FORMAT)

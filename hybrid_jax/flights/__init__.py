@@ -2,7 +2,7 @@
 
     windows = hj.load_windows("flights/", hj.load_vehicle("vehicle.toml"), steps=10)  # one log of any format per flight
 
-Its steps can be taken one by one. Split by flight before cutting, since windows of one flight share samples and wind:
+You can also take each step yourself. Split by flight before cutting: windows of one flight share samples and wind.
 
     train, test = hold_out(load_logs("flights/"), ["flight_07"])
     windows = cut_windows(train, steps=10)

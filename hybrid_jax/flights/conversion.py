@@ -38,18 +38,18 @@ SINCE = {"vehicle_angular_velocity": (1, 10), "vehicle_acceleration": (1, 11), "
 
 
 def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] = ()) -> FlightLog:
-    """Resample a recording at intervals of dt [s] where all its signals exist; a gap in one is a gap in all.
+    """Resample a recording at intervals of dt [s] while all its signals exist; a gap in one is a gap in all.
 
     States are interpolated linearly and attitudes spherically; rotor speeds are averaged over each interval.
 
     Args:
         recording: the log as it was read.
-        dt: interval of the samples [s].
+        dt: interval between samples [s].
         polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, of commands as shares from 0 to 1; not needed where
             speeds were measured, but then preferred to speeds that are slower than commands.
 
     Raises:
-        ValueError: a quantity is missing, or the signals have no time in common.
+        ValueError: if a quantity is missing, or the signals have no time in common.
     """
     checks.positive("dt", dt, "a positive number of seconds")
     if missing := missing_states(recording):

@@ -60,10 +60,10 @@ def load_log(
         polynomial: see `load_windows`.
         topics: see `load_windows`.
         motor_order: see `load_windows`.
-        dt: sample interval [s] if the signals have their own times, by default 0.01; otherwise ignored.
+        dt: interval between samples [s] if the signals have times of their own, by default 0.01; otherwise ignored.
 
     Raises:
-        ValueError: the log is invalid: file, row, field and what to do.
+        ValueError: if the log is invalid, with file, row, field and what to do.
     """
     return flight_at(read_recording(path, columns, topics, motor_order), dt, polynomial)
 
@@ -90,11 +90,11 @@ def load_logs(
         motor_order: see `load_windows`.
         dt: see `load_windows`.
         cleaning: changes to every log, by default none.
-        vehicle: constants that you expect; without it, motors are not checked.
+        vehicle: the expected vehicle. Without it the motors are not checked.
         failed: whether a failed check raises an error ("refuse") or warns ("warn").
 
     Raises:
-        ValueError: the folder has no logs, or one of them is invalid: file, row, field and what to do.
+        ValueError: if the folder has no logs, or one of them is invalid, with file, row, field and what to do.
     """
     if failed not in (known := get_args(Failed)):
         raise ValueError(f"failed must be one of {', '.join(known)}, got {failed!r}")
@@ -153,13 +153,13 @@ def _head(path: str | Path, unpack: bool = True) -> bytes:
 
 
 def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
-    """List the logs of a folder in alphabetical order, and its other files with why they are skipped.
+    """List the logs of a folder in alphabetical order, and its other files with the reasons for skipping them.
 
     Args:
-        folder: folder of logs; hidden files are ignored, and a ROS bag is one log.
+        folder: folder of logs. Hidden files are ignored, and a ROS bag is one log.
 
     Raises:
-        ValueError: the folder does not exist.
+        ValueError: if the folder does not exist.
     """
     folder, logs, left = Path(folder), [], {}
     if not folder.is_dir():
@@ -190,7 +190,7 @@ def read_recording(
         motor_order: index in the log of each rotor's motor; by default the vehicle's order.
 
     Raises:
-        ValueError: the log is invalid: file, topic or column, time and what was expected.
+        ValueError: if the log is invalid, with file, topic or column, time and what was expected.
     """
     column_map = load_column_map(columns) if columns is not None else None
     kind, why = format_of(path)

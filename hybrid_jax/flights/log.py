@@ -18,16 +18,16 @@ JITTER = 0.1  # relative deviation from the median interval that still counts as
 
 @dataclass(frozen=True)
 class FlightLog:
-    """n samples of one flight; quaternions are normalised and their signs made continuous, the first with w ≥ 0.
+    """n samples of one flight. Quaternions become unit length and continuous in sign, with w ≥ 0 in the first.
 
     Attributes:
         t: time of each sample [s], strictly increasing.
-        x: state at that time, as in `hybrid_jax.state`: z up, forward-left-up, SI.
-        u: rotor speeds, constant from this sample to the next [rad/s].
+        x: state (n, 13) at that time, as in `hybrid_jax.state`: z up, forward-left-up, SI units.
+        u: rotor speeds (n, rotors) [rad/s], constant from this sample to the next.
         name: name of the flight in messages and reports, usually its file.
 
     Raises:
-        ValueError: shapes are inconsistent, or a sample is impossible.
+        ValueError: if shapes do not agree, or a sample is impossible.
     """
 
     t: Float[np.ndarray, " n"] = field(repr=False)
@@ -58,10 +58,10 @@ class FlightLog:
 
     @property
     def dt(self) -> float:
-        """Median interval between samples [s], rounded to nanoseconds so that logs of one rate agree.
+        """The median interval between samples [s], rounded to nanoseconds so that logs of one rate agree.
 
         Raises:
-            ValueError: the log has fewer than two samples.
+            ValueError: if the log has fewer than two samples.
         """
         if len(self) < 2:
             raise ValueError(f"{self.name}: {len(self)} samples have no interval")

@@ -31,10 +31,10 @@ def axes_of(quantity: str, count: int) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Recording(Record):
-    """The signals of one log by `QUANTITIES`; for its attributes see `hybrid_jax.records.Record`.
+    """The signals of one log, named by `QUANTITIES`. For the attributes see `hybrid_jax.records.Record`.
 
     Raises:
-        ValueError: a quantity or axis is unknown.
+        ValueError: if a quantity or axis is unknown.
     """
 
     def __post_init__(self):
@@ -47,6 +47,6 @@ class Recording(Record):
 
     @property
     def rotors(self) -> int:
-        """Number of rotors that were commanded or measured; 0 if none."""
+        """The number of rotors that were commanded or measured."""
         found = [len(self.signals[name].axes) for name in ROTOR_UNITS if name in self.signals]
         return max(found, default=0)

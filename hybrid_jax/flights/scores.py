@@ -20,7 +20,7 @@ Errors = Float[Array | np.ndarray, "*n"]
 
 
 class FlightErrors(NamedTuple):
-    """Magnitudes of the errors of predicted states.
+    """The sizes of the errors of predicted states, each (n, t) for n windows of t intervals.
 
     Attributes:
         position: norm of the error [m].
@@ -43,14 +43,14 @@ def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"
 
 
 def flight_errors(field: AbstractVectorField, windows: Trajectories) -> FlightErrors:
-    """Compute the errors (n, t) of a field in inference mode at the end of every interval of every window.
+    """Predict each window with a field in inference mode, and return the errors at the end of each interval.
 
     Args:
         field: the model.
-        windows: true states and inputs; the first 13 numbers of a state are as in `hybrid_jax.state`.
+        windows: measured states and inputs; the first 13 numbers of a state are as in `hybrid_jax.state`.
 
     Raises:
-        ValueError: the windows are malformed, or their states are not a multirotor's.
+        ValueError: if the windows are malformed, or their states are not a multirotor's.
     """
     if check(windows, "windows").x.shape[-1] < STATE_SIZE:
         raise ValueError(f"windows: states of {STATE_SIZE} expected, as in state.py, got {windows.x.shape[-1]}")

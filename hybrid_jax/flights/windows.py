@@ -37,17 +37,17 @@ def load_windows(
 ) -> Trajectories:
     """Read all logs of a folder, check them against the vehicle and cut them into windows.
 
-    Windows never cross a gap or a repeated sample. You get a one-line warning for each check that warns. The model
-    assumes constant motors in each interval: faster motor signals are averaged, and you are warned if they were
-    undersampled.
+    Windows never cross a gap or a repeated sample. You get a warning of one line for each check that warns. Motors are
+    constant in each interval of a window, so faster motor signals are averaged, and you get a warning if they were
+    sampled too slowly.
 
     Args:
-        folder: folder with one log per flight, of any format of `read_recording`; other files are ignored.
-        vehicle: constants for the checks.
+        folder: folder with one log per flight, in any format that `read_recording` reads; other files are ignored.
+        vehicle: the vehicle to check the logs against.
         dt: interval [s] to which logs of other intervals are resampled; by default all logs must share one, and those
             whose signals have times of their own get 0.01.
-        steps: intervals per window.
-        stride: samples between the starts of two windows.
+        steps: number of intervals in each window.
+        stride: number of samples between the starts of two windows.
         columns: TOML file that names the columns of CSV logs, see `hybrid_jax.flights.formats.column_map`; by default
             the library's columns and units.
         polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for logs with commands (0 to 1) but no speeds.
@@ -61,7 +61,7 @@ def load_windows(
         Windows in float32: x0 (n, 13), u (n, steps, rotors) [rad/s], x (n, steps, 13), as in `hybrid_jax.state`.
 
     Raises:
-        ValueError: a file or argument is invalid.
+        ValueError: if a file or argument is invalid.
     """
     checks.count("steps", steps)
     checks.count("stride", stride)
@@ -86,15 +86,15 @@ def manoeuvre_of(log: FlightLog) -> str:
 
 
 def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[FlightLog], str] = flight_of) -> Split:
-    """Split flights into training flights and held-out flights.
+    """Split flights into those for training and those that are held out.
 
     Args:
         logs: the flights.
-        names: names of the flights to hold out.
-        of: function that names a flight: `flight_of`, `manoeuvre_of` or your own.
+        names: the names of the flights to hold out.
+        of: function that names a flight, for example `flight_of` or `manoeuvre_of`.
 
     Raises:
-        ValueError: a name is unknown, or one side is empty.
+        ValueError: if a name is unknown, or one side is empty.
     """
     known = sorted({of(log) for log in logs})
     for name in names:
@@ -110,16 +110,16 @@ def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[Flig
 def folds(
     logs: Sequence[FlightLog], count: int | None = None, of: Callable[[FlightLog], str] = flight_of, seed: int = 0
 ) -> list[Split]:
-    """Make splits in which each flight is held out once, together with all flights of its name.
+    """Split flights several times, so that each is held out once, together with all flights of its name.
 
     Args:
         logs: the flights.
-        count: number of splits; by default one per name.
-        of: function that names a flight: `flight_of`, `manoeuvre_of` or your own.
-        seed: seed for assigning names to splits.
+        count: number of splits; by default one for each name.
+        of: function that names a flight, for example `flight_of` or `manoeuvre_of`.
+        seed: random seed for assigning names to splits.
 
     Raises:
-        ValueError: count is less than 2 or more than the number of names.
+        ValueError: if count is less than 2 or more than the number of names.
     """
     names = sorted({of(log) for log in logs})
     count = len(names) if count is None else count
@@ -154,7 +154,7 @@ def sequences(logs: Sequence[FlightLog], steps: int) -> list[Trajectories]:
 
 
 def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: int | None = None) -> Trajectories:
-    """Cut logs into windows of `steps` intervals without gaps; logs shorter than a window are left out.
+    """Cut logs into windows of `steps` intervals without gaps. Logs shorter than a window are skipped.
 
     Args:
         logs: evenly sampled flights.
@@ -166,7 +166,7 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: in
         Windows in float32, ordered by flight.
 
     Raises:
-        ValueError: all logs are shorter than a window, or samples are not evenly spaced.
+        ValueError: if all logs are shorter than a window, or samples are not evenly spaced.
     """
     parts = []
     for log in require_length(logs, steps):

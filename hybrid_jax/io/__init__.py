@@ -1,4 +1,4 @@
-"""Models and datasets as files with data and no code, written atomically and verified by a checksum."""
+"""Save and load models and datasets. Files hold data and no code, and a checksum finds damage."""
 
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.models import Model, check_savable, load, save

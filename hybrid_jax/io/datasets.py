@@ -22,11 +22,11 @@ ARRAYS = ("x0", "u", "x")
 
 @dataclass(frozen=True)
 class Dataset:
-    """Windows by the name of their split.
+    """Windows in splits, with metadata.
 
     Attributes:
-        splits: the windows of each split by its name, for example "train".
-        metadata: JSON values. Its entry `config` determines the windows; other entries describe them, e.g. versions.
+        splits: the windows of each split, by its name, for example "train".
+        metadata: JSON values. The entry `config` determines the windows; others describe them, for example versions.
     """
 
     splits: Mapping[str, Trajectories]
@@ -42,13 +42,13 @@ def save_dataset(path: str | Path, dataset: Dataset) -> None:
     """Write a dataset atomically. A file with the same windows and configuration is left unchanged.
 
     Args:
-        path: of the file to write.
+        path: the file to write.
         dataset: the windows and their metadata.
 
     Raises:
-        ValueError: malformed windows, windows of a vehicle without unit quaternions, metadata that are not JSON, or a
-            file with other content.
-        OSError: the file cannot be written.
+        ValueError: if windows are malformed or have quaternions that are not of unit length, metadata are not JSON, or
+            the file exists with other content.
+        OSError: if the file cannot be written.
     """
     path = Path(path)
     _check_splits(path, dataset)
@@ -66,12 +66,12 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
     """Read and verify a dataset.
 
     Args:
-        path: of a file that `save_dataset` wrote.
+        path: a file that `save_dataset` wrote.
         expected_config: entries that the configuration must contain; None for no condition.
 
     Raises:
-        ValueError: the file is missing, damaged or not a dataset, or has another configuration; one line with the file
-            and every entry that differs.
+        ValueError: if the file is missing, damaged or not a dataset, or has another configuration. The message lists
+            each entry that differs.
     """
     header, arrays = load_archive(path, FORMAT)
     try:

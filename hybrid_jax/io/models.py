@@ -24,7 +24,7 @@ FORMAT = "hybrid_jax model 2"
 
 @dataclass(frozen=True)
 class Model:
-    """A vector field and its metadata.
+    """A saved model: a vector field and its metadata.
 
     Attributes:
         field: the vector field ẋ = f(x, u), or any other Equinox module that was saved.
@@ -37,9 +37,9 @@ class Model:
     def predict(
         self, x0: Float[Array | np.ndarray, "*n d"], u: Float[Array | np.ndarray, "*n t m"], dt: float
     ) -> Float[Array, "*n t d"]:
-        """The state of one window, or of n, at the end of each interval, under piecewise constant inputs.
+        """Predict the state at the end of each interval, for one window or for n, under piecewise constant inputs.
 
-        To keep the other windows if some diverge, use `rollout_batch` instead.
+        If some windows may diverge and you need the others, use `rollout_batch` instead.
 
         Args:
             x0: the initial state of each window.
@@ -47,7 +47,7 @@ class Model:
             dt: length of an interval [s].
 
         Raises:
-            ValueError: shapes do not agree or do not fit the model, a number is not finite, dt is not positive, an
+            ValueError: if shapes do not agree or do not fit the model, a number is not finite, dt is not positive, an
                 initial quaternion is not of norm 1, or a prediction diverges.
         """
         if not callable(self.field):
@@ -66,19 +66,19 @@ class Model:
 
 
 def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = None) -> None:
-    """Write a model to one file: any Equinox module, and JSON values `about` it.
+    """Save a model, any Equinox module, to one file, with JSON values `about` it.
 
-    Warns if you will need `like` in `load`, because the file is not enough to rebuild the model; see `check_savable`.
+    You get a warning if `load` will need `like`, because the file is not enough to rebuild the model.
 
     Args:
-        path: of the file to write; an existing file is replaced.
+        path: the file to write; an existing file is replaced.
         field: the model. You should define its classes in a module that you can import.
         about: JSON values, which `load` returns with the field.
 
     Raises:
-        ValueError: `about` is not JSON, or the field contains an object, named by its path, other than an array,
-            number, text, function, container or module.
-        OSError: the file cannot be written.
+        ValueError: if `about` is not JSON, or the field contains an object other than an array, number, text, function,
+            container or module.
+        OSError: if the file cannot be written.
     """
     about = {} if about is None else about
     checks.instance("about", about, Mapping)
@@ -95,13 +95,13 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
     """Read a model that `save` wrote. You should import the modules that define its classes first.
 
     Args:
-        path: of the file.
-        like: a field of the same structure, whose arrays are replaced by those in the file. Needed for classes and
+        path: the file to read.
+        like: a field of the same structure, whose arrays are replaced by those in the file. You need it for classes and
             functions that the file cannot name, for example local classes and lambdas.
 
     Raises:
-        ValueError: the file is missing, damaged or not a model; it refers to an unknown class or function; an array is
-            not finite, or not of the type and shape that its class declares; or the file does not fit `like`.
+        ValueError: if the file is missing, damaged or not a model, a class or function is unknown, an array is not
+            finite or not of the type and shape that its class declares, or the file does not fit `like`.
     """
     metadata, arrays = load_archive(path, FORMAT)
     try:
@@ -138,7 +138,7 @@ def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
 
 
 def check_savable(field: Any) -> str | None:
-    """Why `load` cannot rebuild this field from its file without `like`, or None if it can.
+    """Return why `load` cannot rebuild this field from its file without `like`, or None if it can.
 
     Args:
         field: the model to save.

@@ -55,17 +55,17 @@ def portable(item: Item, *, name: str | None = None) -> Item: ...
 @overload
 def portable(item: None = None, *, name: str | None = None) -> Callable[[Item], Item]: ...
 def portable(item: Any = None, *, name: str | None = None) -> Any:
-    """Decorator: saved models refer to this class or function by `name`, and not by its module.
+    """Decorate a class or function so that saved models refer to it by `name` instead of by its module.
 
-    An Equinox module needs no decorator unless you move it to another module. A function in a field, or a dataclass
-    other than an Equinox module, needs it to be loaded without `like`.
+    An Equinox module needs this only if you want to move it to another module. A function in a field, or a dataclass
+    that is not an Equinox module, needs it to be loaded without `like`.
 
     Args:
         item: the class or function. Without it, as in `@portable(name="mine")`, the result is the decorator.
-        name: in files, by default its own; must be unique.
+        name: the unique name in files; by default its own.
 
     Raises:
-        ValueError: another class or function already has the name.
+        ValueError: if another class or function already has the name.
     """
     if item is None:
         return partial(portable, name=name)

@@ -24,10 +24,10 @@ WIDTH = {"cpu": 1}  # one lane fills the cache; on a GPU a chunk holds all lanes
 
 
 def stack(lanes: Sequence[PyTree]) -> PyTree:
-    """One tree whose arrays have a first axis over the lanes; ValueError if other leaves, e.g. Python numbers, differ.
+    """Stack trees along a new first axis over the lanes; ValueError if other leaves, for example floats, differ.
 
     Args:
-        lanes: trees of one structure, one for each lane.
+        lanes: one tree for each lane, all of the same structure.
     """
 
     def stacked(*leaves):
@@ -41,11 +41,11 @@ def stack(lanes: Sequence[PyTree]) -> PyTree:
 
 
 def lane(lanes: PyTree, index: int | np.ndarray) -> PyTree:
-    """The lane, or lanes, at an index of the first axis.
+    """Return the lane, or the lanes, at an index of the first axis.
 
     Args:
         lanes: a tree whose arrays have a first axis over the lanes.
-        index: number of a lane, from 0, or an array of indices or booleans.
+        index: the number of a lane, from 0, or an array of indices or booleans.
     """
     # asarray: an entry of a NumPy vector is a scalar
     return jax.tree.map(lambda leaf: np.asarray(leaf[index]) if eqx.is_array(leaf) else leaf, lanes)
@@ -117,11 +117,11 @@ class LaneMap:
         return lane(results, np.array([where[i] for i in active], int))
 
     def schedule(self, total: int, costs: Numbers, active: Numbers) -> tuple[list[np.ndarray], int, int]:
-        """Each device's shard, the width of a chunk, and the capacity of a device in chunks.
+        """Return each device's shard, the width of a chunk, and the number of chunks of a device.
 
         Args:
             total: the number of lanes.
-            costs: expected work of each lane, in any unit.
+            costs: the expected work of each lane, in any unit.
             active: indices of the active lanes.
         """
         devices = len(self.devices)

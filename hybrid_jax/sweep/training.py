@@ -31,13 +31,13 @@ class Progress:
     """The state of a sweep after a block of epochs.
 
     Attributes:
-        active: lanes that are still training.
-        lanes: all lanes.
-        epochs: the most epochs that a lane has completed.
-        best: the smallest validation L_MSE of any lane.
-        at_least: epochs that some active lane still needs.
-        at_most: epochs that some active lane may still need.
-        seconds: since the sweep began [s].
+        active: number of lanes that are still training.
+        lanes: number of all lanes.
+        epochs: largest number of epochs that a lane has completed.
+        best: smallest validation L_MSE of any lane.
+        at_least: number of epochs that some active lane still needs.
+        at_most: number of epochs that some active lane may still need.
+        seconds: time since the sweep began [s].
     """
 
     active: int
@@ -62,19 +62,19 @@ def sweep(
     block_seconds: float = 4.0,
     on_block: Callable[[FitState, Progress], None] | None = None,
 ) -> FitState:
-    """Train every lane until it stops. If all have stopped already, the program is compiled and nothing is trained.
+    """Train each lane until it stops. If all have stopped already, the program is compiled and nothing is trained.
 
     Args:
-        validation: the windows for early stopping.
+        validation: windows for early stopping, shared by all lanes.
         settings: see `fit`; the same for all lanes.
         states: stacked initial states, one for each lane (`fitting.start`, `lanes.stack`).
         plans: stacked run configurations, one for each lane.
-        train: the windows that `plans` index into; shared by all lanes, as `validation` is.
-        min_capacity: least numbers of lanes and training windows to compile for. Smaller sweeps are padded and share
-            the program; padding of lanes needs a fixed width (see `LaneMap`).
-        width: lanes in a chunk; see `LaneMap`. On a GPU, you should lower it if a sweep does not fit into memory.
+        train: the windows that `plans` index into, shared by all lanes.
+        min_capacity: the smallest numbers of lanes and training windows to compile for. Smaller sweeps are padded and
+            share the program; padding of lanes needs a fixed width (see `LaneMap`).
+        width: number of lanes in a chunk; see `LaneMap`. You should lower it if a GPU has too little memory.
         block_seconds: approximate duration of a block of epochs, after which finished lanes are dropped.
-        on_block: called after each block with all states and the progress.
+        on_block: a function that is called after each block with all states and the progress.
 
     Returns:
         The stacked final states as host arrays. A lane whose loss was not finite has status DIVERGED and the best epoch
@@ -82,7 +82,7 @@ def sweep(
         its rounding.
 
     Raises:
-        ValueError: invalid data, an n_train that does not fit them, or a minibatch of one window with a BatchNorm.
+        ValueError: if data are invalid, n_train does not fit them, or a BatchNorm has minibatches of one window.
     """
     states, plans = jax.device_get((states, plans))
     shared = settings.objective.prepare(train, "train"), settings.objective.prepare(validation, "validation")
@@ -112,14 +112,14 @@ def sweep(
 def evaluate(
     fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
 ) -> Float[np.ndarray, " lanes"]:
-    """L_MSE of each lane's field in inference mode on every `every`-th state; compiled for at least `min_lanes`.
+    """Compute L_MSE of each lane's field in inference mode.
 
     Args:
         fields: stacked fields, one for each lane.
-        windows: shared by all lanes.
-        every: count the state after each so many intervals.
-        settings: for the solver.
-        min_lanes: least number of lanes to compile for.
+        windows: the windows to predict, shared by all lanes.
+        every: number of intervals from one compared state to the next.
+        settings: settings with the solver.
+        min_lanes: the smallest number of lanes to compile for.
     """
     return evaluate_windows(fields, windows, every, settings, min_lanes)[0]
 

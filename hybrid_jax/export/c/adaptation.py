@@ -28,14 +28,14 @@ def export_adaptation_c(
     state_size: Size = None,
     input_size: Size = None,
 ) -> tuple[Path, Path]:
-    """Write NAME.h and NAME.c: NAME_begin and NAME_update of an `OnlineAdaptation`, like its methods.
+    """Write the filter of an `OnlineAdaptation` as C99: NAME.h and NAME.c with NAME_begin and NAME_update.
 
-    It raises the errors of `export_c`.
+    The functions do what the methods of these names do. Errors are those of `export_c`.
 
     Args:
         folder: where the files are written; it is created if it does not exist.
-        adaptation: an `OnlineAdaptation`.
-        name: prefix of the files and definitions, see `export_c`.
+        adaptation: the filter.
+        name: name of the files and prefix of the definitions, see `export_c`.
         double: compute in double precision, else in single.
         state_size: d; by default from the filter's field.
         input_size: m; by default from the filter's field.

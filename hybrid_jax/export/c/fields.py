@@ -35,16 +35,16 @@ def export_c(
     state_size: Size = None,
     input_size: Size = None,
 ) -> tuple[Path, Path]:
-    """Write NAME.h and NAME.c: ẋ = f(x, u) in inference mode, a step of RK4 over dt [s], and the Jacobians of both.
+    """Write a field in inference mode as C99: ẋ = f(x, u), a step of RK4 over dt [s], and the Jacobians of both.
 
-    The functions are NAME_derivative, NAME_step, NAME_derivative_jacobian and NAME_step_jacobian; the header describes
-    their arguments. They are C99, use only the stack, and you can call them from several threads.
+    NAME.c has NAME_derivative, NAME_step, NAME_derivative_jacobian and NAME_step_jacobian, and NAME.h describes their
+    arguments. They use only the stack, and you can call them from several threads.
 
     Args:
         folder: where the files are written; it is created if it does not exist.
         field: ẋ = f(x, u), for one state x (d,) and one input u (m,).
         dt: length of a step [s].
-        name: of the files and, as a prefix, of all definitions in the header; a lower-case C identifier.
+        name: name of the files and prefix of all definitions in the header; a lower-case C identifier.
         double: compute in double precision, else in single.
         smooth: see `casadi_function`.
         state_size: d; by default from the field's vehicle or its attribute of this name.
@@ -54,9 +54,9 @@ def export_c(
         The paths of the header and of the source.
 
     Raises:
-        ValueError: unknown sizes, a field that does not accept such x and u, an operation without C code, by
-            its name, or a name that is not an identifier.
-        OSError: the folder cannot be written.
+        ValueError: if sizes are unknown, the field does not accept such x and u, an operation has no C code, or the
+            name is not an identifier.
+        OSError: if the folder cannot be written.
     """
     checks.positive("dt", dt, "a positive number of seconds")
     check_name(name)

@@ -16,7 +16,7 @@ TIME_CONSTANTS = (0.0, *np.geomspace(0.005, 0.2, 24).tolist())  # s
 
 @dataclass(frozen=True)
 class Cleaning:
-    """Changes to every log, in this order; by default none.
+    """The changes to make to each log, in this order; by default none.
 
     Attributes:
         in_flight: cut out the time on the ground: half a second or longer with hardly any thrust.
@@ -25,7 +25,7 @@ class Cleaning:
         delay: delay [s] to add to the motors: the gyro's lag that `check_log` reports.
 
     Raises:
-        ValueError: a number is out of range, or longest_gap is given without resample.
+        ValueError: if a number is out of range, or longest_gap is given without resample.
     """
 
     in_flight: bool = False
@@ -43,14 +43,14 @@ class Cleaning:
 
 
 def clean(log: FlightLog, cleaning: Cleaning) -> tuple[FlightLog, list[str]]:
-    """Apply some changes to a log and describe each in one line.
+    """Apply changes to a log. The second result describes each of them in one line.
 
     Args:
-        log: the log.
-        cleaning: the changes.
+        log: the log to change.
+        cleaning: the changes to make.
 
     Raises:
-        ValueError: a change is impossible.
+        ValueError: if a change is impossible.
     """
     resampling = cleaning.resample or log.dt, cleaning.longest_gap
     changes = ("in_flight", in_flight, ()), ("resample", resample, resampling), ("delay", delay, (cleaning.delay,))

@@ -59,11 +59,11 @@ class Check:
 
     Attributes:
         name: name of the check, for example the two records compared.
-        value: result in `unit`; NaN if the verdict is "cannot tell".
+        value: the result in `unit`; NaN if the verdict is "cannot tell".
         unit: unit of value and limit, for example "s" or "relative error".
-        limit: maximum of the value; for correlations, the minimum.
+        limit: the maximum of the value, or for correlations the minimum.
         verdict: "ok", "warns", "fails" or "cannot tell".
-        suggestion: what you should correct, if anything.
+        suggestion: what you should correct, if anything; for example the sign of an axis.
     """
 
     name: str
@@ -75,14 +75,14 @@ class Check:
 
 
 def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
-    """Check a log for consistency with itself and, if given, with its vehicle.
+    """Check whether a log is consistent with itself and, if you give one, with its vehicle.
 
     Args:
         log: the flight.
         vehicle: constants to compare the motion with.
 
     Raises:
-        ValueError: fewer than two samples, or the number of motors differs from the vehicle's.
+        ValueError: if there are fewer than two samples, or the number of motors is not the vehicle's.
     """
     if vehicle is not None and log.u.shape[1] != vehicle.rotors:
         found = f"{log.name}: has {log.u.shape[1]} motors, {vehicle.name} has {vehicle.rotors}"

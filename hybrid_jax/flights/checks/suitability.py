@@ -23,12 +23,12 @@ USED = ("position", "velocity", "body_velocity", "attitude", "rates")
 
 
 def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: float | None = None) -> list[Check]:
-    """Check the signals of a recording before interpolation.
+    """Check the signals of a recording before they are interpolated.
 
     Args:
         recording: the log as it was read.
-        vehicle: the expected vehicle; without it, rotor count and largest speed are not checked.
-        dt: intended sample interval [s]; without it, signal rates are not checked.
+        vehicle: the expected vehicle. Without it the number of rotors and the largest speed are not checked.
+        dt: the interval that you want between samples [s]. Without it the rates of signals are not checked.
     """
     damage, missing = recording.facts.get("damage", ""), missing_states(recording)
     motors = motors_of(recording) if recording.signals.keys() & ROTOR_UNITS.keys() else None
