@@ -36,11 +36,11 @@ class _Newton(optimistix.Newton):
 
 
 class RK4(diffrax.AbstractSolver):
-    """The classical fourth-order Runge–Kutta method (Kutta 1901), which diffrax does not ship; fixed steps only.
+    """The classical fourth-order Runge–Kutta method (Kutta 1901) with fixed steps, as a solver of diffrax.
 
     Attributes:
         scanned: whether its stages are a loop, which compiles faster (see `compact`). The result is the same.
-        substeps: steps in each interval; you should take more than one if one is not accurate, for example if stiff.
+        substeps: number of steps in each interval. Take more if one is not accurate, for example if stiff.
     """
 
     scanned: bool = False
@@ -167,17 +167,16 @@ def rollout(
     dt: float,
     solver: Solver | None = None,
 ) -> Float[Array, "t d"]:
-    """The trajectory of a field in inference mode: x[i] is the state (i + 1) dt after x0, u[i] the input before it.
+    """Integrate a field in inference mode: x[i] is the state (i + 1) dt after x0, and u[i] the input before it.
 
-    For more than a thousand intervals, attitudes in the field's state space are normalised after each one. A
-    trajectory that diverges continues as infinity or NaN, as does one in which an implicit solver finds no step;
-    `Model.predict` raises instead.
+    A trajectory continues as infinity or NaN if it diverges, or if an implicit solver finds no step; `Model.predict`
+    raises an error instead. If there are more than a thousand intervals, attitudes are normalised after each.
 
     Args:
         field: ẋ = f(x, u), a vector field or any function of a state (d,) and an input (m,).
         x0: the initial state (d,).
         dt: length of an interval [s].
-        solver: a one-step ODE solver of diffrax; by default `RK4`, which can take several steps per interval.
+        solver: a one-step ODE solver of diffrax; by default `RK4`, for example `RK4(substeps=4)`.
 
     Raises:
         ValueError: an argument has the wrong shape or type, or is not finite; dt is not positive; the solver is
@@ -204,7 +203,7 @@ def rollout_batch(
     dt: float,
     solver: Solver | None = None,
 ) -> Float[Array, "n t d"]:
-    """`rollout` of each of n windows.
+    """Integrate a field over each of n windows; see `rollout`.
 
     Args:
         field: ẋ = f(x, u); see `rollout`.

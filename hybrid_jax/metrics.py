@@ -15,7 +15,7 @@ CHUNK = 1000  # windows predicted at once
 
 
 def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:
-    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window; ValueError if the shapes differ or there is no state.
+    """Compute L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window; ValueError if shapes differ or there is no state.
 
     Numbers that were not measured, NaN in `truth`, count as no error.
 
@@ -32,16 +32,16 @@ def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Flo
 def rollout_mse(
     field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None
 ) -> Float[Array, ""]:
-    """L_MSE of a field in inference mode, mean over windows, on every `every`-th state; not finite if it diverges.
+    """Compute L_MSE of a field in inference mode, averaged over windows; it is not finite if a rollout diverges.
 
     Args:
         field: ẋ = f(x, u), evaluated in inference mode.
         windows: the windows, each predicted from its initial state.
-        every: count the state after each so many intervals.
+        every: number of intervals from one compared state to the next.
         solver: a one-step method of diffrax; by default `RK4`.
 
     Raises:
-        ValueError: malformed windows, windows that do not match the field, or an `every` beyond their horizon.
+        ValueError: if windows are malformed or do not match the field, or `every` is beyond their horizon.
     """
     return jnp.mean(window_mse(field, windows, every, solver))
 
@@ -49,12 +49,12 @@ def rollout_mse(
 def window_mse(
     field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None
 ) -> Float[Array, " n"]:
-    """L_MSE of each window; see `rollout_mse`.
+    """Compute L_MSE of each window; see `rollout_mse`.
 
     Args:
         field: ẋ = f(x, u), evaluated in inference mode.
         windows: n windows.
-        every: intervals between two states that count.
+        every: number of intervals from one compared state to the next.
         solver: by default `RK4`.
     """
     windows = continuous(field, check(windows, "windows", missing=True))

@@ -16,16 +16,16 @@ Between = Literal["held", "linear", "averaged"]
 
 @dataclass(frozen=True)
 class Signal:
-    """n samples of one quantity.
+    """The n samples of one quantity.
 
     Attributes:
         t: time of each sample [s], strictly increasing, from the start of the record.
-        values: one column for each of `axes`, in SI units.
-        axes: names of the measured axes; by default "0", "1", …
-        source: topic, group or columns that it came from, for messages.
+        values: the samples (n, k) in SI units, with a column for each axis.
+        axes: the names of the measured axes; by default "0", "1", …
+        source: the topic, group or columns that it came from, for messages.
 
     Raises:
-        ValueError: inconsistent shapes, values that are not finite, or times that do not increase (with their source).
+        ValueError: if shapes do not agree, a value is not finite, or times do not increase.
     """
 
     t: Float[np.ndarray, " n"] = field(repr=False)
@@ -57,7 +57,7 @@ class Signal:
         return float(np.median(np.diff(self.t))) if len(self) > 1 else np.inf
 
     def gaps(self) -> list[tuple[float, float]]:
-        """Start and end [s] of each interval without samples."""
+        """Return start and end [s] of each interval without samples."""
         missing = np.flatnonzero(np.diff(self.t) > GAP * self.interval)
         return [(float(self.t[i]), float(self.t[i + 1])) for i in missing]
 
@@ -68,9 +68,9 @@ class Record:
 
     Attributes:
         name: what messages call the experiment, usually its file.
-        signals: by name; signals that were not measured are absent.
+        signals: the signals, by name. A signal that was not measured is absent.
         notes: what a reader omitted or had to assume, one sentence each.
-        facts: metadata of a log for reports and checks, for example {"airframe": "4001"}.
+        facts: metadata of the log, for example {"airframe": "4001"}.
     """
 
     name: str
@@ -80,11 +80,11 @@ class Record:
 
     @classmethod
     def of(cls, name: str = "record", **signals: tuple) -> "Record":
-        """A record of arrays, for example `Record.of("run 1", torque=(t, torque), angle=(t_angle, angle))`.
+        """Make a record of arrays, for example `Record.of("run 1", torque=(t, torque), angle=(t_angle, angle))`.
 
         Args:
             name: what messages call the experiment.
-            signals: times [s] (n,) and values (n,) or (n, k) of each signal. Samples with a NaN are left out.
+            signals: the times [s] (n,) and values (n,) or (n, k) of each signal. Samples with NaN are left out.
 
         Raises:
             ValueError: see `Signal`.
@@ -98,11 +98,11 @@ class Record:
 
     @property
     def duration(self) -> float:
-        """Length [s] of the longest signal, from its first to its last sample."""
+        """The length [s] of the longest signal, from its first to its last sample."""
         return max((float(signal.t[-1] - signal.t[0]) for signal in self.signals.values() if len(signal)), default=0.0)
 
     def part(self, begin: float, end: float) -> Self:
-        """The samples between two times; times are not shifted.
+        """Return the samples between two times; times are not shifted.
 
         Args:
             begin: the first time [s].

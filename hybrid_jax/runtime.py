@@ -51,13 +51,13 @@ def configure(folder: Path | None = None) -> None:
     """Configure JAX. Call this before you create the first array; afterwards devices and XLA options cannot change.
 
     Args:
-        folder: cache of compiled programs, by default `programs` in the user's cache folder for hybrid_jax.
+        folder: folder for compiled programs, by default `programs` in the user's cache folder for hybrid_jax.
             JAX_COMPILATION_CACHE_DIR takes precedence. Old programs are deleted only in the default folder.
 
     Warns if JAX has already started: its devices and XLA options stay as they are, and the rest is set.
 
     Raises:
-        ValueError: the folder cannot be written.
+        ValueError: if the folder cannot be written.
     """
     default = Path(platformdirs.user_cache_dir("hybrid_jax")) / "programs"
     programs = Path(os.environ.get(PROGRAMS) or folder or default)

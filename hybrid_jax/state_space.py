@@ -16,18 +16,18 @@ Change = Float[Array, " e"]  # of a state or a quantity, in the tangent space
 
 @dataclass(frozen=True)
 class Quantity:
-    """Numbers of a state that form one vector; write a subclass for a manifold of your own.
+    """Numbers of a state that form one vector. You can write a subclass for a manifold of your own.
 
     Attributes:
-        name: for example "velocity".
-        size: how many numbers of the state it has.
-        unit: of its numbers, for example "m/s"; empty without a unit.
-        labels: a short name of each number, for example ("vx", "vy", "vz"); empty to use their indices.
-        scale: a typical small difference of the quantity (norm), in its unit.
+        name: its name, for example "velocity".
+        size: the number of entries of the state that it has.
+        unit: the unit of its entries, for example "m/s"; empty without a unit.
+        labels: a short name of each entry, for example ("vx", "vy", "vz"); empty to use their indices.
+        scale: the norm of a typical small difference of the quantity, in its unit.
         uniform: whether its numbers are one quantity at many points, so that a constant disturbance is one number.
 
     Raises:
-        ValueError: the size is not a count, or the number of labels differs from it.
+        ValueError: if the size is not a count, or the number of labels differs from it.
     """
 
     name: str
@@ -49,11 +49,11 @@ class Quantity:
 
     @property
     def is_vector(self) -> bool:
-        """Whether changes are added and differences subtracted."""
+        """Whether you add a change and subtract values, as in a vector space."""
         return type(self) is Quantity
 
     def retract(self, x: Float[Array, " n"], change: Change) -> Float[Array, " n"]:
-        """The value after a change.
+        """Return the value after a change.
 
         Args:
             change: a tangent vector at x.
@@ -61,7 +61,7 @@ class Quantity:
         return x + change
 
     def difference(self, y: Float[Array, " n"], x: Float[Array, " n"]) -> Change:
-        """The change that leads from x to y: `retract(x, difference(y, x))` is y.
+        """Return the change that leads from x to y: `retract(x, difference(y, x))` is y.
 
         Args:
             y: the other value (n).
@@ -69,11 +69,11 @@ class Quantity:
         return y - x
 
     def normalise(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The usual representation of the value near x."""
+        """Return the usual representation of a value near x, for example a unit quaternion."""
         return x
 
     def nearest(self, x: Float[Array, " n"], to: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The representation of x that is nearest to another value's numbers.
+        """Return the representation of x that is nearest to another value's numbers.
 
         Args:
             to: the numbers of the other value (n).
@@ -81,7 +81,7 @@ class Quantity:
         return x
 
     def continuous(self, path: Float[np.ndarray, "t n"]) -> Float[np.ndarray, "t n"]:
-        """A sequence of values without jumps between representations.
+        """Return a sequence of values without jumps between representations.
 
         Args:
             path: values in the order of time (t, n).
@@ -89,7 +89,7 @@ class Quantity:
         return path
 
     def check(self, name: str, x: Numbers, part: slice) -> None:
-        """Require states in which this quantity is valid.
+        """Raise an error if this quantity is invalid in a state.
 
         Args:
             name: what the message calls the states.
@@ -97,13 +97,13 @@ class Quantity:
             part: which of their numbers belong to the quantity.
 
         Raises:
-            ValueError: a state is invalid.
+            ValueError: if a state is invalid.
         """
 
 
 @dataclass(frozen=True)
 class Angle(Quantity):
-    """Angles [rad] modulo whole turns."""
+    """Angles [rad], of which whole turns do not matter."""
 
     unit: str = "rad"
 
@@ -167,7 +167,7 @@ class StateSpace:
 
     @property
     def size(self) -> int:
-        """d; 0 if nothing is known about the state."""
+        """The size d of a state; 0 if nothing is known about it."""
         return sum(quantity.size for quantity in self.quantities)
 
     @property
@@ -178,7 +178,7 @@ class StateSpace:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """A name for each number of the state: its label or its index."""
+        """The name of each number of the state: its label or its index."""
         return tuple(
             one.labels[i - part.start] if one.labels else str(i)
             for part, one in self.parts
@@ -196,10 +196,10 @@ class StateSpace:
         return sum(quantity.tangent_size for quantity in self.quantities)
 
     def padded(self, d: int) -> "StateSpace":
-        """This space extended to d numbers by quantities x[i]; only these if d is too small.
+        """Return this space, extended to d numbers by quantities x[i]; only these if d is too small.
 
         Args:
-            d: how many numbers a state has.
+            d: the size of a state.
         """
         if d == self.size:
             return self
@@ -207,7 +207,7 @@ class StateSpace:
         return replace(known, quantities=(*known.quantities, *(Quantity(f"x[{i}]") for i in range(known.size, d))))
 
     def retract(self, x: Float[Array, " d"], change: Change) -> Float[Array, " d"]:
-        """The state after a change.
+        """Return the state after a change.
 
         Args:
             change: a tangent vector at x (e), quantity by quantity.
@@ -217,7 +217,7 @@ class StateSpace:
         return jnp.concatenate([q.retract(x[at], change[i : i + q.tangent_size]) for (at, q), i in pairs])
 
     def difference(self, y: Float[Array, " d"], x: Float[Array, " d"]) -> Change:
-        """The change (e) that leads from x to y.
+        """Return the change (e) that leads from x to y.
 
         Args:
             y: the other state (d).
@@ -225,17 +225,17 @@ class StateSpace:
         return jnp.concatenate([one.difference(y[part], x[part]) for part, one in self.parts])
 
     def normalise(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The usual representation of the state, for example with unit quaternions."""
+        """Return the usual representation of the state, for example with unit quaternions."""
         for part, one in self._curved():
             x = x.at[part].set(one.normalise(x[part]))
         return x
 
     def projected(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The valid state nearest to x, which rounding or a solver step may have moved off the manifold."""
+        """Return the valid state nearest to x, which rounding or a solver step may have moved off the manifold."""
         return self.nearest(self.normalise(x), x)
 
     def nearest(self, x: Float[Array, " d"], to: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The representation of x that is nearest to another state's numbers.
+        """Return the representation of x that is nearest to another state's numbers.
 
         Args:
             to: the other state (d).
@@ -245,7 +245,7 @@ class StateSpace:
         return x
 
     def continuous(self, x0: Numbers, x: Numbers) -> Numbers:
-        """Trajectories without jumps between representations; traced ones are returned unchanged.
+        """Return trajectories without jumps between representations; traced ones stay unchanged.
 
         Args:
             x0: the initial states (…, d), which stay unchanged.
@@ -262,20 +262,20 @@ class StateSpace:
         return x
 
     def check(self, name: str, x: Numbers) -> None:
-        """Require valid states, for example rigid bodies with unit quaternions.
+        """Raise an error if a state is invalid, for example if a quaternion is not of unit length.
 
         Args:
-            name: what the message calls them.
+            name: what the message calls the states.
             x: states (…, d).
 
         Raises:
-            ValueError: with the position and what was expected there.
+            ValueError: if a state is invalid, with its index and what was expected.
         """
         for part, one in self._curved():
             one.check(name, x, part)
 
     def features(self, x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
-        """By name, what determines whether a model has seen similar samples; by default each number of x and of u."""
+        """Return, by name, what determines whether samples are alike; by default each number of x and of u."""
         return {f"{name}[{i}]": column for name, part in (("x", x), ("u", u)) for i, column in enumerate(part.T)}
 
     def _curved(self) -> Iterator[tuple[slice, Quantity]]:

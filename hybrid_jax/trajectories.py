@@ -20,11 +20,11 @@ def _plain(dt):
 
 
 class Trajectories(eqx.Module):
-    """n windows of t equal intervals.
+    """Windows: n pieces of recordings, each of t equal intervals.
 
     Attributes:
-        x0: initial state of each window (n, d), in SI units; you should not scale it.
-        u: input during each interval (n, t, m), constant over it.
+        x0: the initial state of each window (n, d), in SI units. You should not scale it.
+        u: the input (n, t, m), constant during each interval.
         x: state at the end of each interval (n, t, d): x[:, i] is (i + 1) dt after x0. For `fit`, `adapt` and least
             squares, NaN means not measured.
         dt: length of an interval [s].
@@ -40,7 +40,7 @@ class Trajectories(eqx.Module):
 
     @property
     def horizon(self) -> int:
-        """The number of intervals t."""
+        """The number t of intervals."""
         return self.x.shape[-2]
 
     def __getitem__(self, index) -> "Trajectories":
@@ -105,11 +105,11 @@ def check_like(trajectories: Trajectories, windows: Trajectories, name: str, dt:
 
 
 def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:
-    """The first `at` intervals of each window, and the intervals after them; ValueError if a part would be empty.
+    """Split each window into its first `at` intervals and the rest; ValueError if a part would be empty.
 
     Args:
         trajectories: windows, or one window without its axis.
-        at: intervals of the first part.
+        at: number of intervals of the first part.
     """
     checks.count("at", at)
     if not at < trajectories.horizon:
@@ -135,11 +135,11 @@ def windows_of(
         states: the state at the start and after each interval (t + 1, d).
         inputs: the input during each interval (t, m).
         dt: length of an interval [s].
-        steps: intervals of each window.
-        stride: intervals between the starts of two windows; by default `steps`, so that windows do not overlap.
+        steps: number of intervals in each window.
+        stride: number of intervals between the starts of two windows; by default `steps`, so that none overlap.
 
     Raises:
-        ValueError: arrays of the wrong shape or type, a dt that is not positive, or fewer intervals than one window.
+        ValueError: if an array has the wrong shape or type, dt is not positive, or the trajectory is too short.
     """
     arrays = {"states": states, "inputs": inputs}
     states, inputs = (np.asarray(checks.real_array(name, array)) for name, array in arrays.items())
@@ -157,7 +157,7 @@ def windows_of(
 
 
 def concatenate(parts: Iterable[Trajectories]) -> Trajectories:
-    """All windows of the parts, in order; ValueError if dt, horizon, or sizes of state or input differ.
+    """Join windows in their order; ValueError if dt, horizon, or sizes of state or input differ.
 
     Args:
         parts: windows with the same dt, horizon, and sizes of state and input.

@@ -23,10 +23,10 @@ ROUNDING = 0.05  # share by which a moment may exceed the sum of the other two: 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """The constants of a multirotor; body frame x forward, y left, z up.
+    """The constants of a multirotor. In its body frame x points forward, y left and z up.
 
     Attributes:
-        mass: in kg.
+        mass: mass [kg].
         inertia: principal moments (Ix, Iy, Iz) about the centre of mass [kg m²].
         thrust_coefficient: k [N/(rad/s)²]; the thrust of a rotor is k u².
         torque_coefficient: c_m [N m/(rad/s)²]; the reaction torque of a rotor is c_m u².
@@ -35,10 +35,10 @@ class Vehicle:
         max_rotor_speed: the largest rotor speed [rad/s].
         rotor_radius: radius of a rotor [m]; 0 if unknown.
         gravity: acceleration of free fall [m/s²].
-        name: what reports and messages call it.
+        name: what reports and messages call the vehicle.
 
     Raises:
-        ValueError: numbers that are not positive and finite, physically impossible, or in the wrong unit.
+        ValueError: if a number is not positive and finite, physically impossible, or in the wrong unit.
     """
 
     mass: float
@@ -107,17 +107,17 @@ class Vehicle:
 
 
 def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
-    """Read the table `[vehicle]` of a TOML file whose keys are the attributes of `Vehicle`.
+    """Read the table `[vehicle]` of a TOML file. Its keys are the attributes of `Vehicle`.
 
     Use `dynamics.vehicle_file.load_vehicle_model` to read and check the other tables as well.
 
     Args:
         path: the TOML file.
-        variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, for example the mass with a
-            payload. All variants of the file are checked.
+        variant: name of a table `[vehicle.VARIANT]` that overrides constants, for example the mass with a payload. All
+            variants of the file are checked.
 
     Raises:
-        ValueError: one line with the file, the key and what was expected.
+        ValueError: if a key is invalid, with the file, the key and what was expected.
     """
     tables = read_tables(path)
     vehicle = vehicle_of(tables, path, variant)

@@ -49,13 +49,13 @@ class Identified(NamedTuple):
     """The result of `identify`.
 
     Attributes:
-        field: with the fitted parameters.
-        intervals: 95 % confidence interval of each parameter, number by number.
-        errors: RMS of each quantity's channels over the windows, from the estimated initial states.
-        windows: number of fitted windows.
-        seconds: length of all windows [s].
+        field: the field with the fitted parameters.
+        intervals: the 95 % confidence interval of each parameter, number by number.
+        errors: the RMS error of each quantity's channels over the windows, from the estimated initial states.
+        windows: the number of fitted windows.
+        seconds: the length of all windows [s].
         status: how the last round ended.
-        covariance: of the parameters (p, p), in the parametrisation of `ravel_parameters`.
+        covariance: the covariance (p, p) of the parameters, in the parametrisation of `ravel_parameters`.
         explained: R² of the change of each body rate in a window (3); 1 if not measured.
     """
 
@@ -70,7 +70,7 @@ class Identified(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """Whether the last round stopped by itself, where no step lowers the errors further."""
+        """Whether the last round stopped by itself, because no step lowered the errors further."""
         return self.status == Status.OK
 
 
@@ -84,22 +84,22 @@ def identify(
     free: Sequence[str] | None = None,
     known: Float[np.ndarray, "p p"] | None = None,
 ) -> Identified:
-    """Fit the learned parameters of the field's physics to recordings.
+    """Fit the learned parameters of the field's physics to recordings of commands and sensors.
 
     Args:
         field: an `Actuated` field if the input is commands; any other field takes the measured rotor speeds.
         recordings: one or more, of one vehicle.
         layout: how they are cut into windows, by default `Layout()`.
-        measured: quantities to compare, by default all that every recording has.
-        free: names of parameters to fit, such as k or efficiency[2], by default all; the others do not change.
-        known: covariance of the other parameters, which adds to the covariance of the fitted ones; by default zero.
+        measured: the quantities to compare; by default all that every recording has.
+        free: names of the parameters to fit, for example "k" or "efficiency[2]"; by default all.
+        known: covariance of the parameters that are not fitted, which widens the intervals of the others; by default 0.
 
     Returns:
         A parameter that is not identifiable has an infinite interval and does not change, nor do those in
         `terms.OF_VELOCITY` unless each recording has a velocity or position.
 
     Raises:
-        ValueError: a recording that lacks something, or too few windows, with name and what was expected.
+        ValueError: if a recording lacks something, or there are too few windows.
     """
     layout = Layout() if layout is None else layout
     with jax.enable_x64(True):

@@ -46,12 +46,12 @@ class Learned(NamedTuple):
     Attributes:
         field: the model.
         physics: the fit of the physics without the network, with intervals.
-        chosen: one of `CANDIDATES`.
-        lag: time constant of the rotors behind the logged motors [s].
+        chosen: the chosen candidate, one of `CANDIDATES`.
+        lag: the time constant of the rotors behind the logged motors [s].
         left_out: RMSE of frozen rates and of each candidate on held-out flights after each interval of `dt`, in the
             units of `prediction_errors.UNITS`.
-        windows: some that it was learned from, by which `adapted` judges its errors without any change.
-        expected: error on a new flight after `STEPS` intervals: value, low and high end of the 80 % interval.
+        windows: some training windows, by which `adapted` judges the model's errors without any change.
+        expected: the error on a new flight after `STEPS` intervals: value, low and high end of the 80 % interval.
     """
 
     field: AbstractVectorField
@@ -88,12 +88,12 @@ def learnable(model: VehicleModel, seconds: float, window: float, moves: bool = 
 
 
 def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Learned:
-    """Learn from all flights, and choose by held-out flights whether to add a network to the physics.
+    """Learn a vehicle from all flights. Held-out flights decide whether a network is added to the physics.
 
     Args:
-        model: the vehicle file, with the parameters to learn.
-        logs: two flights or more, at one interval, checked and in the air.
-        seed: seed of the network.
+        model: the vehicle and the names of its parameters to learn.
+        logs: two flights or more, sampled at one interval, checked and in the air.
+        seed: the random seed of the network.
     """
     lag = _lag(model, logs) if LAG in model.learn else model.terms.motor_time_constant
     logs = [lag_motors(log, lag) for log in logs]
@@ -132,7 +132,7 @@ def adapted(
         field: the source model.
         logs: flights after the change.
         learned_from: windows that the source was trained on, see `hybrid_jax.adapt`.
-        most: the most windows to adapt to.
+        most: the largest number of windows to adapt to.
     """
     windows = cut_windows(logs, STEPS, STEPS, most)
     found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)

@@ -28,15 +28,15 @@ class Layout:
     """How recordings are cut into windows.
 
     Attributes:
-        dt: of the solver's steps and of the grid on which measurements are compared [s].
-        steps: intervals of a window.
-        most: windows at most, spread evenly; `identify` chooses half by their information.
+        dt: the solver's step, and the interval at which measurements are compared [s].
+        steps: number of intervals of a window.
+        most: largest number of windows, spread evenly; `identify` chooses half by their information.
         span: duration of the samples before a window from which its initial state is estimated [s].
         disturbance: initial standard deviation of a window's constant disturbances (6), 0 for none: along x, y and z
             [m/s²], and about x, y and z [rad/s²].
 
     Raises:
-        ValueError: a number out of range.
+        ValueError: if a number is out of range.
     """
 
     dt: float = 0.01
@@ -53,7 +53,7 @@ class Layout:
 
     @property
     def ahead(self) -> int:
-        """Intervals of commands before a window."""
+        """The number of intervals of commands before a window."""
         return round(WARM / self.dt)
 
 

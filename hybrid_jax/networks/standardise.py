@@ -62,14 +62,14 @@ def motion_of(field: AbstractVectorField) -> Trajectories | None:
 
 
 def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
-    """The field with every `ChannelScaling` that is not set yet (see `residual_network`) set from windows.
+    """Set each `ChannelScaling` of a field that is not set yet (see `residual_network`) from windows.
 
     Inputs are scaled to mean 0 and standard deviation 1. Outputs are scaled to the RMS of the derivative that the rest
     of the field lacks, if there is one for each state or, in a `GridNetwork`, for each component. Scalings that are
     already set do not change.
 
     Args:
-        field: a field that contains networks; one without is returned unchanged.
+        field: a field that contains networks. A field without networks is returned unchanged.
         windows: the training windows.
     """
     networks = _networks(field)

@@ -83,8 +83,8 @@ class LaneMap:
     Args:
         width: lanes in a chunk. Default: 1 on a CPU; elsewhere 0, an even share of the lanes for each device.
         devices: where chunks run, ordered by process; by default all devices of all processes.
-        min_capacity: least number of lanes to compile for, so that smaller calls share the program. Ignored for width
-            0, where padding would be computed.
+        min_capacity: the smallest number of lanes to compile for, so that smaller calls share the program. Ignored if
+            the width is 0.
         compiler: options of XLA.
     """
 
