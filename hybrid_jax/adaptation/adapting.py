@@ -18,6 +18,7 @@ from hybrid_jax.adaptation.expectation import expected_errors
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.outliers import outliers
 from hybrid_jax.adaptation.plausible import groups_of
+from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, correlated, longest_chain, overlap
 from hybrid_jax.chunks import in_chunks
@@ -250,14 +251,20 @@ def _parameters(
     if without is not None:
         return {"parameters": found, "without_intervals": without}
     cluster = correlated(windows)
-    degrees = None if cluster == 1 else -(-len(windows) // cluster) - 1
+    own_degrees = len(windows) - free.sum() if cluster == 1 else -(-len(windows) // cluster) - 1
     if choice is None:
         scale = scale_of(settings.objective, d)
         covariance = np.asarray(covariance_of(field, windows, solver=settings.solver, scale=scale, cluster=cluster))
+        inherited, of_source = np.zeros_like(covariance), np.inf
     else:
         unseen = free & (np.asarray(choice.equations.score) == 0).all(axis=0)[places]
-        covariance = np.asarray(sandwich(choice.equations, int(free.sum()), cluster) + choice.inherited)
-        covariance = covariance[np.ix_(places, places)] + np.diag(np.where(unseen, np.inf, 0.0))
+        covariance = np.asarray(sandwich(choice.equations, int(free.sum()), cluster))[np.ix_(places, places)]
+        covariance = covariance + np.diag(np.where(unseen, np.inf, 0.0))
+        inherited, of_source = np.asarray(choice.inherited)[np.ix_(places, places)], float(choice.degrees)
+    # What the network absorbs is the size of a bias and no estimate from a sample, so of infinite degrees (GUM, G.4.3).
+    parts = np.stack([np.diag(covariance), np.diag(inherited), absorbed])
+    degrees = satterthwaite(parts, np.array([own_degrees, of_source, np.inf]))
+    covariance = covariance + inherited
     if np.isnan(covariance).any():
         return {"parameters": found, "without_intervals": NOT_FINITE}
     whole = covariance + np.diag(absorbed)

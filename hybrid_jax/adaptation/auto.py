@@ -37,7 +37,7 @@ from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors, ravel_parameters
 from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, masked
-from hybrid_jax.estimation.uncertainty import sandwich
+from hybrid_jax.estimation.uncertainty import sandwich_of_repeated
 from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_by_size
 from hybrid_jax.status import Status
@@ -80,6 +80,7 @@ class Choice(NamedTuple):
         change: change of the network's weights in each candidate (c, w); None without a trainable network.
         ends: errors of left-out blocks, see `errors_at_ends` (b, 2, d).
         inherited: covariance at the chosen parameters from errors of those that the source keeps (p, p).
+        degrees: degrees of freedom of `inherited`.
         absorbed: square of how far the source's parameters move on its own motion without its network (p,).
     """
 
@@ -95,6 +96,7 @@ class Choice(NamedTuple):
     change: Float[Array, "c w"] | None
     ends: Float[Array, "b 2 d"]
     inherited: Float[Array, "p p"]
+    degrees: Float[Array, ""]
     absorbed: Float[Array, " p"]
 
 
@@ -142,7 +144,7 @@ class Auto(Method):
             distinct, learned_from = jnp.array(min(len(learned_from), len(train))), alike(learned_from, train)
             own, refit, _ = fits(larger, learned_from, both, *options, distinct)
             rival = None if physics is None else fits(physics, learned_from, both, *options, distinct)[1]
-            larger, source = replace(self, larger, own, refit, rival)
+            larger, source = replace(self, larger, own, refit, rival, distinct)
         options = *options, jnp.array(len(train))
         (found, every, starts), fitted = fits(larger, train, both, *options), None
         for _ in range(ROUNDS):
@@ -153,11 +155,12 @@ class Auto(Method):
 
 
 class OfSource(NamedTuple):
-    """Fits to the source's own motion: of the source that is adapted, whether it is physics `alone`, and `absorbed`."""
+    """Fits to `distinct` windows of the source: of the one adapted, whether it is physics `alone`, `absorbed`."""
 
     own: Fit
     alone: Bool[Array, ""]
     absorbed: Float[Array, " p"]
+    distinct: Int[Array, ""]
 
 
 def _begin(method: Auto, field, train: Trajectories):
@@ -171,15 +174,15 @@ def _fits(field, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
     return at(found, 0), at(found, 1), starts
 
 
-def _replace(method: Auto, larger, own: Fit, refit: Fit, rival: Fit | None) -> tuple[AbstractVectorField, OfSource]:
+def _replace(method: Auto, larger, own: Fit, refit: Fit, rival: Fit | None, distinct) -> tuple[Any, OfSource]:
     """Replace the source by physics if these predict its own motion better."""
     if rival is None:
-        return larger, OfSource(own, jnp.array(False), jnp.zeros_like(own.theta))
+        return larger, OfSource(own, jnp.array(False), jnp.zeros_like(own.theta), distinct)
     alone = rival.surely_better(own) & method.networks
     absorbed = jnp.where(alone, 0.0, jnp.square(rival.theta - refit.theta))
     physics = ravel_parameters(without_network(larger))[1](rival.theta)
     larger, own = (_where(alone, *pair) for pair in ((physics, larger), (rival, own)))
-    return larger, OfSource(own, alone, absorbed)
+    return larger, OfSource(own, alone, absorbed, distinct)
 
 
 def _judge(
@@ -204,10 +207,11 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
     theta, blocks = chosen.theta.at[taken].set(found.theta), blocks_of(len(train), method.blocks)
     probability, refused = chosen.probability, chosen.naive > chosen.naive[taken]
     equations = masked(found.equations, free[taken] & found.seen)
-    alone, absorbed, of_source = jnp.array(False), jnp.zeros_like(start), jnp.diag(nothing.apparent)
+    alone, absorbed, of_source, degrees = jnp.array(False), jnp.zeros_like(start), jnp.diag(nothing.apparent), jnp.inf
     if source is not None:
-        own, alone, absorbed = source
-        of_source = jnp.where(alone, sandwich(own.equations, len(start), 1), of_source)
+        own, alone, absorbed, distinct = source
+        of_source = jnp.where(alone, sandwich_of_repeated(own.equations, len(start), distinct), of_source)
+        degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
     inherited = spread(found.equations, free[taken] & found.seen, of_source)
     held = jnp.diag(jnp.where(free[taken] & found.seen, found.noise / jnp.square(sizes), 0.0))
     left_out = found.theta + left_out_steps(equations, held, held @ (found.theta - start), blocks)
@@ -232,7 +236,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[blocks[0]], train)
     ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(blocks[1])))
     first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
-    choice = Choice(*first, inherited, absorbed)
+    choice = Choice(*first, inherited, jnp.asarray(degrees), absorbed)
     finite = (found.status == Status.OK) | ~jnp.isinf(ends).any()
     status = jnp.where(finite, found.status, Status.DIVERGED)
     return Solution(candidate(extended(field, train.x0.shape[1]), choice, taken), found.steps, status, choice)

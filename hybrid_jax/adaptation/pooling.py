@@ -1,4 +1,4 @@
-"""Pool physical parameters from several sources, with intervals that include the error of the networks."""
+"""Sum variances of different origin, and pool parameters of several sources, with the error of the networks."""
 
 from collections.abc import Sequence
 
@@ -43,8 +43,8 @@ def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parame
     estimates = [_estimates(result) for result in results]
     found = {}
     for name in (name for name in results[0].parameters if all(name in own for own in fitted)):
-        values, variances = np.array([own[name] for own in estimates]).T
-        centre, away = combined(values, variances, level, min(result.degrees or np.inf for result in results))
+        values, variances, degrees = np.array([own[name] for own in estimates]).T
+        centre, away = combined(values, variances, level, min(degrees))
         low, high = sorted(_at(results[0], name, end) for end in (centre - away, centre + away))
         found[name] = Parameter(_at(results[0], name, centre), low, high, results[0].parameters[name].unit)
     return found
@@ -69,11 +69,32 @@ def combined(
     return float(np.mean(estimates)), float(scipy.special.stdtrit(freedom, (1 + level) / 2) * np.sqrt(total))
 
 
-def _estimates(result: Adaptation) -> dict[str, tuple[float, float]]:
+def satterthwaite(variances: Float[np.ndarray, "c p"], degrees: Float[np.ndarray, " c"]) -> Float[np.ndarray, " p"]:
+    """Compute the effective degrees of freedom of a sum of c independent estimates of variance.
+
+    An estimate v of a variance σ² with ν degrees of freedom is σ² χ²_ν / ν: its mean is σ², its variance 2 σ⁴ / ν. The
+    sum Σ v_i thus has the mean Σ σ_i² and the variance Σ 2 σ_i⁴ / ν_i. Student's quantile is right for a multiple of
+    χ²_ν with these two moments, that is for ν = (Σ v_i)² / Σ (v_i² / ν_i), with v_i in place of σ_i² (Satterthwaite,
+    Biometrics Bulletin 1946; Welch, Biometrika 1947; ISO/IEC Guide 98-3, GUM, Sec. G.4.1). It is between the smallest
+    ν_i and Σ ν_i.
+
+    Args:
+        variances: of each component, for each of p parameters.
+        degrees: of freedom of each component; ∞ for a variance that is known.
+    """
+    total = np.sum(variances, axis=0)
+    shares = np.divide(variances, total, out=np.ones_like(variances), where=np.isfinite(total) & (total > 0))
+    with np.errstate(divide="ignore"):
+        return 1 / np.sum(np.square(shares) / np.asarray(degrees)[:, None], axis=0)
+
+
+def _estimates(result: Adaptation) -> dict[str, tuple[float, float, float]]:
+    """Return by name the value, its variance, and the degrees of freedom of that."""
     theta, _ = ravel_parameters(result.field)
     assert result.covariance is not None
-    pairs = zip(theta.tolist(), np.diag(result.covariance).tolist(), strict=True)
-    return dict(zip(named_parameters(result.field), pairs, strict=True))
+    assert result.degrees is not None
+    known = zip(theta.tolist(), np.diag(result.covariance).tolist(), result.degrees.tolist(), strict=True)
+    return dict(zip(named_parameters(result.field), known, strict=True))
 
 
 def _at(result: Adaptation, name: str, value: float) -> float:

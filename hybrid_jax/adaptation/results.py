@@ -65,7 +65,8 @@ class Adaptation:
         level: confidence level of the intervals, between 0 and 1.
         without_intervals: why there are no intervals; None if there are.
         covariance: covariance in the physics' own parametrisation, of effective parameters too; None without intervals.
-        degrees: degrees of freedom of the covariance, one less than the clusters of adjacent windows, or None.
+        degrees: effective degrees of freedom of each variance, see `pooling.satterthwaite`; ∞ for the normal
+            distribution; None without intervals.
         changed: parameters that differ significantly from the source's, the most significant first.
         set_aside: number of samples in windows with outliers, which were not used.
         not_measured: share of the states of the windows, 0 to 1, that are NaN, which counts as not measured.
@@ -90,7 +91,7 @@ class Adaptation:
     level: float
     without_intervals: str | None
     covariance: Float[np.ndarray, "p p"] | None = None
-    degrees: int | None = None
+    degrees: Float[np.ndarray, " p"] | None = None
     changed: tuple[str, ...] = ()
     set_aside: int = 0
     not_measured: float = 0.0

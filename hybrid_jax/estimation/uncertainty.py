@@ -112,20 +112,21 @@ def covariance_of(
     seen = has_effect(equations, windows, scale)
     equations = masked(equations, seen if free is None else free & seen)
     unknown = ~seen if free is None else free & ~seen
-    found = _covariance(equations, kind, jnp.asarray(measured), fitted, cluster)
+    found = _covariance(equations, kind, jnp.asarray(measured), fitted, cluster, len(windows))
     return found + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
 
 
 @jit_by_size()
-def _covariance(equations: NormalEquations, kind: Kind, measured, p: Int[Array, ""] | int, cluster: int):
+def _covariance(
+    equations: NormalEquations, kind: Kind, measured, p: Int[Array, ""] | int, cluster: int, n: Int[Array, ""] | int
+):
     gram, score, square = equations
-    n = len(score)
     bread = inverse(jnp.sum(gram, axis=0))
     told = bread.told
     if kind == "homoscedastic":
         found = jnp.sum(square) / (measured - p) * bread.matrix
     elif cluster > 1:
-        clusters, of = -(-n // cluster), np.arange(n) // cluster
+        clusters, of = -(-len(score) // cluster), np.arange(len(score)) // cluster
         gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
         without = inverses(jnp.sum(gram, axis=0) - gram)
         told = told & without.told.all(axis=0)
@@ -135,18 +136,28 @@ def _covariance(equations: NormalEquations, kind: Kind, measured, p: Int[Array, 
         found = (clusters - 1) / clusters * moves.T @ moves
     else:
         half = score @ bread.matrix  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
-        found = n / (n - p) * half.T @ half
+        found = n / jnp.maximum(n - p, 1) * half.T @ half
     return found + jnp.diag(jnp.where(told, 0.0, jnp.inf))
 
 
-def sandwich(equations: NormalEquations, fitted: int, cluster: int) -> Float[Array, "p p"]:
+def sandwich(equations: NormalEquations, fitted: int, cluster: int = 1) -> Float[Array, "p p"]:
     """Compute H⁻¹ M H⁻¹ of `covariance_of` from equations in which all but `fitted` parameters are `masked`."""
-    return _covariance(equations, "sandwich", 1, fitted, cluster)
+    return _covariance(equations, "sandwich", 1, fitted, cluster, len(equations.score))
+
+
+def sandwich_of_repeated(equations: NormalEquations, fitted: int, distinct: Int[Array, ""]) -> Float[Array, "p p"]:
+    """Compute `sandwich` from windows of which only the first `distinct` are independent: the others repeat them."""
+    of = jnp.arange(len(equations.score)) % distinct
+    score = jax.ops.segment_sum(equations.score, of, len(equations.score))
+    return _covariance(equations._replace(score=score), "sandwich", 1, fitted, 1, distinct)
 
 
 @entry
 def intervals(
-    field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95, degrees: int | None = None
+    field: AbstractVectorField,
+    covariance: Float[Array, "p p"],
+    level: float = 0.95,
+    degrees: float | Float[np.ndarray, " p"] | None = None,
 ) -> dict[str, Interval]:
     """The physical parameters of a field, each with a confidence interval; names as in `named_parameters`.
 
@@ -157,8 +168,8 @@ def intervals(
         field: at the estimate; a disturbance in its physics is one of the parameters.
         covariance: covariance in the physics' own parametrisation (p, p), for example from `covariance_of`.
         level: confidence level, between 0 and 1.
-        degrees: degrees of freedom of the covariance, one less than its clusters, for Student's t; by default the
-            normal distribution is used.
+        degrees: degrees of freedom of the covariance, or of each variance, for Student's t: for example one less than
+            its clusters, or see `pooling.satterthwaite`; by default the normal distribution is used.
 
     Raises:
         ValueError: a level not between 0 and 1, or a covariance of another shape or with a negative variance.
@@ -173,7 +184,7 @@ def intervals(
         raise ValueError(f"covariance must have variances of at least 0, got {variances}")
     quantile = jax.jit(jax.scipy.special.ndtri)((1 + level) / 2)
     if degrees is not None:
-        quantile = float(scipy.special.stdtrit(degrees, (1 + level) / 2))
+        quantile = jnp.asarray(scipy.special.stdtrit(degrees, (1 + level) / 2))
     away = quantile * jnp.sqrt(variances)
     left, right = (named_parameters(unravel(end)) for end in (theta - away, theta + away))
     return {

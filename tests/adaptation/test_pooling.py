@@ -10,7 +10,7 @@ from pushes import Push, pushes
 from surface import refusal
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.pooling import combined
+from hybrid_jax.adaptation.pooling import combined, satterthwaite
 
 
 def test_the_interval_holds_errors_within_and_between_sources():
@@ -48,6 +48,24 @@ def test_two_sources_or_one_without_intervals_are_refused():
     tuned = hj.adapt(pendulum(), swings(40), method=hj.FineTune(max_epochs=1))
     with pytest.raises(ValueError, match=r"results\[2\] has no intervals: they are valid for least squares only"):
         hj.pool([*results[:2], tuned])
+
+
+@pytest.mark.parametrize("of_target", [0.1, 0.3, 0.5, 0.9])
+def test_intervals_hold_if_a_part_of_the_variance_is_known_better_than_the_rest(of_target):
+    """Of the variance a share is the target's, known from five blocks, and the rest the source's, from a hundred."""
+    rng, shares, freedom = np.random.default_rng(0), np.array([of_target, 1 - of_target]), np.array([4.0, 99.0])
+    error = rng.normal(size=5000)
+    found = shares[:, None] * rng.chisquare(freedom[:, None], (2, 5000)) / freedom[:, None]
+    degrees = satterthwaite(found, freedom)
+    within = np.abs(error) / np.sqrt(found.sum(axis=0)) <= scipy.stats.t.ppf(0.975, degrees)
+    assert np.mean(within) == pytest.approx(0.95, abs=0.012)  # four standard deviations of the mean
+    assert freedom[0] <= degrees.min()
+    assert degrees.max() <= freedom.sum()
+
+
+def test_a_parameter_that_is_not_determined_has_finite_degrees_of_freedom():
+    found = satterthwaite(np.array([[np.inf, 0.0, 1.0], [1.0, 0.0, 0.0]]), np.array([4.0, np.inf]))
+    np.testing.assert_allclose(found, [4.0, 4.0, 4.0])
 
 
 def test_few_degrees_of_freedom_widen_the_interval():
