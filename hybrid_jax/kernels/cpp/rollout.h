@@ -90,12 +90,20 @@ struct Lane {
   float* q(Vec* point) const { return reinterpret_cast<float*>(h(point) + group * U); }
 };
 
+// The derivative with respect to h, kept when it is read.
+struct Through {
+  const float *scale, *through_q;
+  const Vec *dn, *h;
+  Vec* dh;
+  INLINE Vec operator[](int64_t i) const { return dh[i] = scale[i] * dn[i] + through_q[i] * h[i]; }
+};
+
 // The layer that couples all windows of a lane: z less its mean, n of a block of windows, and the derivatives. z and the
 // derivatives with respect to h wait for their products until a step's stages are done.
 struct Coupling {
   const Lane& lane;
   const int64_t blocks = lane.group;
-  Vec *zs = lane.room(STAGES * blocks * Z), *dns = lane.room(STAGES * blocks * U), *dz = lane.room(blocks * Z), *by_scale = lane.room(U);
+  Vec *zs = lane.room(STAGES * blocks * Z), *dhs = lane.room(STAGES * blocks * U), *dn = lane.room(blocks * U), *dz = lane.room(blocks * Z);
   float *scale = reinterpret_cast<float*>(lane.room(U)), *through_q = reinterpret_cast<float*>(lane.room(U));
 
   void centre(Vec* z) const {
@@ -127,22 +135,21 @@ struct Coupling {
     for (int i = 0; i < H; ++i) scale[i] = lane.w[GAIN + i] * q[i];
   }
   Normal normal(const Vec* h) const { return {scale, lane.w + SHIFT, h}; }
-  // Adds dn of a vector of windows, and dn h, while these are at hand.
-  void collect(const Vec* dn, const Vec* h, Vec* sums) const {
-    for (int i = 0; i < H; ++i) by_scale[i] += dn[i] * h[i], sums[SHIFT + i] += dn[i];
-  }
-  // From dn to the derivatives with respect to h, in its place, and z; adds those with respect to γ.
-  void back(Vec* dn, const Vec* h, const float* q, Vec* sums) const {
-    for (int i = 0; i < H; ++i) {
-      sums[GAIN + i] += q[i] * by_scale[i];
-      through_q[i] = -scale[i] * q[i] * q[i] * sum(by_scale[i]) / float(lane.b);
-      by_scale[i] = Vec{};
-    }
-    for (int64_t j = 0; j < blocks; ++j, dn += U, h += U) {
-      const float *factor = scale, *through = through_q;
-      for (int i = 0; i < H; ++i) dn[i] = factor[i] * dn[i] + through[i] * h[i];
-      dense<Z, H>(lane.w + WEIGHT, 1, Z, dn, dz + j * Z);
-    }
+  // From dn to the derivatives with respect to h and z; adds those with respect to γ and β, of some units at a time.
+  void back(int stage, const Vec* h, const float* q, Vec* sums) const {
+    Vec* dh = dhs + stage * blocks * U;
+    in_tiles<H, 8>([&](auto rows, int i) __attribute__((always_inline)) {
+      constexpr int R = decltype(rows)::value;
+      Vec by_scale[R] = {}, by_shift[R] = {};
+      for (int64_t j = 0; j < blocks; ++j)
+        UNROLL for (int r = 0; r < R; ++r) by_scale[r] += dn[j * U + i + r] * h[j * U + i + r], by_shift[r] += dn[j * U + i + r];
+      UNROLL for (int r = 0; r < R; ++r) {
+        sums[GAIN + i + r] += q[i + r] * by_scale[r], sums[SHIFT + i + r] += by_shift[r];
+        through_q[i + r] = -scale[i + r] * q[i + r] * q[i + r] * sum(by_scale[r]) / float(lane.b);
+      }
+    });
+    for (int64_t j = 0; j < blocks; ++j)
+      dense<Z, H>(lane.w + WEIGHT, 1, Z, Through{scale, through_q, dn + j * U, h + j * U, dh + j * U}, dz + j * Z);
     centre(dz);
   }
 };
@@ -185,7 +192,7 @@ void backward_lane(const Call& call) {
   Vec *sums = lane.room(P), *factors = lane.room(F * SLOTS);
   int64_t used = 0;
   const Coupling c{lane};
-  std::fill_n(sums, P, Vec{}), std::fill_n(c.by_scale, H, Vec{});
+  std::fill_n(sums, P, Vec{});
   for (int64_t first = 0; first < lane.blocks; first += group) {
     std::fill_n(dx, n, Vec{});
     for (int64_t t = lane.steps; t--;) {
@@ -198,14 +205,12 @@ void backward_lane(const Call& call) {
         Vec *point = lane.point(first, t, stage), *h = lane.h(point);
         for (int64_t i = 0; i < n; ++i) d_slope[i] = lane.share[stage] * next[i] + (stage < STAGES - 1 ? lane.ahead[stage] * d_point[i] : Vec{});
         if (H) c.evaluate(stage, point, u, h, lane.q(point), true);
-        Vec* dn = c.dns + stage * group * U;
         for (int64_t j = 0; j < group; ++j) {
           if (used == SLOTS) products(sums, factors, used), used = 0;
-          slope_back(back, point + j * D, u + j * M, c.normal(h + j * U), d_slope + j * D, d_point + j * D, more_u, dn + j * U, {sums}, factors + F * used++);
-          c.collect(dn + j * U, h + j * U, sums);
+          slope_back(back, point + j * D, u + j * M, c.normal(h + j * U), d_slope + j * D, d_point + j * D, more_u, c.dn + j * U, {sums}, factors + F * used++);
           for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
         }
-        if (H) c.back(dn, h, lane.q(point), sums);
+        if (H) c.back(stage, h, lane.q(point), sums);
         for (int64_t j = 0; j < group && H; ++j) {
           read_back(back, point + j * D, u + j * M, c.dz + j * Z, more, more_u, {sums});
           for (int i = 0; i < D; ++i) d_point[j * D + i] += more[i];
@@ -213,7 +218,7 @@ void backward_lane(const Call& call) {
         }
         for (int64_t i = 0; i < n; ++i) dx[i] += d_point[i];
       }
-      if (H) add_products<H, Z>(sums + WEIGHT, c.dns, U, c.zs, Z, STAGES * group);
+      if (H) add_products<H, Z>(sums + WEIGHT, c.dhs, U, c.zs, Z, STAGES * group);
       for (int64_t j = 0; j < group; ++j) d_u.scatter(du + j * M, t, (first + j) * V);
     }
     for (int64_t j = 0; j < group; ++j) d_x0.scatter(dx + j * D, 0, (first + j) * V);

@@ -16,13 +16,13 @@ namespace {
 // V numbers in a vector. What registers hold: rows of a product with a vector; and rows and columns of
 // a sum of products.
 #if defined(__AVX512F__)
-constexpr int V = 16, DENSE = 16, ROWS = 4, COLUMNS = 6;
+constexpr int V = 16, DENSE = 20, ROWS = 4, COLUMNS = 6;
 #else
 constexpr int V = 8, DENSE = 8, ROWS = 3, COLUMNS = 3;
 #endif
 
 #define INLINE inline __attribute__((always_inline))
-#define UNROLL _Pragma("GCC unroll 16")
+#define UNROLL _Pragma("GCC unroll 20")
 typedef float Vec __attribute__((vector_size(4 * V), aligned(4), may_alias));
 typedef int32_t Places __attribute__((vector_size(4 * V)));
 #define HELD alignas(sizeof(Vec))  // a vector that begins within a line of the cache takes two accesses
@@ -66,24 +66,28 @@ INLINE void dense(const W* w, int64_t row, int64_t step, X v, Vec* out) {
     constexpr int R = decltype(rows)::value;
     Vec sum[R] = {};
     const W* at = w + i * row;
-    _Pragma("GCC unroll 4") for (int k = 0; k < K; ++k, at += step)
-      UNROLL for (int r = 0; r < R; ++r) sum[r] += at[r * row] * v[k];
+    _Pragma("GCC unroll 4") for (int k = 0; k < K; ++k, at += step) {
+      const Vec one = v[k];
+      UNROLL for (int r = 0; r < R; ++r) sum[r] += at[r * row] * one;
+    }
     UNROLL for (int r = 0; r < R; ++r) out[i + r] = sum[r];
   });
 }
 
-// sums (M, N) += Σ a bᵀ over slots: the next a and b lie so many vectors behind the last.
-template <int M, int N>
+// sums += Σ a bᵀ over slots, of M rows and N columns, so many vectors apart; the next a and b lie so many behind the last.
+// The longer gives the rows, as it is read once.
+template <int M, int N, int ROW = N, int COLUMN = 1>
 void add_products(Vec* sums, const Vec* a, int64_t next_a, const Vec* b, int64_t next_b, int64_t slots) {
-  in_tiles<M, ROWS>([&](auto rows, int i) __attribute__((always_inline)) {
+  if constexpr (M < N) add_products<N, M, COLUMN, ROW>(sums, b, next_b, a, next_a, slots);
+  else in_tiles<M, ROWS>([&](auto rows, int i) __attribute__((always_inline)) {
     in_tiles<N, COLUMNS>([&](auto columns, int j) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value, C = decltype(columns)::value;
-      Vec sum[R][C], *at = sums + i * N + j;
-      UNROLL for (int r = 0; r < R; ++r) UNROLL for (int c = 0; c < C; ++c) sum[r][c] = at[r * N + c];
+      Vec sum[R][C], *at = sums + i * ROW + j * COLUMN;
+      UNROLL for (int r = 0; r < R; ++r) UNROLL for (int c = 0; c < C; ++c) sum[r][c] = at[r * ROW + c * COLUMN];
       for (int64_t s = 0; s < slots; ++s)
         UNROLL for (int r = 0; r < R; ++r)
           UNROLL for (int c = 0; c < C; ++c) sum[r][c] += a[s * next_a + i + r] * b[s * next_b + j + c];
-      UNROLL for (int r = 0; r < R; ++r) UNROLL for (int c = 0; c < C; ++c) at[r * N + c] = sum[r][c];
+      UNROLL for (int r = 0; r < R; ++r) UNROLL for (int c = 0; c < C; ++c) at[r * ROW + c * COLUMN] = sum[r][c];
     });
   });
 }
