@@ -92,13 +92,13 @@ class AbstractVectorField(eqx.Module):
 
     @property
     def state_space(self) -> StateSpace:
-        """The state space; by default that of the first field inside that has one, else empty."""
+        """The state space; by default taken from the first field inside that has one, else empty."""
         spaces = (part.state_space for part in _fields_inside(self))
         return next((space for space in spaces if space.quantities), StateSpace())
 
     @property
     def parameter_units(self) -> dict[str, str]:
-        """The units of learned parameters by name, for example "kg m²"; by default those of the fields inside."""
+        """The units of learned parameters by name, for example "kg m²"; by default taken from the fields inside."""
         inside = (part.parameter_units for part in _fields_inside(self))
         return {name: unit for units in inside for name, unit in units.items()}
 

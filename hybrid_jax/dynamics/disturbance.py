@@ -61,7 +61,7 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
     """Return the field with a constant disturbance in its physics, which is zero unless the field already has one.
 
     Args:
-        field: physics alone, or a hybrid.
+        field: physics, or a hybrid.
         indices: the disturbed states; by default given by the state space of the physics, for example v̇ and ω̇ of a
             rigid body, or each component of physics on a `Grid` (one number for all points).
 

@@ -63,7 +63,7 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
     if apart := without_common_time(recording):
         raise ValueError(f"{recording.name}: {apart}")
     if motors.values.shape[1] > MOST_ROTORS:
-        order = "name those of the rotors: motor_order=(0, 1, 2, 3)"
+        order = "name the motors of the rotors: motor_order=(0, 1, 2, 3)"
         raise ValueError(f"{recording.name}: {motors.source} has {motors.values.shape[1]} motors; {order}")
     first, last = max(signal.t[0] for signal in used), min(signal.t[-1] for signal in used)
     if last - first < dt:

@@ -95,8 +95,8 @@ def excitation(
     It maximises log det of the inverse covariance of `parameters` that `fit_least_squares(…, scale=noise)` will have on
     windows of the flight. All other parameters of the physics count as unknown as well, for example a constant force
     and torque with `with_disturbance(model)`. Adam improves random series. A series outside the limits is shrunk, so
-    the result satisfies them and is at least as informative as any start. Note that the predicted standard errors are
-    those of the plan, which the vehicle will not follow exactly.
+    the result satisfies them and is at least as informative as any start. Note that the standard errors are predicted
+    for the plan, which the vehicle will not follow exactly.
 
     Args:
         model: any field with a guess of its parameters: a multirotor with `FlightBounds`, another with `InputBounds`.

@@ -81,7 +81,7 @@ class Domain:
     Attributes:
         name: name of the system. Simulated flights depend on it.
         vehicle: the true vehicle.
-        drag_coefficient: C_D [kg/s]; by default that of the Iris, scaled by the square of the vehicle's size.
+        drag_coefficient: C_D [kg/s]; by default the Iris's, scaled by the square of the vehicle's size.
         forces: functions of `hybrid_jax.sim.forces`, or of your own, that add to thrust and gravity.
         nominal: the vehicle that the pilot of random flights is tuned for; by default the true one.
 

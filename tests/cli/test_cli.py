@@ -150,7 +150,7 @@ def test_without_a_vehicle_file_one_is_written_first(fitted, tmp_path, called, m
 
 SAID = {
     "the motors are u3 u0 u1 u2: motor_order=(3, 0, 1, 2)": "the motors are u3 u0 u1 u2: --motor-order 3,0,1,2",
-    "name those of its rotors: motor_order=…": "name those of its rotors: --motor-order",
+    "name the motors of its rotors: motor_order=…": "name the motors of its rotors: --motor-order",
     "topics: motors must be TOPIC:FIELD:UNIT": "--topics: motors must be TOPIC:FIELD:UNIT",
     'name the columns in a column map: columns="MAP.toml"': "name the columns in a column map: --columns MAP.toml",
     "columns: u0 never changes": "columns: u0 never changes",  # the name of a check

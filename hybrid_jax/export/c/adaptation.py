@@ -30,7 +30,7 @@ def export_adaptation_c(
 ) -> tuple[Path, Path]:
     """Write the filter of an `OnlineAdaptation` as C99: NAME.h and NAME.c with NAME_begin and NAME_update.
 
-    The functions do what the methods of these names do. Errors are those of `export_c`.
+    The functions do what the methods with these names do. It raises the errors of `export_c`.
 
     Args:
         folder: where the files are written; it is created if it does not exist.

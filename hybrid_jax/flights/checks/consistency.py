@@ -86,7 +86,7 @@ def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
     """
     if vehicle is not None and log.u.shape[1] != vehicle.rotors:
         found = f"{log.name}: has {log.u.shape[1]} motors, {vehicle.name} has {vehicle.rotors}"
-        raise ValueError(f"{found}; log all of them, or name those of its rotors: motor_order=…")
+        raise ValueError(f"{found}; log all of them, or name the motors of its rotors: motor_order=…")
     skip = max(0, (len(log) - MAX_SAMPLES) // 2)
     log = log[skip : skip + MAX_SAMPLES]
     lost, stale = float(gaps(log).mean()), float(repeats(log).mean())

@@ -70,7 +70,7 @@ def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
         signals = [recording.signals[name] for name in ROTOR_UNITS if name in recording.signals]
         moving = tuple(i for i in range(found) if any(np.ptp(signal.values[:, i]) > 0 for signal in signals))
         named = moving if vehicle is None and not stated else moving[:expected]
-        mend = f"name those of the rotors, which change: motor_order={named}"
+        mend = f"name the motors that change: motor_order={named}"
     who = "the airframe" if vehicle is None else "the vehicle file"
     advice = f"{found} motors are logged, {who} has {expected}: {mend}, or correct the vehicle file"
     fits = found == expected and found <= MOST_ROTORS
