@@ -1,6 +1,6 @@
 """Estimate the parameters of a field by least squares through the ODE solver, with covariances and intervals.
 
-`fit_least_squares` uses windows of full states; `fit_records` uses records in which only some states were measured.
+You should use `fit_least_squares` if you measure whole states, and `fit_records` if you measure only some of them.
 """
 
 from hybrid_jax.estimation.disturbances import fit_disturbance, observe

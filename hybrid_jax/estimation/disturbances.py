@@ -26,15 +26,15 @@ PARTS, WINDOWS = 3, 200  # parts that are left out in turn, and windows of each 
 def fit_disturbance(
     field: AbstractVectorField, sequences: Sequence[Trajectories], *, steps: int = 10, solver: Solver = None
 ) -> DisturbanceModel:
-    """Learn a linear model of the disturbance that a field lacks, by ridge regression on its errors after one interval.
+    """Learn to predict the disturbance that a field lacks, by ridge regression on its errors after one interval.
 
-    Use it when the errors of a model last, because the system has states that you do not measure. Parts of the
+    You should use it if the errors of a model last, because the system has states that you do not measure. Parts of the
     sequences that are left out in turn choose the penalty; an infinite one leaves the field's predictions unchanged.
     If you start from a model that was learned before, its weights change only if this explains more than twice as much
-    of the errors in each part left out as it alters predictions of the earlier data (after Mallows, 1973). So noise in
-    a hover does not change them.
+    of the errors in each part left out as it alters predictions of the earlier data (after Mallows, 1973). For example,
+    noise in a hover does not change them.
 
-    For example, after the last state of each window:
+    To predict from the last state of each window:
 
         model = hj.fit_disturbance(result.field, flights)
         state = hj.observe(model, past)[:, -1]
@@ -42,12 +42,12 @@ def fit_disturbance(
 
     Args:
         field: the field, or a `DisturbanceModel` that was learned before.
-        sequences: long windows, each without a gap; for one or two, parts of them are left out.
-        steps: intervals after which predictions are compared.
+        sequences: long windows, each without a gap. With one or two, parts of them are left out.
+        steps: number of intervals after which predictions are compared.
         solver: of diffrax, by default `RK4`.
 
     Raises:
-        ValueError: no sequence, or one that is shorter than twice the steps.
+        ValueError: if there is no sequence, or one is shorter than twice the steps.
     """
     before = field if isinstance(field, DisturbanceModel) else None
     field = field if before is None else before.field
@@ -77,11 +77,11 @@ def fit_disturbance(
 
 
 def observe(model: DisturbanceModel, past: Trajectories, solver: Solver = None) -> Float[np.ndarray, "n t+1 d+f"]:
-    """The states of a model (x, z₁, …, z_k) at the start and after each interval, from measured states x.
+    """Return the states of a model (x, z₁, …, z_k) at the start and after each interval, from measured states x.
 
     Args:
         model: as returned by `fit_disturbance`.
-        past: measured windows; the filters start at zero, so the first slowest time constant is less accurate.
+        past: measured windows, longer than the slowest time constant, since the filters start at zero.
         solver: of diffrax, by default `RK4`.
     """
     errors = errors_after_one(model.field, past, solver)

@@ -39,10 +39,10 @@ class LeastSquaresFit(eqx.Module):
     """The result of `fit_least_squares`.
 
     Attributes:
-        field: with the fitted θ_p; the start if no finite L_MSE was reached.
-        mse: L_MSE on the windows, of errors over `scale`.
-        steps: evaluations of the residuals and their Jacobian.
-        status: how it ended, a `Status`.
+        field: the field with the fitted θ_p, or the start if no L_MSE was finite.
+        mse: L_MSE on the windows, with errors divided by `scale`.
+        steps: the number of evaluations of the residuals and their Jacobian.
+        status: how the fit ended.
         discretisation: by how many standard errors half the solver's step would change a parameter at most; -1 if this
             was not computed.
     """
@@ -55,7 +55,7 @@ class LeastSquaresFit(eqx.Module):
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether it stopped before `max_steps`, at a finite L_MSE."""
+        """Whether the fit stopped before `max_steps`, at a finite L_MSE."""
         return self.status == Status.OK
 
 
@@ -68,22 +68,22 @@ def fit_least_squares(
     max_steps: int = 100,
     scale: Scale = None,
 ) -> LeastSquaresFit:
-    """Minimise L_MSE over θ_p of the field's physics, in inference mode, with each state's error divided by `scale`.
+    """Fit the parameters θ_p of a field's physics by least squares; the field is in inference mode.
 
-    Pure: it compiles, maps over stacked fields, and reports failure in `status` instead of raising. In float32 it
-    reaches the minimum within a few hundredths of a standard error. It warns if `discretisation` is above 0.5: you
-    should then use a smaller step, since the intervals do not include this error.
+    You can use it under `jit` and `vmap`, and it reports failure in `status` instead of raising. In float32 it reaches
+    the minimum within a few hundredths of a standard error. You get a warning if `discretisation` is above 0.5: you
+    should then use a smaller step, since intervals do not include this error.
 
     Args:
-        field: its θ_p is the start; a residual beside the physics does not change.
-        windows: of the system whose θ_p you want. NaN in x means not measured, and counts as no error.
-        solver: integrates the field over each sample interval, by default one step of RK4.
-        max_steps: the most evaluations of the residuals and their Jacobian.
+        field: the initial field; a residual beside its physics does not change.
+        windows: windows of the system. NaN in x means "not measured" and counts as no error.
+        solver: the integrator over each interval, by default one step of RK4.
+        max_steps: the largest number of evaluations of the residuals and their Jacobian.
         scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
 
     Raises:
-        ValueError: physics without parameters, windows that are malformed or do not fit the field, or an implicit
-            solver that finds no step.
+        ValueError: if physics has no parameters, windows are malformed or do not fit the field, or an implicit solver
+            finds no step.
     """
     windows = check_windows(field, windows, missing=True)
     checks.count("max_steps", max_steps)

@@ -38,16 +38,16 @@ class RecordFit(eqx.Module):
     """The result of `fit_records`.
 
     Attributes:
-        model: with the fitted numbers; it starts like the first record.
+        model: the model with the fitted numbers; it starts like the first record.
         starts: the state at the start of each record (r, d).
-        starts_error: its standard error (r, d); three rotation angles [rad] for an attitude.
+        starts_error: the standard error of `starts` (r, d); three rotation angles [rad] for an attitude.
         ends: the state at the end of each record (r, d).
         times: first and last time of each record at which outputs were compared [s] (r, 2).
         intervals: confidence interval of each physical parameter, number by number; infinite if not identifiable.
         errors: RMS of each output's errors in the fit (k).
-        set_aside: how many samples of each output counted less, as their errors were too large.
-        covariance: of the learned numbers (p, p), in the order of `ravel_learned`.
-        steps: of Levenberg–Marquardt, summed over rounds.
+        set_aside: number of samples of each output that counted less, because their errors were too large.
+        covariance: the covariance (p, p) of the learned numbers, in the order of `ravel_learned`.
+        steps: number of Levenberg–Marquardt steps, summed over rounds.
         status: how the last round ended.
         discretisation: by how many standard errors half the solver's step would change a learned number at most; 0 if
             there is none.
@@ -94,32 +94,32 @@ def fit_records(
 ) -> RecordFit:
     """Fit the learned numbers of a model and the initial states to all measured outputs.
 
-    It warns if half the solver's step would give others, see `RecordFit.discretisation`, and of what no sample
-    determines, see `RecordFit.directions`.
+    You get a warning if half the solver's step would give other numbers (`RecordFit.discretisation`), and of what no
+    sample determines (`RecordFit.directions`).
 
     Args:
-        model: the start of the search.
-        records: one or more; each output is compared wherever a record has samples of it.
+        model: the initial model.
+        records: one or more records. Each output is compared at the samples that a record has of it.
         dt: length of the intervals in which the inputs are constant [s].
         between: how inputs act between their samples: "held", "linear" or "averaged", see `records.on_grid`.
-        segment: length of the segments of multiple shooting [s], used before a simulation; by default the search begins
-            with the simulation. You need it for unstable systems, far starts, and process noise.
+        segment: length of the segments of multiple shooting [s], which come before whole simulations; by default there
+            are none. You need them for unstable systems, a poor initial model, and process noise.
         prior: standard deviations of learned numbers from their start, by the beginning of their path, for example
             {"field.residual": 0.3}; the others are free.
         noise: expected size of each output's errors in the first round, relative to which `prior` is weighed; by
             default the standard deviation of its samples.
-        robust: from the second round on, an error of more than so many times the usual one counts linearly. By default
-            all count as squares; 3 is usual for data with outliers.
-        rounds: fits, each with outputs weighted by the previous round's errors.
-        max_steps: of Levenberg–Marquardt in each round.
-        starts: searches in the first round, of which the one with the least cost goes on: the first from the model, the
-            others from learned numbers drawn from `prior`, always the same ones; free numbers are not drawn.
-        solver: of diffrax, by default `RK4`.
-        substeps: steps of the solver in each interval.
+        robust: from the second round on, an error counts linearly beyond this many times the usual one, for example 3
+            for data with outliers. By default all errors are squared.
+        rounds: number of fits, each with outputs weighted by the errors of the round before.
+        max_steps: largest number of Levenberg–Marquardt steps in each round.
+        starts: number of searches in the first round, of which the best continues. The first begins at the model, and
+            the others at numbers drawn from `prior`; numbers without a prior are not drawn.
+        solver: a solver of diffrax, by default `RK4`.
+        substeps: number of solver steps in each interval.
         level: confidence level of the intervals, between 0 and 1.
 
     Raises:
-        ValueError: a record without a signal of the model, too many unknowns, or an implicit solver that finds no step.
+        ValueError: if a record lacks a signal, there are too many unknowns, or an implicit solver finds no step.
     """
     records = checks.list_of("records", records, Record)
     if not records:

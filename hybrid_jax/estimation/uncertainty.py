@@ -66,12 +66,12 @@ def covariance_of(
     free: Bool[Array | np.ndarray, " p"] | None = None,
     cluster: int = 1,
 ) -> Float[Array, "p p"]:
-    """The covariance of θ_p of a field fitted to the windows, given θ_d, in the physics' own parametrisation.
+    """Return the covariance of θ_p of a field that was fitted to windows, in the physics' own parametrisation.
 
-    Rows are in the order of `ravel_parameters`, for example log Ix, log Iy, log k of a `RigidBody`. Pure: it compiles
-    and maps over stacked fields. A parameter that is not identifiable has an infinite variance. Note that the
-    covariance does not include bias: intervals are too narrow if a network was trained on the same windows, or if the
-    model lacks an effect such as drag (see `experiments/coverage.py`).
+    Rows are in the order of `ravel_parameters`, for example log Ix, log Iy, log k of a `RigidBody`. A parameter that is
+    not identifiable has an infinite variance. You can use it under `jit` and `vmap`. Note that the covariance takes the
+    network as exact and does not include bias: intervals are too narrow if a network was trained on the same windows,
+    or if the model lacks an effect such as drag.
 
     Args:
         field: at, or near, the minimum over θ_p of Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p.
@@ -81,7 +81,7 @@ def covariance_of(
             within one may be correlated and of any unit (Huber 1967; White 1980; the factor is
             MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for white noise of one variance.
         solver: integrates the field over each sample interval, by default one step of RK4.
-        chunk: windows that are in memory at a time.
+        chunk: number of windows in memory at a time.
         error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
             The slope and curvature of another loss enter M and H (Huber 1967).
         scale: divides the error of each state, as in `fit_least_squares`.
@@ -91,7 +91,8 @@ def covariance_of(
             sandwich of summed J_iᵀr_i is too narrow for few clusters, and intervals need Student's t.
 
     Raises:
-        ValueError: malformed windows, or no more than parameters; an unknown kind, or homoscedastic with an `error`.
+        ValueError: if there are no more windows than parameters, they are malformed, or kind is unknown or
+    homoscedastic with an `error`.
     """
     windows = least_squares.check_windows(field, windows, missing=True)
     traced = checks.is_traced(windows.x)  # else NumPy counts, which keeps no program for each size
@@ -159,20 +160,20 @@ def intervals(
     level: float = 0.95,
     degrees: float | Float[np.ndarray, " p"] | None = None,
 ) -> dict[str, Interval]:
-    """The physical parameters of a field, each with a confidence interval; names as in `named_parameters`.
+    """Return the physical parameters of a field with confidence intervals; names are as in `named_parameters`.
 
     The error is normal in the physics' own parametrisation: the interval is value · exp(±z s) of a parameter that is
     stored as a logarithm and returned by `theta()`, otherwise value ± z s.
 
     Args:
-        field: at the estimate; a disturbance in its physics is one of the parameters.
+        field: the fitted field. A disturbance in its physics is one of the parameters.
         covariance: covariance in the physics' own parametrisation (p, p), for example from `covariance_of`.
         level: confidence level, between 0 and 1.
         degrees: degrees of freedom of the covariance, or of each variance, for Student's t: for example one less than
             its clusters, or see `pooling.satterthwaite`; by default the normal distribution is used.
 
     Raises:
-        ValueError: a level not between 0 and 1, or a covariance of another shape or with a negative variance.
+        ValueError: if level is not between 0 and 1, or the covariance has another shape or a negative variance.
     """
     check_level(level)
     theta, unravel = ravel_parameters(physics := physics_of(field))
@@ -234,7 +235,7 @@ class DisturbanceSelection(eqx.Module):
 
     Attributes:
         fit: the better of the two fits, with a disturbance of zero if none is needed.
-        needed: whether it lowers L_MSE of left-out windows, in their mean, by more than the standard error of that.
+        needed: whether a disturbance lowers the mean L_MSE of left-out windows by more than its standard error.
     """
 
     fit: LeastSquaresFit
@@ -254,14 +255,14 @@ def select_disturbance(
     """Fit θ_p with and without a constant disturbance and choose by leave-one-out cross-validation (Stone 1974).
 
     The simpler model is chosen unless it is worse by more than one standard error of the difference (Breiman, Friedman,
-    Olshen and Stone, Classification and Regression Trees, 1984, Sec. 3.4.3), or if windows do not identify θ_p. Pure,
-    and raises as `fit_least_squares`.
+    Olshen and Stone, Classification and Regression Trees, 1984, Sec. 3.4.3), or if windows do not identify θ_p. It
+    raises the errors of `fit_least_squares`.
 
     Args:
-        field: its θ_p, and its disturbance if it has one, are the start.
-        windows: of the system whose θ_p you want, independent of each other.
-        solver: integrates the field over each sample interval, by default one step of RK4.
-        max_steps: the most steps of each of the two fits.
+        field: the initial field, with or without a disturbance.
+        windows: windows of the system, independent of each other.
+        solver: the integrator over each interval, by default one step of RK4.
+        max_steps: the largest number of steps of each fit.
         scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
         indices: the disturbed states, see `with_disturbance`.
     """
