@@ -4,7 +4,7 @@
     result = hj.adapt(source.best, windows)
     print(result.report())
 
-By default (`Auto`) the most probable change is chosen; `METHODS` lists the other methods, and `Method` explains how you
+By default (`Auto`) the most probable change is chosen. `METHODS` lists the other methods, and `Method` shows how to
 write your own.
 """
 

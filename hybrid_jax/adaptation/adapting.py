@@ -83,7 +83,7 @@ def adapt(
     settings: Settings | None = None,
     level: float = 0.95,
 ) -> Adaptation:
-    """Adapt a source field to windows of a changed system.
+    """Adapt a trained field to a few windows of a changed system.
 
     Args:
         field: a trained `Hybrid`, or any other field.
@@ -91,16 +91,17 @@ def adapt(
             windows follow each other, for example in one flight, the intervals allow for errors that are correlated
             within a fifth of the windows. NaN in x means not measured, and counts as no error; x0 and u must be whole.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` to write your own.
-        validation: windows for early stopping and penalties, which should be of another flight. By default
-            the last fifth of `windows` is held out if the method needs validation.
+        validation: windows for early stopping and penalties; you should take them from another flight. By default the
+            last fifth of `windows` is held out if the method needs validation.
         learned_from: windows that the source was trained on, by default those that `hj.fit` stores in its networks.
             "auto" uses them to estimate the source's own error, and the report warns if `windows` are unlike them.
         settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, which is
             independent of units. If you pass settings, their objective is used, by default the plain MSE.
-        level: confidence level of the intervals.
+        level: confidence level of the intervals, between 0 and 1.
 
     Raises:
-        ValueError: an unknown method, malformed, too few or other windows, or a field that the method cannot adapt.
+        ValueError: if the method is unknown, windows are malformed, too few or of another system, or the method cannot
+    adapt the field.
     """
     checks.not_traced("adapt", field, windows, validation, learned_from)
     name, method = _named(method)

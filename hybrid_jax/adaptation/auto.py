@@ -111,8 +111,8 @@ class Auto(Method):
 
     Attributes:
         networks: whether the network may change.
-        blocks: how many blocks of windows are left out in turn to estimate the expected errors.
-        max_steps: the most steps of each fit.
+        blocks: number of blocks of windows that are left out in turn to estimate the expected errors.
+        max_steps: largest number of steps of each fit.
         plausible: prior standard deviations of the changes.
     """
 

@@ -55,9 +55,9 @@ class ExpertAugmented(eqx.Module):
     """A hybrid whose θ_p an encoder estimates from the past of each flight; also a method of `adapt`.
 
     Attributes:
-        encoder: from the past of a flight to a place in the box.
-        expert: the hybrid of the source, which does not change.
-        box: lowest and highest factor on each of the expert's parameters.
+        encoder: a network from the past of a flight to a place in the box.
+        expert: the source's hybrid, which does not change.
+        box: the lowest and highest factor on each of the expert's parameters.
     """
 
     encoder: Encoder
@@ -123,13 +123,13 @@ def expert_augmented(
     """Build an expert with an untrained encoder of two hidden layers.
 
     Args:
-        expert: a hybrid trained on the source; its physics must store its parameters as logarithms.
-        past: windows of source flight, as long as the encoder will read; they set the scale of its inputs.
-        box: lowest and highest factor on each of the expert's parameters, 0 < low <= high.
-        hidden: units of each hidden layer of the encoder.
+        expert: a hybrid that was trained on the source. Its physics must store its parameters as logarithms.
+        past: windows of the source, as long as the encoder will read. They set the scale of its inputs.
+        box: the lowest and highest factor on each of the expert's parameters, 0 < low <= high.
+        hidden: number of units of each hidden layer of the encoder.
 
     Raises:
-        ValueError: an invalid box, or malformed past windows.
+        ValueError: if the box is invalid, or past windows are malformed.
     """
     if len(box) != 2 or not 0 < box[0] <= box[1] < np.inf:
         raise ValueError(f"box must be two factors, 0 < low <= high, got {box}")
@@ -171,8 +171,8 @@ class Augmentation(Objective):
     Every source window is used twice: as recorded, and as flown by the expert with a θ_p from the box.
 
     Attributes:
-        past: intervals at the head of a window that the encoder reads; the rest is predicted.
-        seed: seed of the random θ_p.
+        past: number of intervals at the start of a window that the encoder reads; the rest is predicted.
+        seed: random seed of θ_p.
     """
 
     past: int = 10

@@ -30,8 +30,8 @@ class Solution(NamedTuple):
 
     Attributes:
         field: the adapted field.
-        steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
-        status: how it ended, a `Status`.
+        steps: number of epochs, or of evaluations of the Jacobian; 0 for a closed form.
+        status: how the method ended.
         choice: the candidates of `Auto` and the chosen one, an `auto.Choice`; None for another method.
     """
 
@@ -51,34 +51,34 @@ class Method(Protocol):
             def solve(self, field, train, validation, settings):
                 return Solution(min(self.candidates, key=lambda one: rollout_mse(one, validation)))
 
-    Two class attributes are optional: `uses_validation = False` keeps all windows for training. You should set
-    `has_intervals = True` only if the method minimises L_MSE over nothing but the physics' parameters, since only these
-    then have valid intervals.
+    Two class attributes are optional. `uses_validation = False` keeps all windows for training. You should set
+    `has_intervals = True` only if the method minimises L_MSE over the physics' parameters and nothing else, since
+    intervals are valid only then.
     """
 
     def solve(
         self, field: AbstractVectorField, train: Trajectories, validation: Trajectories, settings: Settings
     ) -> Solution:
-        """Adapt a field. Methods of the library compile and map over stacked fields.
+        """Adapt a field. You can use the library's methods under `jit`, and under `vmap` over stacked fields.
 
         Args:
-            field: the source, which must not be changed.
+            field: the source field, which must not be changed.
             train: windows of the changed system to adapt to.
-            validation: other windows of it, for early stopping and choices.
-            settings: objective and solver; for training also minibatches and regulariser.
+            validation: other windows of the changed system, for early stopping and choices.
+            settings: the objective and the solver; for training also minibatches and regulariser.
 
         Raises:
-            ValueError: a field, windows or settings that the method cannot use.
+            ValueError: if the method cannot use the field, windows or settings.
         """
         ...
 
 
 @dataclass(frozen=True)
 class LeastSquares(Method):
-    """Least squares for θ_p and a constant disturbance; the residual does not change.
+    """Fit θ_p and a constant disturbance by least squares; the residual does not change.
 
     Attributes:
-        disturbance: whether one is fitted; with "auto" only if the windows need one, see `select_disturbance`.
+        disturbance: whether to fit a disturbance; "auto" fits one if the windows need it, see `select_disturbance`.
         indices: the disturbed states, see `with_disturbance`.
         max_steps: the most steps of each fit.
     """
@@ -115,14 +115,14 @@ class LeastSquares(Method):
 
 @dataclass(frozen=True)
 class FineTune(Method):
-    """Adam from the source's parameters, with early stopping on the validation windows.
+    """Fine-tune by Adam from the source's parameters, with early stopping on the validation windows.
 
     Attributes:
         rates: learning rates, a tree prefix of the field; by default 1e-2 for physics and 1e-3 for the residual.
         frozen: the part that is not trained, or None.
-        min_epochs: no early stop before.
-        patience: stop after so many epochs without a better validation loss.
-        max_epochs: stop after so many epochs.
+        min_epochs: training does not stop early before this epoch.
+        patience: training stops after this many epochs without a better validation loss.
+        max_epochs: training stops after this many epochs.
         regulariser_weight: λ of `settings.regulariser`, if there is one.
         l2_sp: weight of half the squared distance from the source's parameters, see `held_at_start`.
         seed: random seed for shuffling minibatches.
@@ -177,7 +177,7 @@ def held_at_start(weight: float) -> optax.GradientTransformation:
 
 @dataclass(frozen=True)
 class Ridge(Method):
-    """A linear correction by ridge regression, with the penalty of smallest validation error.
+    """Fit a linear correction by ridge regression, with the penalty that has the smallest validation error.
 
     Attributes:
         update: `ridge.last_layer`, `ridge.linear_residual` or a function like them.
@@ -194,7 +194,7 @@ class Ridge(Method):
 
 @dataclass(frozen=True)
 class Source(Method):
-    """No adaptation: the baseline."""
+    """The baseline: keep the source field."""
 
     uses_validation: ClassVar[bool] = False
 

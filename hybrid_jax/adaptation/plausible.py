@@ -21,7 +21,7 @@ GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[
 
 @dataclass(frozen=True)
 class Plausible:
-    """Standard deviations of a normal prior for changes, centred at the source.
+    """How large changes usually are: standard deviations of a normal prior that is centred at the source.
 
     Attributes:
         theta: of each parameter of a rigid body in its own parametrisation, for example 0.3 for 30 % of a ratio.
@@ -33,7 +33,7 @@ class Plausible:
         disturbance: constant disturbance of another system, over the RMS rate of each state in the windows.
 
     Raises:
-        ValueError: a size that is not positive.
+        ValueError: if a size is not positive.
     """
 
     theta: float = 0.3
@@ -53,7 +53,7 @@ class Plausible:
 
         Args:
             field: the extended source.
-            windows: of the changed system.
+            windows: windows of the changed system.
         """
         groups, theta = groups_of(names_of(field)), ravel_parameters(field)[0]
         k = groups.count("disturbance")

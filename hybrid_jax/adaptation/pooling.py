@@ -17,7 +17,7 @@ SOURCES = 3  # at least so many: the variance between two says nothing
 
 @entry
 def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parameter]:
-    """Pool the parameters that all results share, with intervals from the variance within and between results.
+    """Combine the parameters of several results. Intervals include the variance within and between results.
 
     The covariance of one fit assumes an exact network. Sources with different seeds differ in what their networks
     absorbed, so they are combined as in multiple imputation (Rubin, Multiple Imputation for Nonresponse in Surveys,
@@ -28,7 +28,7 @@ def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parame
         level: confidence level.
 
     Raises:
-        ValueError: fewer than three results, or one without intervals; the message says which.
+        ValueError: if there are fewer than three results, or one has no intervals.
     """
     check_level(level)
     results = checks.list_of("results", results, Adaptation)

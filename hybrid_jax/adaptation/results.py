@@ -26,7 +26,7 @@ class Parameter:
         value: the estimate, in `unit`.
         low: lower end of the interval in `unit`: NaN without a valid one, −∞ or 0 if the parameter is not identifiable.
         high: upper end in `unit`: NaN without a valid interval, ∞ if the parameter is not identifiable.
-        unit: for example "kg m²"; None if unknown.
+        unit: the unit, for example "kg m²"; None if unknown.
         effective: why the value predicts well but need not be the system's own, so that it has no interval; None if it
             is physical.
     """
@@ -39,7 +39,7 @@ class Parameter:
 
     @property
     def has_interval(self) -> bool:
-        """Whether there is a valid interval, which may be infinite."""
+        """Whether the parameter has a valid interval, which may be infinite."""
         return not math.isnan(self.low)
 
     def __str__(self) -> str:
@@ -55,12 +55,12 @@ class Adaptation:
     Attributes:
         field: the adapted field.
         method: name of the method, or its class if you passed a value.
-        parameters: of physics and disturbance, by the names of `uncertainty.named_parameters`.
+        parameters: parameters of physics and disturbance, by the names of `uncertainty.named_parameters`.
         disturbance: the constant part of ẋ in the units of ẋ; None if there is none.
         mse_before: L_MSE of the source field on the windows, in squared units of the states.
         mse_after: L_MSE of the adapted field on the windows, in the same units.
         windows: the number of windows that were used.
-        steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
+        steps: number of epochs, or of evaluations of the Jacobian; 0 for a closed form.
         status: how the method ended.
         level: confidence level of the intervals, between 0 and 1.
         without_intervals: why there are no intervals; None if there are.
@@ -109,7 +109,7 @@ class Adaptation:
         return self.status == Status.OK
 
     def report(self) -> str:
-        """A summary in plain text, a few lines."""
+        """Return a summary in plain text, a few lines."""
         return "\n".join([*self._about_the_fit(), *self._about_parameters()])
 
     def _about_the_fit(self) -> Iterator[str]:
@@ -157,7 +157,7 @@ class Adaptation:
             yield f"No intervals: {self.without_intervals}."
 
     def to_dict(self) -> dict[str, Any]:
-        """All but the field as JSON values; numbers that are not finite become None."""
+        """Return all attributes but the field as JSON values; numbers that are not finite become None."""
         parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
         found = vars(self) | {"status": str(self.status), "converged": self.converged, "parameters": parameters}
         return json_value({name: value for name, value in found.items() if name != "field"})
