@@ -43,17 +43,17 @@ TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a 
 
 
 class OnlineAdaptation(AbstractEstimator):
-    """Recursive estimator of the parameters of any field and of a constant disturbance, with their covariance.
+    """Estimate the parameters of any field and a constant disturbance while the system runs, with their covariance.
 
         filter = hj.OnlineAdaptation(field, dt=0.01, noise=0.02, disturbance=1.0)
         state = filter.begin(x)
         state = filter.update(state, x, u)  # at each sample; then filter.model(state), filter.intervals(state)
 
-    All methods are pure: you can compile them and map them over stacked states. A sample of another shape raises
-    ValueError; invalid numbers do not, see `flags`.
+    You can use all methods under `jit`, and under `vmap` over stacked states. A sample of another shape raises
+    ValueError. Invalid numbers in a sample do not; see `flags`.
 
     Attributes:
-        field: the model; its physics is adapted from its present values, its network is not changed.
+        field: the model. Its physics is adapted from its present values, and its network does not change.
         dt: time between two samples [s].
         noise: standard deviation of the measurement of each state.
         prior: standard deviation of each parameter before and after a change, in the physics' own parametrisation (for
@@ -66,10 +66,10 @@ class OnlineAdaptation(AbstractEstimator):
             model stays the field's own until a change is detected.
         tuning: settings of forgetting and change detection.
         names: names of the parameters, in the order of θ.
-        scales: the prior standard deviation of each, in that order.
+        scales: the prior standard deviation of each parameter, in the same order.
 
     Raises:
-        ValueError: a number is out of range, a name unknown, or the physics has no parameters.
+        ValueError: if a number is out of range, a name is unknown, or the physics has no parameters.
     """
 
     field: AbstractVectorField
@@ -159,10 +159,10 @@ class OnlineAdaptation(AbstractEstimator):
         """Update the state after one period.
 
         Args:
-            x: the new sample; NaN where nothing was measured.
+            x: the new sample; NaN for a state that was not measured.
             u: the mean applied input over the period (after latency and rotor lag), not the command.
-            elapsed: periods since the last update. After more than one, the state is reset to the sample.
-            each: maps a function over the filters of all hypotheses, for example `jax.vmap`.
+            elapsed: number of periods since the last update. After more than one, the state is reset to the sample.
+            each: how to map a function over the filters of all hypotheses, for example `jax.vmap`.
         """
         checks.not_negative("elapsed", elapsed)
         x, u = jnp.asarray(x, state.x.dtype), jnp.asarray(u, state.x.dtype)

@@ -28,7 +28,7 @@ class Hypothesis:
         lead: how far ahead those parameters are extrapolated in the model [s].
 
     Raises:
-        ValueError: there is no parameter, a number is out of range, or a rate's parameter is not in `parameters`.
+        ValueError: if there is no parameter, a number is out of range, or a rate's parameter is not in `parameters`.
     """
 
     name: str

@@ -25,11 +25,11 @@ Numbers = float | tuple[float, ...] | np.ndarray
 
 
 class OnlineState(eqx.Module):
-    """State of an `OnlineAdaptation` of d states and p parameters, all numbers, so that it can be exported to C.
+    """The state of an `OnlineAdaptation` with d states and p parameters. It has only numbers, so C can hold it.
 
     Attributes:
-        x: estimated state.
-        theta: change of θ in prior standard deviations, from the filter of all parameters.
+        x: the estimated state.
+        theta: the change of θ in prior standard deviations, from the filter of all parameters.
         root: a square root of the covariance of both, in these units.
         excitation: information of recent samples about θ.
         test: the change test of the filter of all parameters.
@@ -63,27 +63,27 @@ class OnlineState(eqx.Module):
 
     @property
     def joint(self) -> Belief:
-        """Belief of z = [x, θ] of the filter of all parameters."""
+        """The belief about z = [x, θ] of the filter of all parameters."""
         return Belief(jnp.concatenate([self.x, self.theta]), self.root)
 
     @property
     def covariance(self) -> Float[Array, "*n d+p d+p"]:
-        """Covariance of x and θ, in the units of `theta`."""
+        """The covariance of x and θ, in the units of `theta`."""
         return self.root @ self.root.mT
 
 
 class Flags(NamedTuple):
-    """Problems and changes detected by the filter.
+    """The problems and changes that a filter detected.
 
     Attributes:
-        missing: states not measured in the last sample: NaN, or equal to the previous value.
-        frozen: states whose sensor repeats its last value.
-        gap: nothing was measured for longer than `Tuning.gap`.
-        changed: an alarm in the last second.
-        inconsistent: errors are too large for the model at any θ, or alarms persist, for example because a sensor has a
-            wrong sign, unit or position: the last good estimate is used.
-        unexcited: parameters that recent samples do not excite, separately or in combination with others.
-        at_bound: parameters at the end of their range.
+        missing: which states were not measured in the last sample: NaN, or equal to the previous value.
+        frozen: which states have a sensor that repeats its last value.
+        gap: whether nothing was measured for longer than `Tuning.gap`.
+        changed: whether there was an alarm in the last second.
+        inconsistent: whether errors are too large for the model at any θ, or alarms persist, for example because a
+            sensor has a wrong sign, unit or position. The last good estimate is then used.
+        unexcited: which parameters recent samples do not excite, alone or in combination with others.
+        at_bound: which parameters are at the end of their range.
     """
 
     missing: Bool[Array, " d"]

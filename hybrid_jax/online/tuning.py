@@ -14,16 +14,15 @@ SLOWEST = 0.05  # period up to which a pace of 1 is right
 
 @dataclass(frozen=True)
 class Tuning:
-    """Settings of forgetting and change detection of an `OnlineAdaptation`.
+    """How an `OnlineAdaptation` forgets and detects changes.
 
-    The values were tuned by hand on simulated flights of a quadrotor at 100 Hz, with other seeds than the report on
-    online adaptation. They are in standard deviations of the prior and of the noise, so they should carry over to your
-    system once `prior`, `noise` and `process` are right. If you change anything, you should begin with `alarm` (missed
-    changes against false alarms), `drift` and `caution` (intervals that are too narrow), and with `pace` if your system
-    is much slower or sampled much less often.
+    The defaults were tuned by hand on simulated flights of a quadrotor at 100 Hz, with other seeds than the report on
+    online adaptation. They are in standard deviations of the prior and of the noise, so they should fit your system if
+    `prior`, `noise` and `process` do. If changes are missed or alarms are false, you should begin with `alarm`; if
+    intervals are too narrow, raise `drift` and `caution`; if your system is much slower, set `pace`.
 
     Attributes:
-        pace: factor on all times of the filter except `gap`; 0 for 1, or the period over 0.05 s if larger.
+        pace: factor on all times of the filter except `gap`; 0 for the larger of 1 and the period over 0.05 s.
         drift: random walk of a parameter, as a share of its prior standard deviation [1/√s, for a pace of 1].
         gusts: largest factor on the random walk of a disturbance while innovations are biased, for example in gusts.
         alarm: threshold of the change test, which is standard normal without a change.
@@ -38,7 +37,7 @@ class Tuning:
         caution: share of the effect of uncertain parameters on a step that counts as noise, because of nonlinearity.
 
     Raises:
-        ValueError: a number is negative, or zero although it must be positive.
+        ValueError: if a number is negative, or zero although it must be positive.
     """
 
     pace: float = 0.0
