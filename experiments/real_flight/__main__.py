@@ -12,7 +12,7 @@ from experiments.real_flight.simulated import write_logs
 from experiments.real_flight.study import run_folds
 from experiments.runner import command
 from experiments.runner.stages import stages_of
-from hybrid_jax.cli.command import BAD_INPUT, split_lists
+from hybrid_jax.cli.command import BAD_INPUT
 from hybrid_jax.cli.logs import Flights, read_flights, require_distinct
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 from hybrid_jax.identification.learning import STEPS, learnable
@@ -31,13 +31,11 @@ real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--t
 
   Public flights: IMRCLab/crazyflie-data-collection (a Crazyflie with and without a load) and
   idsia-robotics/nanodrone-sysid-benchmark on GitHub. Both need a column map and have licences of their own."""
-# Options that take several values.
-LISTS = ("--horizon", "--n-target", "--polynomial", "--motor-order", "--topics", "--learn")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the experiment; without any flights, explain how to get some and exit with code 2."""
-    given = split_lists(sys.argv[1:] if arguments is None else arguments, LISTS)
+    given = list(sys.argv[1:] if arguments is None else arguments)
     if not any(word.startswith(("--simulated", "--source", "--vehicle")) for word in given):
         command.check(NAME, ABOUT, given, PRESETS)  # a wrong option is named before flights are asked for
         print(GUIDE, file=sys.stderr)

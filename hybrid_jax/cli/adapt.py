@@ -11,7 +11,7 @@ from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
 from hybrid_jax.cli.identified import KEEP
-from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, Known, flights_for, known_of, unlike
+from hybrid_jax.cli.logs import FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.identification.learning import adapted, without_past
@@ -20,7 +20,7 @@ from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import load, save
 from hybrid_jax.trajectories import Trajectories
 
-__all__ = ["LISTS", "Options", "run"]
+__all__ = ["Options", "run"]
 UNLIKELY = 0.05  # probability that nothing changed, below which the vehicle is another one
 SHOWN = 5  # parameters beside the answer
 DIFFER = "These flights differ from the model, but do not determine which of its parameters changed."

@@ -10,14 +10,14 @@ from jaxtyping import Float
 
 from hybrid_jax.cli import errors, identified, page
 from hybrid_jax.cli.command import step
-from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, Known, flights_for, known_of, unlike
+from hybrid_jax.cli.logs import FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.baselines import FrozenRates, Kinematics
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.windows import flight_of
 from hybrid_jax.identification.prediction_errors import UNITS, errors_of, ratio, rmse, rmse_by_flight
 from hybrid_jax.io.models import load
 
-__all__ = ["LISTS", "Options", "run"]
+__all__ = ["Options", "run"]
 LONGER = 5  # times the window that the model learned from
 WORST = 5  # moments that are listed
 

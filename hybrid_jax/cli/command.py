@@ -9,7 +9,7 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from itertools import takewhile
 from typing import Any, TypeVar, cast, get_type_hints
@@ -18,7 +18,7 @@ import tyro
 
 from hybrid_jax import checks
 from hybrid_jax.cli import INTERRUPTED
-from hybrid_jax.cli.help import expected, option_of, short_help
+from hybrid_jax.cli.help import expected, option_of, short_help, values
 from hybrid_jax.runtime import configure
 
 Options = TypeVar("Options")
@@ -70,7 +70,7 @@ def run(arguments: Sequence[str]) -> None:
         if verb not in VERBS:
             raise ValueError(f"no such verb{_meant(verb, VERBS)}; see hybrid-jax --help")
         module = import_module(f"hybrid_jax.cli.{verb}")
-        options = parsed(module.Options, f"hybrid-jax {verb}", split_lists(given, module.LISTS))
+        options = parsed(module.Options, f"hybrid-jax {verb}", given)
         configure()
         checks.writable_folder("--out", options.out)
         if (output := getattr(options, "output", None)) is not None:
@@ -96,7 +96,9 @@ def parsed(
     if {"-h", "--help"} & {*given}:
         print(short_help(kind, program, description, default, common))
         sys.exit(0)
-    given = ["--help"] if "--help-all" in given else given
+    hints = get_type_hints(kind, include_extras=True).items()
+    known = {f"--{option_of(name, getattr(hint, '__metadata__', ()))}": values(hint) for name, hint in hints}
+    given = ["--help"] if "--help-all" in given else split_lists(given, known)
     try:
         with contextlib.redirect_stderr(output):
             return cast(Options, tyro.cli(kind, prog=program, args=given, description=description, default=default))
@@ -104,13 +106,11 @@ def parsed(
         if not stop.code:
             raise  # --help
         usage = short_help(kind, program, "", default, common).partition("\n")[0]
-        raise ValueError(f"{_complaint(kind, given, output.getvalue(), usage)}; see --help") from None
+        raise ValueError(f"{_complaint(known, given, output.getvalue(), usage)}; see --help") from None
 
 
-def _complaint(kind: type, given: Sequence[str], box: str, usage: str) -> str:
+def _complaint(known: Mapping[str, str], given: Sequence[str], box: str, usage: str) -> str:
     """Say in one line what is wrong with a command line, around which tyro draws a box."""
-    hints = get_type_hints(kind, include_extras=True).items()
-    known = {f"--{option_of(name, getattr(hint, '__metadata__', ()))}": hint for name, hint in hints}
     # One that is wrong is named even where an argument is missing, which tyro finds first.
     for word in (re.split(r"[=.]", word)[0] for word in given if word.startswith("--")):
         if word.replace("--no-", "--", 1) not in (*known, "--help"):
@@ -122,17 +122,17 @@ def _complaint(kind: type, given: Sequence[str], box: str, usage: str) -> str:
         return f"an argument is missing; {usage}"
     if (found := re.match(r"Error parsing (--[\w-]+): ", text)) and found[1] in known:
         at = max(i for i, word in enumerate(given) if word.partition("=")[0] == found[1])
-        values = [given[at].partition("=")[2], *takewhile(lambda word: not word.startswith("--"), given[at + 1 :])]
-        return f"{found[1]} must be {expected(known[found[1]])}, got {' '.join(filter(None, values))}"
+        typed = [given[at].partition("=")[2], *takewhile(lambda word: not word.startswith("--"), given[at + 1 :])]
+        return f"{found[1]} must be {expected(known[found[1]])}, got {' '.join(filter(None, typed))}"
     return re.sub(r"^Error parsing \w+: ", "", text).removesuffix(".")
 
 
-def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
+def split_lists(arguments: Sequence[str], known: Mapping[str, str]) -> list[str]:
     """Split comma-separated values, for example 10,50, of options with several values."""
     words, option = [], ""
     for word in arguments:
         option, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
-        several = option in lists and word != option
+        several = " " in known.get(option, "") and word != option
         words += [option] * word.startswith("--") + value.split(",") if several else [word]
     return words
 

@@ -30,8 +30,7 @@ from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.online import OnlineAdaptation
 from hybrid_jax.state import BODY_RATES, SENSOR_NOISE, STATE_SIZE, VELOCITY
 
-__all__ = ["LISTS", "Options", "run"]
-LISTS = ("--to", "--noise")
+__all__ = ["Options", "run"]
 RESPONSE, FASTER = 0.2, 1.05  # of the figure: seconds, and factor on the speed of the first rotor
 UNITS = "velocity [m/s]", "body rates [rad/s]"
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state

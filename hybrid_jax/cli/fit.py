@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 
 from hybrid_jax import checks
-from hybrid_jax.cli import errors, identify, logs, page
+from hybrid_jax.cli import errors, identify, page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
 from hybrid_jax.cli.inspect import inspected, write_vehicle
@@ -25,8 +25,7 @@ from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
 
-__all__ = ["LISTS", "Options", "run"]
-LISTS = (*logs.LISTS, "--disturbance")
+__all__ = ["Options", "run"]
 OF_MODEL = ("windows", "motion")  # of the model, and not of the report
 REMEMBERS = (
     "Errors of the model last, for example because a load swings that no sensor shows. So it predicts them from its "

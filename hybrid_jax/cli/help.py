@@ -32,14 +32,14 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
         if RARE in marks if common is None else each.name not in common:
             continue
         value = each.default if default is None else getattr(default, each.name)
-        values, more, _ = _values(hints[each.name]).partition(" …")
+        typed, more, _ = values(hints[each.name]).partition(" …")
         told = re.split(r"(?<=\.)\s", " ".join(said[each.name].split()))[0].removesuffix(".")
         shown = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-        if len(values) > LONG:
-            told, values = f"{told}: {values.replace('|', ', ')}", "NAME"
+        if len(typed) > LONG:
+            told, typed = f"{told}: {typed.replace('|', ', ')}", "NAME"
         elif not (value is None or isinstance(value, bool) or value in ((), MISSING)):
             told += f" [{shown}]"
-        named = f"--{'no-' * (value is True)}{option_of(each.name, marks)} {values}{more}".rstrip()
+        named = f"--{'no-' * (value is True)}{option_of(each.name, marks)} {typed}{more}".rstrip()
         aliases = [alias for mark in marks for alias in getattr(mark, "aliases", None) or ()]
         needed = value is MISSING and each.default_factory is MISSING
         place = 0 if tyro.conf.Positional in marks else 1 if needed else 2 + (each.name not in kind.__annotations__)
@@ -79,24 +79,24 @@ def _documented(kind: type) -> dict[str, str]:
     return found
 
 
-def _values(hint: Any) -> str:
+def values(hint: Any) -> str:
     """Return what a user types after an option of this type."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return _values(args[0])
+        return values(args[0])
     if origin is Literal:
         return "|".join(map(str, args))
     if origin is tuple:
-        return f"{_values(args[0])} …" if ... in args else " ".join(map(_values, args))
+        return f"{values(args[0])} …" if ... in args else " ".join(map(values, args))
     if args:
-        return "|".join(_values(each) for each in args if each is not NoneType)
+        return "|".join(values(each) for each in args if each is not NoneType)
     return VALUES.get(hint, "PATH")
 
 
-def expected(hint: Any) -> str:
-    """Describe what a user should type after an option of this type."""
-    values, many, _ = _values(hint).partition(" …")
-    one, *more = values.split()
+def expected(typed: str) -> str:
+    """Describe what a user should type after an option, of which `values` says it in short."""
+    typed, many, _ = typed.partition(" …")
+    one, *more = typed.split()
     what = f"one of {one.replace('|', ', ')}" if "|" in one else WORDS.get(one, one)
     several = "" if many else f"{1 + len(more)} "
     return f"{several}{what.split()[-1]}s" if (many or more) and one in WORDS else what

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import BAD_INPUT, in_flags
-from hybrid_jax.cli.logs import LISTS, SpeedOptions, content_of, grouped, look, paths_of, printable
+from hybrid_jax.cli.logs import SpeedOptions, content_of, grouped, look, paths_of, printable
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
 from hybrid_jax.flights.load import read_recording
@@ -24,7 +24,7 @@ from hybrid_jax.identification.vehicle_text import vehicle_text
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.vehicle import Vehicle
 
-__all__ = ["LISTS", "Options", "run"]
+__all__ = ["Options", "run"]
 PICTURED, POINTS = 6, 3000  # logs that get a picture; samples of each line at most
 LINES = 5  # of what is not folded
 # Checks that a log may fail and still say something of its vehicle: it needs no position, and is cut at gaps.

@@ -40,7 +40,6 @@ from hybrid_jax.io.archive import digest
 from hybrid_jax.io.models import Model
 from hybrid_jax.vehicle import Vehicle
 
-LISTS = ("--polynomial", "--motor-order", "--topics", "--learn")
 ONE_TO_ONE = (0.0, 1.0)  # rotor speed = command, in whatever unit: motors are still compared with the motion
 CUT = ("time on the ground",)  # is cut out
 CHANGED = 2.0  # factor by which thrust may differ from the vehicle's where a change is asked for

@@ -22,8 +22,7 @@ from hybrid_jax.io.models import load
 from hybrid_jax.planning import Excitation, FlightBounds, excitation
 from hybrid_jax.state import POSITION, VELOCITY
 
-__all__ = ["LISTS", "Options", "run"]
-LISTS = ("--learn", "--low", "--high", "--rotor-speed", "--noise")
+__all__ = ["Options", "run"]
 WINDOW, HALF, WELL = 10, 1.96, 0.1  # intervals; standard errors of half an interval; share of a value
 MAIN = 5  # intervals that are not folded
 MEANS = "A flight like this gives these intervals where the model is right, with a constant force and torque unknown."

@@ -16,7 +16,7 @@ from PIL import Image
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
-from hybrid_jax.cli.logs import LISTS, FlightOptions, flights_for, known_of
+from hybrid_jax.cli.logs import FlightOptions, flights_for, known_of
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.identification.learning import without_past
 from hybrid_jax.integrate import rollout_batch
@@ -25,7 +25,7 @@ from hybrid_jax.io.models import load
 from hybrid_jax.state import POSITION
 from hybrid_jax.trajectories import Trajectories
 
-__all__ = ["LISTS", "Options", "run"]
+__all__ = ["Options", "run"]
 SHOWN = 10  # pictures a second
 TRUE, COLOURS = "0.3", ("#0072B2", "#CC79A7")
 Forecasts = Mapping[str, Float[np.ndarray, "n t 3"]]
