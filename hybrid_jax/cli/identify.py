@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import matplotlib as mpl
 import numpy as np
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import ChecksFailed, in_flags, step
-from hybrid_jax.cli.logs import grouped, recordings_of
+from hybrid_jax.cli.logs import Flights, grouped, recordings_of
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.flights.checks.consistency import FAILS, Check
@@ -29,23 +29,14 @@ from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
 from hybrid_jax.vehicle import Vehicle
 
+Errors = Float[np.ndarray, "n t k"]
 ENDS = ("value", "low", "high")
 LINES = 5  # of what is not folded
 FITS = ("dt", "steps", "windows", "disturbance")  # options that a model remembers
 NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
+STOPPED = "The fit stopped before it converged: start closer, or learn fewer parameters."
 MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
 ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below counts until they pass."
-
-
-class Read(NamedTuple):
-    """Recordings, digests of them by file name, the initial field and what it does not learn, lines, failed checks."""
-
-    logs: list[Recording]
-    contents: dict[str, str]
-    field: Any
-    left: str
-    said: list[str]
-    failed: list[str]
 
 
 def run(options: Any, path: Path, model: VehicleModel) -> int:
@@ -53,8 +44,8 @@ def run(options: Any, path: Path, model: VehicleModel) -> int:
     for name in ("steps", "windows"):
         checks.count(f"--{name}", getattr(options, name))
     fits = {name: getattr(options, name) for name in FITS} | {"dt": options.dt or Layout.dt}
-    read, layout = checked(options, path, model), layout_of(fits)
-    found = identified(read, layout)
+    (read, field), layout = checked(options, path, model), layout_of(fits)
+    found = identified(field, read.logs, layout)
     values = values_of(found)
     about = {"dt": layout.dt, "learned_from": read.contents, "parameters": values, "identified": fits}
     save(options.output, found.field, json_value(about | {"covariance": found.covariance}))
@@ -68,13 +59,12 @@ def layout_of(fits: Mapping[str, Any]) -> Layout:
     return Layout(fits["dt"], fits["steps"], fits["windows"], disturbance=tuple(fits["disturbance"]))
 
 
-def checked(options: Any, path: Path, model: VehicleModel) -> Read:
-    """Read the logs of a folder and leave out those that fail checks, except with --anyway; one must pass."""
+def checked(options: Any, path: Path, model: VehicleModel) -> tuple[Flights, Any]:
+    """Read the logs of a folder and leave out those that fail checks, except with --anyway; also make a field."""
     if LAG in model.learn:
         mend = _learn(model.learn, (LAG,))
         raise ValueError(f"{path}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
-    window = (options.dt or Layout.dt) * options.steps
-    start = partial(_field_of, path, model, window)
+    start = partial(_field_of, path, model, (options.dt or Layout.dt) * options.steps)
     return read_checked(options.before, options, model.vehicle, model.learn, start)
 
 
@@ -84,7 +74,7 @@ def read_checked(
     vehicle: Vehicle,
     learn: Sequence[str],
     start: Callable[[Sequence[Recording]], tuple[Any, str]],
-) -> Read:
+) -> tuple[Flights, Any]:
     """Read and check the logs of a folder like `checked`; `start` makes a field for them, and says what it lacks."""
     raws, contents, said = recordings_of(folder, options)
     failed: list[tuple[str, str, str]] = []  # a log, a check and what it says
@@ -102,16 +92,17 @@ def read_checked(
     field, left = start([*raws.values()])
     require(lambda log: compared(log, field, learn))
     lines = [in_flags(": ".join(each)) for each in failed]
-    said += [f"{name}: {note}" for name, log in raws.items() for note in log.notes] + lines * (not options.anyway)
+    said += [f"{name}: {note}" for name, log in raws.items() for note in log.notes] + lines
     for line in lines:
         print(f"  {line}", file=sys.stderr)
-    return Read([*raws.values()], contents, field, left, said, lines * options.anyway)
+    warnings = [ANYWAY.format(len(lines))] * (bool(lines) and options.anyway) + [left] * bool(left)
+    return Flights([*raws.values()], contents, said, warnings), field
 
 
-def identified(read: Read, layout: Layout) -> Identified:
+def identified(field: Any, logs: Sequence[Recording], layout: Layout) -> Identified:
     """Identify the parameters, beginning with the field's; with commands, thrust comes before rotation."""
-    with step(f"identifying from {page.counted(read.logs, 'log')}") as told:
-        found = (identify_in_turn if isinstance(read.field, Actuated) else identify)(read.field, read.logs, layout)
+    with step(f"identifying from {page.counted(logs, 'log')}") as told:
+        found = (identify_in_turn if isinstance(field, Actuated) else identify)(field, logs, layout)
         told(f"{found.windows} windows, {found.seconds:.4g} s of flight")
     return found
 
@@ -149,36 +140,26 @@ def _learn(names: Sequence[str], without: Sequence[str]) -> str:
     return f"give --learn {' '.join(name for name in names if name not in without) or 'Ix Iy'}"
 
 
-def _page(options: Any, found: Identified, read: Read, layout: Layout, values: Mapping[str, Any]) -> page.Page:
+def _page(options: Any, found: Identified, read: Flights, layout: Layout, values: Mapping[str, Any]) -> page.Page:
     lines = [(name, *(f"{one[end]:.4g}" for end in ENDS), one["unit"]) for name, one in values.items()]
     unseen = [name for name, one in values.items() if not np.isfinite(one["high"])]
     header = ("parameter", "estimate", "from", "to", "unit")
     fitted = [(name, _unit(name), "  ".join(f"{e:.3g}" for e in each)) for name, each in found.errors.items()]
     again = f"On logs that were not used here: hybrid-jax check {options.output} LOGS."
+    errors = window_errors(found.field, read.logs, layout)
     return page.Page(
         f"What do {page.counted(read.logs, 'log')} of {options.before} show about the vehicle?",
         f"{len(values) - len(unseen)} of {len(lines)} parameters are identified by {found.seconds:.4g} s of flight.",
         page.Table("Parameters, with 95 % intervals", header, lines[:LINES]),
-        [
-            (
-                "Errors of predictions from the state estimated from earlier samples",
-                figure(found.field, read.logs, layout),
-            )
-        ],
-        [*warned(read, found.converged), *_notes(found, read.logs, unseen)],
+        [("Errors of predictions from the state estimated from earlier samples", figure(errors, read.logs, layout.dt))],
+        [*read.warnings, *_notes(found, read.logs, unseen)],
         [f"You should excite {', '.join(unseen)} more, or learn fewer parameters." if unseen else again],
         [
             *([page.Table("All parameters, with 95 % intervals", header, lines)] * (len(lines) > LINES)),
             page.Table("RMS of the errors over the windows fitted", ("quantity", "unit", "x, y, z …"), fitted),
         ],
-        [*read.said, *read.failed],
+        read.said,
     )
-
-
-def warned(read: Read, converged: bool = True) -> list[str]:
-    stopped = "The fit stopped before it converged: start closer, or learn fewer parameters."
-    failed = ANYWAY.format(len(read.failed)) if read.failed else ""
-    return [*filter(None, (failed, "" if converged else stopped, read.left))]
 
 
 def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) -> list[str]:
@@ -187,6 +168,7 @@ def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) 
     shares = ", ".join(f"{axis} {share:.2f}" for axis, share in zip("xyz", found.explained, strict=True))
     learned = {name.partition("[")[0] for name in found.intervals}
     notes = {
+        STOPPED: not found.converged,
         f"Not identifiable from these logs, unchanged: {', '.join(unseen)}.": unseen,
         f"Commands {max(slow, default=0):.3g} s apart: the intervals include changes in between; such a log "
         "hardly distinguishes a delay from a lag.": slow,
@@ -201,21 +183,20 @@ def _unit(name: str) -> str:
     return "rad" if name == "attitude" else unit_of(name)
 
 
-def predicted(field: Any, recordings: Sequence[Recording], layout: Layout, what: str) -> page.Table:
-    errors = window_errors(field, recordings, layout)
+def predicted(errors: Mapping[str, Errors], layout: Layout, what: str) -> page.Table:
     asked = max(1, layout.steps // 4), layout.steps
     lines = [(name, _unit(name), *(_nearest(part, each, layout.dt) for each in asked)) for name, part in errors.items()]
     ends = [f"after {layout.dt * each:.3g} s" for each in asked]
     return page.Table(f"RMS of what was predicted: {what}", ("quantity", "unit", *ends), lines)
 
 
-def _by_step(part: Float[np.ndarray, "n t k"]) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
+def _by_step(part: Errors) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
     """Return the steps, from 1, with a measurement in any window, and the RMS errors there."""
     steps = np.flatnonzero(~np.isnan(part).all(axis=(0, 2)))
     return steps + 1, np.sqrt(np.nanmean(part[:, steps] ** 2, axis=0))
 
 
-def _nearest(part: Float[np.ndarray, "n t k"], asked: int, dt: float) -> str:
+def _nearest(part: Errors, asked: int, dt: float) -> str:
     """Return the errors at the measured step nearest to the requested one, with its time if it differs."""
     steps, errors = _by_step(part)
     if not len(steps):
@@ -226,16 +207,15 @@ def _nearest(part: Float[np.ndarray, "n t k"], asked: int, dt: float) -> str:
 
 
 @mpl.rc_context(page.STYLE)
-def figure(field: Any, logs: Sequence[Recording], layout: Layout) -> Figure:
+def figure(errors: Mapping[str, Errors], logs: Sequence[Recording], dt: float) -> Figure:
     """Plot prediction errors against time."""
-    errors = window_errors(field, logs, layout)
     rows = -(-len(errors) // 2)
     picture = Figure(figsize=(6.0, 2.6 * rows), layout="constrained")
     for i, (name, part) in enumerate(errors.items(), 1):
         panel = picture.add_subplot(rows, min(2, len(errors)), i)
         steps, rms = _by_step(part)
         axes = logs[0].signals[name].axes if name != "attitude" else ("x", "y", "z")
-        panel.plot(layout.dt * steps, rms, marker="." if len(steps) < part.shape[1] else None, label=axes)
+        panel.plot(dt * steps, rms, marker="." if len(steps) < part.shape[1] else None, label=axes)
         panel.set(xlabel="time from the start [s]", ylabel=f"RMS error [{_unit(name)}]", title=name)
         panel.legend()
     return picture

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from hybrid_jax import checks
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import BAD_INPUT, in_flags
-from hybrid_jax.cli.logs import SpeedOptions, content_of, grouped, look, paths_of, printable
+from hybrid_jax.cli.logs import LogOptions, Looked, content_of, grouped, look, paths_of, printable
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
-from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
+from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import Recording, Signal, unit_of
 from hybrid_jax.identification.estimates import estimate
@@ -32,12 +32,12 @@ BORNE = ("quantities", "slowest signal", "gaps", "repeated samples")
 SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
 NOT_RUN = f"Without --vehicle these are not checked: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
 EMPTY = "–"
-READY = "Every verb reads logs that are ready, and leaves out those that fail."
+READY = "ready"  # the result of a log that every verb takes
 LESS = "Some logs have motors and lack states ({}): hybrid-jax fit learns what these determine."
 
 
 @dataclass(frozen=True)
-class Options(SpeedOptions):
+class Options(LogOptions):
     """Check the logs of a folder: their signals, whether they suffice for a model, and what you should log instead.
 
     Reads PX4's .ulg, logs of a Crazyflie's SD card, ROS bags, Betaflight's blackbox and CSV. Files are read separately,
@@ -67,36 +67,6 @@ class Options(SpeedOptions):
     """Folder of the page."""
 
 
-class Inspected(NamedTuple):
-    """One log: recording, checks, why it cannot be a flight (or empty), and lines about it."""
-
-    name: str
-    recording: Recording | None
-    checks: Sequence[Check] = ()
-    refusal: str = ""
-    notes: Sequence[str] = ()
-
-    @property
-    def failed(self) -> list[Check]:
-        return [check for check in self.checks if check.verdict == FAILS]
-
-    @property
-    def warning(self) -> str:
-        """The first check that warns, for a log that is ready."""
-        warns = [check for check in self.checks if check.verdict == WARNS and self.result == "ready"]
-        return f"; {warns[0].name} warns: {warns[0].suggestion}" if warns else ""
-
-    @property
-    def result(self) -> str:
-        """The result: not read, FAILS, no flight, or ready."""
-        if self.recording is None:
-            return f"not read: {self.refusal}"
-        if more := self.failed:
-            rest = f" (and {len(more) - 1} more)" if len(more) > 1 else ""
-            return f"FAILS {more[0].name}: {more[0].suggestion}{rest}"
-        return f"no flight: {self.refusal}" if self.refusal else "ready"
-
-
 def run(options: Options) -> int:
     for name in ("dt", "mass", "arm"):
         if (value := getattr(options, name)) is not None:
@@ -110,15 +80,31 @@ def run(options: Options) -> int:
     logs = inspected(paths, vehicle, options)
     for log in logs:
         kind = [f"{each[0]}, {each[1]}, {each[-2]} s, {each[-1]} motors: " for each in _facts(log)]
-        page.say(f"{log.name}: {''.join(kind)}{log.result}{log.warning}")
-    rows = [{"log": log.name, "result": log.result} for log in logs]
+        page.say(f"{log.name}: {''.join(kind)}{warned(log)}")
+    rows = [{"log": log.name, "result": result_of(log)} for log in logs]
     page.write(options.out, "inspect", _page(options, logs, [printable(line) for line in left]), {"rows": rows})
     if path is not None:
         write_vehicle(path, logs, options.folder, options.mass, options.arm)
     return BAD_INPUT if all(log.recording is None for log in logs) else 0  # the lines above say why
 
 
-def inspected(paths: Sequence[Path], vehicle: Vehicle | None, options: Any) -> list[Inspected]:
+def result_of(log: Looked) -> str:
+    """Return the result: not read, FAILS, no flight, or ready."""
+    if log.recording is None:
+        return f"not read: {log.refusal}"
+    if more := log.failed:
+        rest = f" (and {len(more) - 1} more)" if len(more) > 1 else ""
+        return f"FAILS {more[0].name}: {more[0].suggestion}{rest}"
+    return f"no flight: {log.refusal}" if log.refusal else READY
+
+
+def warned(log: Looked) -> str:
+    """Return the result with the first check that warns, for a log that is ready."""
+    result, warns = result_of(log), [check for check in log.checks if check.verdict == WARNS]
+    return f"{result}; {warns[0].name} warns: {warns[0].suggestion}" if warns and result == READY else result
+
+
+def inspected(paths: Sequence[Path], vehicle: Vehicle | None, options: Any) -> list[Looked]:
     """Read and check logs by the options of this verb or of `fit`; an error becomes part of the result."""
     found, first = [], {}
     for path in paths:
@@ -126,52 +112,52 @@ def inspected(paths: Sequence[Path], vehicle: Vehicle | None, options: Any) -> l
         try:
             raw = read_recording(path, **options.reading)
         except ValueError as error:
-            found.append(Inspected(name, None, refusal=printable(in_flags(str(error).removeprefix(f"{path}: ")))))
+            found.append(Looked(name, refusal=printable(in_flags(str(error).removeprefix(f"{path}: ")))))
             continue
         one = look(path, raw, vehicle, options.dt, options)
         told = [replace(each, suggestion=in_flags(each.suggestion)) for each in one.checks]
         same = first.setdefault(content_of(raw), name)
         refusal = in_flags(one.refusal) if same == name else f"the same flight as {same}; leave one of the two out"
-        found.append(Inspected(name, raw, told, refusal, (*raw.notes, *one.notes)))
+        found.append(one._replace(name=name, checks=told, refusal=refusal))
     return found
 
 
 def write_vehicle(
-    path: Path, logs: Sequence[Inspected], folder: Path, mass: float | None = None, arm: float | None = None
+    path: Path, logs: Sequence[Looked], folder: Path, mass: float | None = None, arm: float | None = None
 ) -> None:
     """Write a vehicle file estimated from the logs of a folder."""
     write_atomic(path, vehicle_text(estimate(trusted(logs)), folder.resolve().stem, mass, arm))
     print(f"{path}: written; read its comments before it is used")
 
 
-def trusted(logs: Sequence[Inspected]) -> list[Recording]:
+def trusted(logs: Sequence[Looked]) -> list[Recording]:
     """Return the recordings that a vehicle file may use; print the others."""
     left = [log.name for log in logs if any(check.name not in BORNE for check in log.failed)]
     kept = [log.recording for log in logs if log.recording is not None and log.name not in left]
     if not kept:
-        raise ValueError(f"vehicle file: no log flew and passed its checks; {logs[0].name}: {logs[0].result}")
+        raise ValueError(f"vehicle file: no log flew and passed its checks; {logs[0].name}: {result_of(logs[0])}")
     if left:
         print(f"left out of the vehicle file, as checks failed: {', '.join(left)}")
     return kept
 
 
-def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> page.Page:
-    ready = sum(log.result == "ready" for log in logs)
+def _page(options: Options, logs: Sequence[Looked], left: Sequence[str]) -> page.Page:
+    ready = sum(result_of(log) == READY for log in logs)
     mends = [(log.name, c.name, c.suggestion) for log in logs for c in log.checks if c.verdict in (FAILS, WARNS)]
     mends += [(log.name, "no flight", log.refusal) for log in logs if log.refusal and not log.failed]
     learn = f"Learn from them: hybrid-jax fit {options.folder} -o source.npz --vehicle {options.vehicle or 'v.toml'}"
     read = [(log, log.recording) for log in logs if log.recording is not None]
     failed = {log.name: {check.name for check in log.failed} for log in logs}
     less = [log.name for log, raw in read if raw.rotors and {"quantities"} <= failed[log.name] <= {*BORNE}]
-    worst = sorted(logs, key=lambda log: log.result == "ready")
-    every = [(log.name, log.result, *(*_facts(log), (EMPTY,) * 6)[0]) for log in logs]
+    worst = sorted(logs, key=lambda log: result_of(log) == READY)
+    every = [(log.name, result_of(log), *(*_facts(log), (EMPTY,) * 6)[0]) for log in logs]
     return page.Page(
         f"Do the logs of {printable(str(options.folder))} suffice for a model?",
         f"{ready} of {len(logs)} logs are ready for a model.",
-        page.Table("Logs", ("log", "result"), [(log.name, f"{log.result}{log.warning}") for log in worst[:LINES]]),
+        page.Table("Logs", ("log", "result"), [(log.name, warned(log)) for log in worst[:LINES]]),
         [(f"{log.name}: its signals; grey: gaps", _drawn(raw)) for log, raw in read[:PICTURED]],
         [
-            READY,
+            "Every verb reads logs that are ready, and leaves out those that fail.",
             *([LESS.format(", ".join(less))] if less else []),
             *([NOT_RUN] if options.vehicle is None and read else []),
         ],
@@ -186,7 +172,7 @@ def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> p
     )
 
 
-def _facts(log: Inspected) -> list[tuple[str, ...]]:
+def _facts(log: Looked) -> list[tuple[str, ...]]:
     """Return format, vehicle, airframe, program, length [s] and motors of a log."""
     if (found := log.recording) is None:
         return []
@@ -195,7 +181,7 @@ def _facts(log: Inspected) -> list[tuple[str, ...]]:
     return [(*told, f"{found.duration:.1f}", str(found.rotors))]
 
 
-def _signals(logs: Sequence[Inspected]) -> page.Table:
+def _signals(logs: Sequence[Looked]) -> page.Table:
     lines = []
     for log in logs:
         for name, signal in log.recording.signals.items() if log.recording else ():
@@ -208,7 +194,7 @@ def _signals(logs: Sequence[Inspected]) -> page.Table:
     return page.Table("Signals at their own rates, in the library's frames and units", header, lines)
 
 
-def _checks(logs: Sequence[Inspected]) -> page.Table:
+def _checks(logs: Sequence[Looked]) -> page.Table:
     """List the results of all checks."""
     every = dict.fromkeys(check.name for log in logs for check in log.checks)
     lines = []

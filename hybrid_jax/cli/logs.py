@@ -56,6 +56,12 @@ class LogOptions:
     """ROS topics: odometry=/odom motors=/rotors:data:rpm …. Also pose, imu, voltage."""
     motor_order: tuple[int, ...] = ()
     """Index of each rotor's motor in the log, as 2,0,3,1. Indices begin with 0."""
+    polynomial: tuple[float, ...] = ()
+    """c0, c1, …: rotor speed [rad/s] = c0 + c1 command …. For logs with commands, from 0 (stop) to 1 (full), but no
+    rotor speeds. You can measure it on a test stand, or at two points: 100,1000 if a motor starts at 100 rad/s and
+    reaches 1100 at full command. PWM (1000 … 2000 µs) and DShot are scaled to 0 … 1 first."""
+    delay: Annotated[float, RARE] = 0.0
+    """Delay to add to the motors [s], if a check found that they lead the gyro."""
 
     @property
     def reading(self) -> dict[str, Any]:
@@ -70,19 +76,7 @@ class LogOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpeedOptions(LogOptions):
-    """Options for reading logs for models whose inputs are rotor speeds."""
-
-    polynomial: tuple[float, ...] = ()
-    """c0, c1, …: rotor speed [rad/s] = c0 + c1 command …. For logs with commands, from 0 (stop) to 1 (full), but no
-    rotor speeds. You can measure it on a test stand, or at two points: 100,1000 if a motor starts at 100 rad/s and
-    reaches 1100 at full command. PWM (1000 … 2000 µs) and DShot are scaled to 0 … 1 first."""
-    delay: Annotated[float, RARE] = 0.0
-    """Delay to add to the motors [s], if a check found that they lead the gyro."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FlightOptions(SpeedOptions):
+class FlightOptions(LogOptions):
     """Options for converting logs to flights."""
 
     anyway: bool = False
@@ -92,7 +86,7 @@ class FlightOptions(SpeedOptions):
 class Flights(NamedTuple):
     """The flights of a folder, at one interval."""
 
-    logs: list[FlightLog]  # airborne, of the logs that passed
+    logs: list[Any]  # of those that passed: flights in the air, or recordings
     contents: dict[str, str]  # digests by name
     said: list[str]  # lines on logs that were read, left out or cut
     warnings: Sequence[str] = ()  # of checks
@@ -105,12 +99,18 @@ class Flights(NamedTuple):
 
 
 class Looked(NamedTuple):
-    """A checked log and its flight."""
+    """A log that was checked."""
 
-    log: FlightLog | None  # airborne
-    checks: list[Check]  # of its signals, except what every verb corrects
-    refusal: str  # why it is not a flight, or empty
-    notes: list[str]  # what was cut
+    name: str
+    recording: Recording | None = None
+    checks: Sequence[Check] = ()  # of its signals, except what every verb corrects
+    refusal: str = ""  # why it cannot be read, or is no flight
+    notes: Sequence[str] = ()  # what was repaired and cut
+    log: FlightLog | None = None  # airborne
+
+    @property
+    def failed(self) -> list[Check]:
+        return [check for check in self.checks if check.verdict == FAILS]
 
 
 def require_distinct(flights: Sequence[tuple[str, Any]]) -> None:
@@ -188,9 +188,9 @@ def read_flights(
         moving = False
         for name, raw in raws.items():
             one = look(Path(raw.name), raw, vehicle, dt, options, changed, lagging)
-            lines = [(name, each.name, each.suggestion) for each in one.checks if each.verdict == FAILS]
+            lines = [(name, each.name, each.suggestion) for each in one.failed]
             failed += (lines := lines or [(name, "no flight", one.refusal)] * bool(one.refusal))
-            told = *raw.notes, *one.notes, *(f"{check}: {why}" for _, check, why in lines)
+            told = *one.notes, *(f"{check}: {why}" for _, check, why in lines)
             said += [f"{name}: {in_flags(line)}" for line in told]
             if one.log is not None and (options.anyway or not lines):
                 logs.append(one.log)
@@ -223,7 +223,7 @@ def look(
     raw: Recording,
     vehicle: Vehicle | None,
     dt: float,
-    options: SpeedOptions,
+    options: LogOptions,
     changed: bool = False,
     lagging: bool = False,
 ) -> Looked:
@@ -244,7 +244,8 @@ def look(
         log, refusal = None, str(error).removeprefix(f"{path}: ")
     borne = {RATIO: changed, GYRO: lagging}
     excused = [each for each in checks if each.name in CUT or (borne.get(each.name) and BORNE[each.name](each.value))]
-    return Looked(log, [each for each in checks if each not in excused], refusal, notes)
+    kept = [each for each in checks if each not in excused]
+    return Looked(path.name, raw, kept, refusal, [*raw.notes, *notes], log)
 
 
 class Known(NamedTuple):

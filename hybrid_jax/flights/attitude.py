@@ -59,9 +59,9 @@ def interpolate_attitude(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"]
     return quaternion_of(scipy.spatial.transform.Slerp(at, rotation_of(q))(t))
 
 
-def interpolate(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values: Float[np.ndarray, "n d"]):
+def interpolate(t: Float[np.ndarray, "*m"], at: Float[np.ndarray, " n"], values: Float[np.ndarray, "n d"]):
     """Interpolate each column linearly."""
-    return np.stack([np.interp(t, at, column) for column in values.T], axis=1)
+    return np.stack([np.interp(t, at, column) for column in values.T], axis=-1)
 
 
 def mean_of_held(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values: Float[np.ndarray, "n d"]):

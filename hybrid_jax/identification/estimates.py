@@ -17,6 +17,7 @@ from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS
 from hybrid_jax.flights.checks.mistakes import band_passed
 from hybrid_jax.flights.checks.motor_response import FAST
 from hybrid_jax.flights.conversion import motors_of
+from hybrid_jax.flights.log import runs_of
 from hybrid_jax.flights.recording import Recording, Signal
 
 FASTEST, LONGEST = 0.002, 60.0  # s: least interval, and how much of each log is used
@@ -74,12 +75,9 @@ class Estimate(NamedTuple):
 def estimate(recordings: Sequence[Recording]) -> Estimate:
     """Estimate from all logs with motors; raise ValueError if none is in flight. Rotation needs body rates."""
     usable = [each for each in recordings if each.rotors]
-    count = usable[0].rotors if usable else 0
-    pieces = [piece for each in usable if each.rotors == count for piece in _pieces(each)]
-    if not pieces:
+    if not (pieces := [piece for each in usable if each.rotors == usable[0].rotors for piece in _pieces(each)]):
         raise ValueError("vehicle file: no log has motors in flight; hybrid-jax inspect says what you should log")
-    commands = pieces[0].commands
-    pieces = [piece for piece in pieces if piece.commands == commands]
+    pieces = [piece for piece in pieces if piece.commands == pieces[0].commands]
     fits = {lag: _regress(pieces, lag) for lag in TIME_CONSTANTS}
     heave = {lag: found for lag in TIME_CONSTANTS if (found := _curve(pieces, lag)) is not None}
     # Thrust determines the lag better than roll and pitch, which the controller couples to the motors.
@@ -89,11 +87,11 @@ def estimate(recordings: Sequence[Recording]) -> Estimate:
     lag = max(scores, key=scores.__getitem__)
     u, force = np.concatenate([piece.u for piece in pieces]), np.concatenate([piece.force for piece in pieces])
     mean = u.mean(axis=1)
-    hovers = (np.abs(force - GRAVITY) < HOVER) & (mean > FLYING * np.quantile(mean, 0.9))
-    hovers = hovers if hovers.any() else mean > FLYING * np.quantile(mean, 0.9)
+    flies = mean > FLYING * np.quantile(mean, 0.9)
+    hovers = hovers if (hovers := (np.abs(force - GRAVITY) < HOVER) & flies).any() else flies
     volts = np.concatenate([piece.volts for piece in pieces])[hovers]
     return Estimate(
-        commands,
+        pieces[0].commands,
         float(u.max()),
         np.sqrt((u[hovers] ** 2).mean(axis=0)),
         float(np.nanmean(volts)) if np.isfinite(volts).any() else np.nan,
@@ -127,24 +125,18 @@ def _pieces(recording: Recording) -> list[_Piece]:
     t = np.arange(middle, min(last, middle + LONGEST), dt)
     if len(t) < 2:
         return []
-    u = mean_of_held(t, motors.t, motors.values)
-    known = np.logical_and.reduce(
-        [(t < start) | (t > end) for each in (motors, rates) for start, end in each.gaps()] or [t > -1]
-    )
-    told = "rotor_speed" if motors is recording.signals.get("rotor_speed") else "command"
+    u, omega = mean_of_held(t, motors.t, motors.values), interpolate(t, rates.t, rates.values)
+    force, volts = (_column(recording, *each, t) for each in (("specific_force", "z"), ("voltage", "battery")))
+    commands = motors is not recording.signals.get("rotor_speed")
     # On the ground an accelerometer measures gravity whatever the motors do.
-    flying = known & within(t, airborne(recording, told))
-    force, volts = (
-        _column(recording.signals.get(name), axis, t)
-        for name, axis in (("specific_force", "z"), ("voltage", "battery"))
-    )
-    omega, edges = interpolate(t, rates.t, rates.values), np.flatnonzero(np.diff(np.r_[0, flying, 0]))
-    commands = told == "command"
-    cut = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if (b - a) * dt > 2 * SLOW]
-    return [_Piece(dt, u[part], omega[part], force[part], volts[part], commands) for part in cut]
+    flying = within(t, airborne(recording, "command" if commands else "rotor_speed"))
+    flying &= ~within(t, [*motors.gaps(), *rates.gaps()])
+    parts = [part for part in runs_of(flying) if (part.stop - part.start) * dt > 2 * SLOW]
+    return [_Piece(dt, u[part], omega[part], force[part], volts[part], commands) for part in parts]
 
 
-def _column(signal: Signal | None, axis: str, t: np.ndarray) -> np.ndarray:
+def _column(recording: Recording, name: str, axis: str, t: np.ndarray) -> np.ndarray:
+    signal = recording.signals.get(name)
     if signal is None or axis not in signal.axes or len(signal) < 2:
         return np.full(len(t), np.nan)
     return np.interp(t, signal.t, signal.values[:, signal.axes.index(axis)])
@@ -160,11 +152,9 @@ def _regress(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, "3
     """Return B and the correlations of ω̇ about each axis with B s."""
     rows = []
     for piece in pieces:
-        fast, slow = (max(1, round(span / piece.dt)) for span in (FAST, SLOW))
-        turned = np.diff(piece.omega, axis=0) / piece.dt
-        rows.append(band_passed(np.concatenate([turned, (_lagged(piece, lag) ** 2)[:-1]], axis=1), fast, slow))
-    both = np.concatenate(rows)
-    turned, squares = both[:, :3], both[:, 3:]
+        both = np.concatenate([np.diff(piece.omega, axis=0) / piece.dt, (_lagged(piece, lag) ** 2)[:-1]], axis=1)
+        rows.append(band_passed(both, *(max(1, round(span / piece.dt)) for span in (FAST, SLOW))))
+    turned, squares = np.split(np.concatenate(rows), [3], axis=1)
     effect = np.linalg.lstsq(squares, turned, rcond=1e-6)[0].T
     explained = squares @ effect.T
     size = np.sqrt((explained**2).sum(axis=0) * (turned**2).sum(axis=0))

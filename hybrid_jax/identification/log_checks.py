@@ -36,8 +36,7 @@ def compared(recording: Recording, field: Any, learn: Sequence[str]) -> list[Che
     """Run all checks of a flight that the signals allow, each at the rate of its signals."""
     body: Any = field.body if isinstance(field, Actuated) else field
     signals = _signals(recording, field)
-    runs: dict[float, list[Check]] = {}
-    found: list[Check] = []
+    runs, found = {}, []
     for needs, longest, names in COMPARED:
         dt = round(max(DT, *(signals[name].interval if name in signals else np.inf for name in needs)), 6)
         if dt > longest or not np.isfinite(dt):
@@ -45,17 +44,25 @@ def compared(recording: Recording, field: Any, learn: Sequence[str]) -> list[Che
         if dt not in runs:
             runs[dt] = check_log(_flight(recording, signals, dt), body.vehicle)
         found += [check for check in runs[dt] if check.name in names]
-    excused = set()
-    if not OF_THRUST.isdisjoint(learn):
-        excused |= {each for each in found if each.name == RATIO and 1 / GUESSED < each.value < GUESSED}
-    return [each for each in found if each not in excused]
+    guessed = not OF_THRUST.isdisjoint(learn)
+    return [each for each in found if not (guessed and each.name == RATIO and 1 / GUESSED < each.value < GUESSED)]
 
 
 def _flight(recording: Recording, signals: dict[str, Signal], dt: float) -> FlightLog:
-    """Return the airborne flight, or all of it if it is never airborne; missing states are at rest at the origin."""
-    filled = _filled(recording, signals, dt)
-    log, first = to_flight(filled, dt), max(signal.t[0] for signal in filled.signals.values())
-    spans = airborne(replace(recording, signals={**recording.signals, MOTORS: signals[MOTORS]}), MOTORS)
+    """Return the airborne flight, or all of it if it is never airborne.
+
+    States that are missing, or slower than dt, are at rest at the origin.
+    """
+    motors, kept = signals[MOTORS], {MOTORS: signals[MOTORS]}
+    for name in STATES:
+        if name in signals and signals[name].interval <= 1.5 * dt:
+            in_body = signals[name] is recording.signals.get("body_velocity")
+            kept["body_velocity" if in_body else name] = signals[name]
+        else:
+            rest = [1.0, 0, 0, 0] if name == "attitude" else [0.0] * 3
+            kept[name] = Signal(motors.t[[0, -1]], np.tile(rest, (2, 1)), AXES[name][0], "nothing")
+    log, first = to_flight(replace(recording, signals=kept), dt), max(signal.t[0] for signal in kept.values())
+    spans = airborne(replace(recording, signals={**recording.signals, MOTORS: motors}), MOTORS)
     flying = within(log.t + first, spans)
     return log[flying] if np.count_nonzero(flying) > 1 else log
 
@@ -83,45 +90,29 @@ def inputs_of(recording: Recording, field: Actuated) -> Float[np.ndarray, "n m"]
     return np.column_stack([inputs.values, np.broadcast_to(volts, len(inputs))])
 
 
-def _filled(recording: Recording, signals: dict[str, Signal], dt: float) -> Recording:
-    """Complete a recording: states that are missing or slower than dt are at rest at the origin."""
-    motors, kept = signals[MOTORS], {MOTORS: signals[MOTORS]}
-    for name in STATES:
-        if name in signals and signals[name].interval <= 1.5 * dt:
-            in_body = signals[name] is recording.signals.get("body_velocity")
-            kept["body_velocity" if in_body else name] = signals[name]
-        else:
-            rest = [1.0, 0, 0, 0] if name == "attitude" else [0.0] * 3
-            kept[name] = Signal(motors.t[[0, -1]], np.tile(rest, (2, 1)), AXES[name][0], "nothing")
-    return replace(recording, signals=kept)
-
-
 def unlearned_drag(logs: Sequence[Recording]) -> str:
     """Return a warning if forces across the thrust depend on the velocity, else an empty string."""
-    both = [pair for log in logs if (pair := _across(log)) is not None]
-    if not both:
+    if not (both := [pair for log in logs if (pair := _across(log)) is not None]):
         return ""
-    force, velocity = (np.concatenate(each) for each in zip(*both, strict=True))
-    slope = (force * velocity).sum() / max((velocity**2).sum(), 1e-12)
-    correlation = (force * velocity).sum() / max(np.sqrt((force**2).sum() * (velocity**2).sum()), 1e-12)
-    if correlation > -DRAGGED:
+    force, velocity = (np.concatenate(each).ravel() for each in zip(*both, strict=True))
+    share = force @ velocity / max(np.linalg.norm(force) * np.linalg.norm(velocity), 1e-12)
+    if share > -DRAGGED:
         return ""
-    told = f"specific force across the thrust is {slope:.2g} v (correlation {correlation:.2f})"
+    slope = force @ velocity / (velocity @ velocity)
+    told = f"specific force across the thrust is {slope:.2g} v (correlation {share:.2f})"
     return f"{told}: drag, which is not learned, so lag and inertia absorb it: learn drag as well"
 
 
 def _across(log: Recording) -> tuple[np.ndarray, np.ndarray] | None:
     """Return specific force and velocity along body x and y, if both were measured."""
-    signals = log.signals
-    force, q = signals.get("specific_force"), signals.get("attitude")
-    if force is None or force.axes != ("x", "y", "z") or not {"velocity", "body_velocity"} & signals.keys():
+    force, q, v, own = map(log.signals.get, ("specific_force", "attitude", "velocity", "body_velocity"))
+    if force is None or force.axes != ("x", "y", "z"):
         return None
-    if "body_velocity" in signals:
-        own = signals["body_velocity"]
+    if own is not None:
         return force.values[:, :2], interpolate(force.t, own.t, own.values)[:, :2]
-    if q is None:
+    if v is None or q is None:
         return None
     inside = (force.t >= q.t[0]) & (force.t <= q.t[-1])
-    t, own = force.t[inside], signals["velocity"]
-    turned = rotation_of(interpolate_attitude(t, q.t, q.values)).inv().apply(interpolate(t, own.t, own.values))
+    t = force.t[inside]
+    turned = rotation_of(interpolate_attitude(t, q.t, q.values)).inv().apply(interpolate(t, v.t, v.values))
     return force.values[inside, :2], turned[:, :2]

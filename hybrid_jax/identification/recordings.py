@@ -13,6 +13,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.measurement import MEASURED
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.shooting import Segments
+from hybrid_jax.flights.attitude import interpolate, quaternion_of, rotation_of
 from hybrid_jax.flights.checks.airborne import airborne
 from hybrid_jax.flights.recording import AXES, Recording, Signal
 from hybrid_jax.identification import slow_commands
@@ -83,10 +84,8 @@ def cut(
     """
     found = [name for name in MEASURED if name != told and all(name in each.signals for each in recordings)]
     names = tuple(measured) or tuple(found)
-    for each in recordings:
-        for name in (told, *names):
-            if name not in each.signals:
-                raise ValueError(f"{each.name}: has no {name}, needed to identify; it has {', '.join(each.signals)}")
+    for each, name in ((each, name) for each in recordings for name in (told, *names) if name not in each.signals):
+        raise ValueError(f"{each.name}: has no {name}, needed to identify; it has {', '.join(each.signals)}")
     starts = [_starts(each, layout, told, names) for each in recordings]
     counts = [len(each) for each in starts]
     if not sum(counts):
@@ -101,16 +100,15 @@ def cut(
         own, first = own[kept[(kept >= first) & (kept < first + len(own))] - first], first + len(own)
         if len(own):
             parts.append(_windows(each, layout, told, names, own, most, volts))
-    axes = {name: columns_of(name, recordings) for name in names}
+    axes = {name: _columns_of(name, recordings) for name in names}
     return jax.tree.map(lambda *each: np.concatenate(each), *parts), axes, np.pad(root, ((0, volts), (0, 0)))
 
 
-def columns_of(name: str, recordings: Sequence[Recording]) -> tuple[int, ...]:
+def _columns_of(name: str, recordings: Sequence[Recording]) -> tuple[int, ...]:
     """Return the measured axes of a quantity; ValueError unless the recordings agree."""
     axes = recordings[0].signals[name].axes
-    for each in recordings:
-        if each.signals[name].axes != axes:
-            raise ValueError(f"{each.name}: {name} has axes {each.signals[name].axes}, those before {axes}")
+    for each in (each for each in recordings if each.signals[name].axes != axes):
+        raise ValueError(f"{each.name}: {name} has axes {each.signals[name].axes}, those before {axes}")
     known = AXES[name][0] if name in AXES else axes
     return tuple(map(known.index, axes))
 
@@ -134,7 +132,8 @@ def _windows(recording: Recording, layout: Layout, told: str, names, starts, mos
     u = np.diff(area.reshape(*edges.shape, -1), axis=1) / layout.dt
     between = slow_commands.spans(command, edges[:, 0], edges[:, -1], most)
     if volts:
-        u = np.concatenate([u, _at(signals["voltage"], (edges[:, 1:] + edges[:, :-1]) / 2)], axis=2)
+        battery = signals["voltage"]
+        u = np.concatenate([u, interpolate((edges[:, 1:] + edges[:, :-1]) / 2, battery.t, battery.values)], axis=2)
     y, there = {}, {}
     for name in names:
         values, known = resampled(signals[name], edges[:, layout.ahead + 1 :], layout.dt)
@@ -146,10 +145,6 @@ def _windows(recording: Recording, layout: Layout, told: str, names, starts, mos
     return Windows(segments, start, np.concatenate([spread, np.tile(layout.disturbance, (n, 1))], axis=1), between)
 
 
-def _at(signal: Signal, t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n k"]:
-    return np.stack([np.interp(t, signal.t, column) for column in np.asarray(signal.values).T], axis=-1)
-
-
 def resampled(signal: Signal, t: Float[np.ndarray, "n t"], dt: float):
     """Resample a signal at times dt apart, and return where it exists: a slow signal only at the nearest times.
 
@@ -158,13 +153,13 @@ def resampled(signal: Signal, t: Float[np.ndarray, "n t"], dt: float):
     values, attitude = np.asarray(signal.values), set(signal.axes) == set(AXES["attitude"][0])
     if attitude:
         values = values * np.cumprod([1.0, *np.where((values[1:] * values[:-1]).sum(axis=1) < 0, -1.0, 1.0)])[:, None]
-        found = _at(Signal(signal.t, values, signal.axes, signal.source), t)
-        found = found / np.linalg.norm(found, axis=-1, keepdims=True)
+        found = interpolate(t, signal.t, values)
+        found /= np.linalg.norm(found, axis=-1, keepdims=True)
     elif signal.interval < dt / 2:
         ends = [integral(signal, t.ravel() + side * dt / 2, "linear") for side in (-1, 1)]
         found = ((ends[1] - ends[0]) / dt).reshape(*t.shape, -1)
     else:
-        found = _at(signal, t)
+        found = interpolate(t, signal.t, values)
     near = np.searchsorted(signal.t, t.ravel() - dt / 2), np.searchsorted(signal.t, t.ravel() + dt / 2)
     there = (near[1] > near[0]).reshape(t.shape) | (signal.interval <= 1.5 * dt)
     return found, there & (t >= signal.t[0]) & (t <= signal.t[-1])
@@ -187,26 +182,22 @@ def initial_states(
         x[:, POSITION], spread[:, :3] = value, error
         x[:, VELOCITY], spread[:, 6:9] = slope, slope_error
     if "attitude" in signals:
-        every = _rotation(np.asarray(signals["attitude"].values))
+        every = rotation_of(np.asarray(signals["attitude"].values))
 
         def from_last(part: slice) -> np.ndarray:
             return (every[part.stop - 1].inv() * every[part]).as_rotvec()
 
         change, spread[:, 3:6], slope, slope_error = fitted(signals["attitude"], starts, layout, from_last)
         last = every[np.clip(np.searchsorted(signals["attitude"].t, starts, side="right") - 1, 0, None)]
-        x[:, QUATERNION] = np.roll((last * scipy.spatial.transform.Rotation.from_rotvec(change)).as_quat(), 1, axis=1)
+        x[:, QUATERNION] = quaternion_of(last * scipy.spatial.transform.Rotation.from_rotvec(change))
         x[:, BODY_RATES], spread[:, 9:] = slope, slope_error
     for name, place, at in (("velocity", VELOCITY, 6), ("rates", BODY_RATES, 9)):
         if name in signals and len(signals[name].axes) == 3:
             x[:, place], spread[:, at : at + 3] = fitted(signals[name], starts, layout)[:2]
     if "body_velocity" in signals and len(signals["body_velocity"].axes) == 3:
         value, error, *_ = fitted(signals["body_velocity"], starts, layout)
-        x[:, VELOCITY], spread[:, 6:9] = _rotation(x[:, QUATERNION]).apply(value), error
+        x[:, VELOCITY], spread[:, 6:9] = rotation_of(x[:, QUATERNION]).apply(value), error
     return x, spread
-
-
-def _rotation(q) -> "scipy.spatial.transform.Rotation":
-    return scipy.spatial.transform.Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
 def fitted(signal: Signal, starts: Float[np.ndarray, " n"], layout: Layout, numbers: Callable | None = None):

@@ -24,83 +24,71 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
     k = level / top**2 if found.commands else thrust
     unit, motors = "of full command" if found.commands else "rad/s", ", ".join(f"{each:.3g}" for each in found.hover)
     volts = f"{found.voltage:.3g} V" if np.isfinite(found.voltage) else "unknown voltage"
-    of_top = (
+    flown = f"{found.seconds:.0f} s of flight"
+    at_top = (
         "PLACEHOLDER at full command: only thrust matters" if found.commands else "1.2 times the largest in the logs"
     )
     weighed = "as given" if mass else "PLACEHOLDER: weigh it; thrust and inertia grow with it"
     length = "arm as given" if arm else f"arm {ARM:g} m is a PLACEHOLDER: measure it; inertia grows with it"
-    order = (
-        "in the order of the log's motors, from roll and pitch"
-        if found.placed
-        else "PLACEHOLDER, in the order of the log's motors"
-    )
+    of_log = "in the order of the log's motors"
+    order = f"{of_log}, from roll and pitch" if found.placed else f"PLACEHOLDER, {of_log}"
     pairs = ", ".join(f"[{x:.4g}, {y:.4g}]" for x, y in places + 0.0)
+    learn = [name for name in LEARN if found.moves or name not in OF_VELOCITY]
+    inertia, torque, spin, why = _turning(found, thrust, places)
+    return f"""\
+# Written from logs by hybrid-jax inspect. Numbers with a # are explained; those marked
+# PLACEHOLDER are not identifiable from logs: measure them.
+learn = {json.dumps(learn)}
+
+[vehicle]
+name = "{name}"
+mass = {own_mass:g}  # kg; {weighed}
+inertia = [{", ".join(f"{each:.4g}" for each in inertia)}]  # kg m²; {why[0]}
+torque_coefficient = {torque * k:.3g}  # N m/(rad/s)²; {why[1]}
+spin = {spin}  # {why[2]}
+thrust_coefficient = {k:.4g}  # N/(rad/s)²; hover with motors at {motors} {unit} at {volts}, {flown}
+rotor_positions = [{pairs}]  # m; {order}; {length}
+max_rotor_speed = {top:.4g}  # rad/s; {at_top}
+{_terms(found, places)}{_actuator(found, own_mass, thrust) if found.commands else ""}"""
+
+
+def _terms(found: Estimate, places: np.ndarray) -> str:
+    if not found.placed:
+        return ""
+    x, y = found.hover**2 @ places / (found.hover**2).sum()
+    lag = f"motor_time_constant = {found.lag:.3g}  # s; of the speeds to the thrust\n" if not found.commands else ""
+    centre = f"[{x:.4g}, {y:.4g}]  # m; the centre of thrust in hover, of equal rotors"
+    return f"\n[terms]\ncentre_of_mass = {centre}\n{lag}"
+
+
+def _actuator(found: Estimate, mass: float, thrust: float) -> str:
+    curve, told = [0.0, 0.0, thrust], "hover only, assuming that thrust is proportional to the squared command"
+    if found.curve is not None:
+        curve, told = mass * found.curve, "the accelerometer"
     lines = [
-        "# Written from logs by hybrid-jax inspect. Numbers with a # are explained; those marked",
-        "# PLACEHOLDER are not identifiable from logs: measure them.",
-        f"learn = {json.dumps([name for name in LEARN if found.moves or name not in OF_VELOCITY])}",
-        "",
-        "[vehicle]",
-        f'name = "{name}"',
-        f"mass = {own_mass:g}  # kg; {weighed}",
-        *_turning(found, thrust, places, k),
-        f"thrust_coefficient = {k:.4g}  # N/(rad/s)²; hover with motors at {motors} {unit} at {volts}, "
-        f"{found.seconds:.0f} s of flight",
-        f"rotor_positions = [{pairs}]  # m; {order}; {length}",
-        f"max_rotor_speed = {top:.4g}  # rad/s; {of_top}",
+        f'gives = "thrust"  # of a rotor [N], of the command from 0 to 1; from {told}',
+        f"curve = [{', '.join(f'{each:.5g}' for each in curve)}]",
     ]
-    if found.placed:
-        x, y = found.hover**2 @ places / (found.hover**2).sum()
+    if found.placed and found.lag:
+        lines += [f"time_constants = {found.lag:.3g}  # s; the one that explains roll and pitch best"]
+    if np.isfinite(found.voltage):
         lines += [
-            "",
-            "[terms]",
-            f"centre_of_mass = [{x:.4g}, {y:.4g}]  # m; the centre of thrust in hover, of equal rotors",
+            f"nominal_voltage = {found.voltage:.4g}  # V in hover",
+            "# voltage_exponent = 1.0  # if commands are PWM",
         ]
-    if found.placed and not found.commands:
-        lines += [f"motor_time_constant = {found.lag:.3g}  # s; of the speeds to the thrust"]
-    if found.commands:
-        curve, told = ([0.0, 0.0, thrust], "hover only, assuming that thrust is proportional to the squared command")
-        curve, told = (curve, told) if found.curve is None else (own_mass * found.curve, "the accelerometer")
-        numbers = ", ".join(f"{each:.5g}" for each in curve)
-        lines += [
-            "",
-            "[actuator]",
-            f'gives = "thrust"  # of a rotor [N], of the command from 0 to 1; from {told}',
-            f"curve = [{numbers}]",
-        ]
-        if found.placed and found.lag:
-            lines += [f"time_constants = {found.lag:.3g}  # s; the one that explains roll and pitch best"]
-        if np.isfinite(found.voltage):
-            lines += [
-                f"nominal_voltage = {found.voltage:.4g}  # V in hover",
-                "# voltage_exponent = 1.0  # if commands are PWM",
-            ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(["\n[actuator]", *lines, ""])
 
 
-def _turning(found: Estimate, thrust: float, places: np.ndarray, k: float) -> list[str]:
-    """Return inertia, reaction torque and spin."""
+def _turning(found: Estimate, thrust: float, places: np.ndarray):
+    """Return inertia, reaction torque over thrust, spin, and a comment on each."""
     why = f"correlation of roll, pitch, yaw {', '.join(f'{each:.2f}' for each in found.correlations)}"
-    if found.placed:
-        ix, iy = found.inertia(thrust, places)
-        inertia, spin, torque = (
-            (ix, iy, ix + iy),
-            found.spin(),
-            (ix + iy) * float(np.abs(found.effect[2]).mean()) / thrust,
-        )
-        sure = "" if found.correlations[2] > 0.3 else "; PLACEHOLDER: yaw hardly moves, check it"
-        told = (
-            f"{why}; Iz = Ix + Iy, as for a flat body",
-            f"with that Iz{sure}",
-            f"sign of each rotor's reaction torque about z, up{sure}",
-        )
-    else:
+    if not found.placed:
         ix = 0.4 * thrust * float((found.hover**2).sum()) / GRAVITY * float(np.linalg.norm(places[0])) ** 2
-        inertia, spin, torque = (ix, ix, 2 * ix), [1 if i % 2 else -1 for i in range(len(places))], 0.01
         hardly = f"PLACEHOLDER: roll and pitch hardly follow the motors ({why}); shake roll and pitch in flight"
-        told = hardly, "PLACEHOLDER", "PLACEHOLDER"
-    return [
-        f"inertia = [{', '.join(f'{each:.4g}' for each in inertia)}]  # kg m²; {told[0]}",
-        f"torque_coefficient = {torque * k:.3g}  # N m/(rad/s)²; {told[1]}",
-        f"spin = {spin}  # {told[2]}",
-    ]
+        spin = [1 if i % 2 else -1 for i in range(len(places))]
+        return (ix, ix, 2 * ix), 0.01, spin, (hardly, "PLACEHOLDER", "PLACEHOLDER")
+    ix, iy = found.inertia(thrust, places)
+    sure = "" if found.correlations[2] > 0.3 else "; PLACEHOLDER: yaw hardly moves, check it"
+    torque = (ix + iy) * float(np.abs(found.effect[2]).mean()) / thrust
+    told = f"{why}; Iz = Ix + Iy, as for a flat body", f"with that Iz{sure}"
+    return (ix, iy, ix + iy), torque, found.spin(), (*told, f"sign of each rotor's reaction torque about z, up{sure}")

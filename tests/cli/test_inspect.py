@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.cli.command import ChecksFailed
-from hybrid_jax.cli.inspect import Options, inspected, trusted
+from hybrid_jax.cli.inspect import Options, inspected, result_of, trusted
 from hybrid_jax.cli.logs import FlightOptions, read_flights
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.log import FlightLog
@@ -137,7 +137,7 @@ def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
     options = Options(folder, columns=tmp_path / "map.toml")
     logs = inspected(paths, None, options)
     assert ["has only motor commands" in log.refusal for log in logs] == [True, True]
-    assert "FAILS q̇ against ω: body rates are in degrees per second" in logs[1].result
+    assert "FAILS q̇ against ω: body rates are in degrees per second" in result_of(logs[1])
     assert [kept.name for kept in trusted(logs)] == [str(paths[0])]
     assert "left out of the vehicle file, as checks failed: chirp_run2.csv.gz" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"^vehicle file: no log flew and passed its checks"):
