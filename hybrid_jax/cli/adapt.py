@@ -2,15 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from hybrid_jax.adaptation import Adaptation
-from hybrid_jax.cli import errors, identified, page
+from hybrid_jax.cli import errors, identify, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
-from hybrid_jax.cli.identified import KEEP
+from hybrid_jax.cli.identify import KEEP
 from hybrid_jax.cli.logs import FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.uncertainty import named_parameters
@@ -53,7 +53,7 @@ class Options(FlightOptions):
 def run(options: Options) -> int:
     model = load(options.source)
     if "identified" in model.about:
-        return identified.adapt(options, model)
+        return identify.adapt(options, model)
     known = known_of(options.source, model)
     flights = flights_for(known, options.after, options, changed=True)
     x0, u, x = (np.asarray(known.about["windows"][part], "f4") for part in ("x0", "u", "x"))
@@ -79,9 +79,9 @@ def _page(
     priors = {name: float(learned.get(name, name.startswith("efficiency"))) for name in names}
     changes = [(name, priors[name], found.parameters[name]) for name in names]
     changed = changes[: len(found.changed)]
-    effective: dict[str, dict[str, None]] = {}  # why → names without their indices
-    for name, why in ((name, one.effective) for name, _, one in changes if one.effective):
-        effective.setdefault(why, {})[name.partition("[")[0]] = None
+    effective: dict[Any, dict[str, None]] = {}  # why → names without their indices
+    for name, _, one in changes:
+        effective.setdefault(one.effective, {})[name.partition("[")[0]] = None
     own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
     fields = {"before": known.field} | ({"adapted": field} if different else {})
     curves = {name: rmse_by_flight(each, flights.logs, known.steps) for name, each in fields.items()}
@@ -94,19 +94,11 @@ def _page(
     todo = f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS." if different else KEEP
     title = "What changed" if changed else "Parameters, none of which clearly changed"
     moved = [each for each in changes if each[1] != each[2].value] or changes
-    rows = [
-        (name, f"{value:.4g} {one.unit or ''}".rstrip(), str(one))
-        for name, value, one in ([*own, *lacked] or moved)[:SHOWN]
-    ]
-    known_error = known.about.get("expected", {}).get("velocity")  # of a model that `fit` wrote
-    expected = f", where {known_error[0]:.3g} m/s was expected on a new flight" if known_error else ""
+    main = ([*own, *lacked] or moved)[:SHOWN]
+    rows = [(name, f"{value:.4g} {one.unit or ''}".rstrip(), str(one)) for name, value, one in main]
+    was = known.about.get("expected", {}).get("velocity")  # of a model that `fit` wrote
+    expected = f", where {was[0]:.3g} m/s was expected on a new flight" if was else ""
     unseen = [each["velocity"] for each in [*found.expected.values()][:1] if different]
-    coming = [
-        (horizon, name, *(f"{number:.3g}" for number in one), found.units[name])
-        for horizon, each in found.expected.items()
-        for name, one in each.items()
-    ]
-    header = ("after", "of", "RMSE", "from", "to", "unit")
     return page.Page(
         f"What changed in {page.counted(flights.logs, 'flight')} of {options.after} ({flights.seconds:.0f} s)?",
         answer,
@@ -118,15 +110,12 @@ def _page(
             *([f"Of the model before, {ALONE}"] if found.alone else []),
             *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
             *errors.unknown(found),
-            *(f"The values of {', '.join(names)} are effective: {why}." for why, names in effective.items()),
+            *(f"The values of {', '.join(names)} are effective: {why}." for why, names in effective.items() if why),
             *[STILL] * flights.still,
             *unlike(known, flights),
             *flights.warnings,
         ],
         [todo],
-        [
-            errors.parameter_table(found),
-            page.Table("Error to expect on a flight not seen (80 % intervals)", header, coming),
-        ],
+        [errors.parameter_table(found)],
         [*flights.said, *found.report().splitlines()],
     )

@@ -8,7 +8,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from hybrid_jax.cli import errors, identified, page
+from hybrid_jax.cli import errors, identify, page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.logs import FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.baselines import FrozenRates, Kinematics
@@ -37,7 +37,7 @@ class Options(FlightOptions):
 def run(options: Options) -> int:
     model = load(options.model)
     if "identified" in model.about:
-        return identified.check(options, model)
+        return identify.check(options, model)
     known = known_of(options.model, model)
     flights = flights_for(known, options.flights, options, changed=False)
     with step("predicting") as told:
@@ -63,14 +63,12 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
     header = ("", *(name.replace("_", " ") for name in UNITS))
     names = [flight_of(log) for log in flights.logs]
     by_flight = [(name, *errors.texts(curves["model"][i, at])) for i, name in enumerate(names)]
-    beaten = (
-        f"{better:.2g} times as accurate as with frozen rates" if better > 1 else "no better than with frozen rates"
-    )
+    beaten = f"{better:.2g} times as accurate as" if better > 1 else "no better than"
     worse = [name for i, name in enumerate(names) if (curves["model"][i, at] > frozen[i, at]).all()]
     meaning = [f"The model is worse than frozen rates in every quantity on {', '.join(worse)}."] if worse else []
     return page.Page(
         f"How well does {options.model.name} predict {page.counted(names, 'flight')} of {options.flights}?",
-        f"Its predictions of {known.steps * known.dt:g} s are {beaten}.",
+        f"Its predictions of {known.steps * known.dt:g} s are {beaten} with frozen rates.",
         page.Table(f"RMSE after {known.steps * known.dt:g} s", header, rows),
         [("RMSE over the time since a prediction began, all flights", errors.figure(curves, known.dt))],
         [*meaning, errors.BASELINE, *unlike(known, flights), *flights.warnings],
@@ -86,11 +84,10 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
 def _worst(known: Known, flights: Flights, names: list[str], each: list[Float[np.ndarray, "n t 4"]]) -> list[tuple]:
     """Return the moments of the largest errors relative to the typical error."""
     typical = np.sqrt(np.mean(np.concatenate([np.square(one[:, -1]) for one in each]), axis=0))
-    size = [(one[:, -1] / typical).max(axis=1) for one in each]
-    found = sorted(((float(size[i][j]), i, j) for i in range(len(size)) for j in range(len(size[i]))), reverse=True)
-    times = [np.asarray(log.t) - log.t[0] for log in flights.logs]
-    length = LONGER * known.steps
-    return [
-        (names[i], f"{times[i][min(j * length, len(times[i]) - 1)]:.1f} s", *errors.texts(each[i][j, -1]))
-        for _, i, j in found[:WORST]
+    ends = [
+        (end, name, float(log.t[min(j * LONGER * known.steps, len(log) - 1)] - log.t[0]))
+        for log, name, one in zip(flights.logs, names, each, strict=True)
+        for j, end in enumerate(one[:, -1])
     ]
+    ends.sort(key=lambda moment: -(moment[0] / typical).max())
+    return [(name, f"{time:.1f} s", *errors.texts(end)) for end, name, time in ends[:WORST]]

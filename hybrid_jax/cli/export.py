@@ -89,10 +89,8 @@ def run(options: Options) -> int:
     d, m = sizes_of(field, options.state_size, options.input_size)
     sizes: dict[str, Any] = {"state_size": d, "input_size": m}
     own: dict[str, Any] = sizes | {"smooth": options.smooth}
-    said: list[str] = []
+    said = [WITHOUT] * (field is not model.field)
     adaptation = _filter(options, field, dt, d) if "c" in options.to else ""
-    if field is not model.field:
-        said.append(WITHOUT)
     written: list[Path] = []
     with step(f"writing {', '.join(options.to)}"):
         if "c" in options.to:
@@ -182,5 +180,5 @@ def _change(field: AbstractVectorField, beta: float) -> str:
     before, after = (np.asarray(eqx.filter_jit(one.infer_batch)(*columns)) for one in (field, smoothed(field, beta)))
     off = np.abs(after - before).max(axis=1)
     entry = int(off.argmax())
-    told = f"smooth {beta:g}: ẋ differs by at most {off[entry]:.2g}, in entry {entry}"
-    return f"{told}, of RMS {np.sqrt(np.mean(np.square(before[entry]))):.2g}; {len(motion)} training states."
+    told, rms = f"ẋ differs by at most {off[entry]:.2g}, in entry {entry}", np.sqrt(np.mean(np.square(before[entry])))
+    return f"smooth {beta:g}: {told}, of RMS {rms:.2g}; {len(motion)} training states."

@@ -1,4 +1,4 @@
-"""`hybrid-jax fit` for logs of commands and of any other measurements, without all states."""
+"""`hybrid-jax fit`, `adapt` and `check` for logs of commands and of any other measurements, without all states."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -13,23 +13,26 @@ from matplotlib.figure import Figure
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
-from hybrid_jax.cli.command import ChecksFailed, in_flags, step
-from hybrid_jax.cli.logs import Flights, grouped, recordings_of
+from hybrid_jax.cli.command import NOTHING_CHANGED, ChecksFailed, in_flags, step
+from hybrid_jax.cli.logs import Flights, grouped, recordings_of, require_unseen
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.flights.checks.consistency import FAILS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.recording import Recording, unit_of
 from hybrid_jax.identification import slow_commands
+from hybrid_jax.identification.changes import changes
 from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, measure_velocity, window_errors
 from hybrid_jax.identification.learning import learnable
 from hybrid_jax.identification.log_checks import compared, unlearned_drag
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
-from hybrid_jax.io.models import save
+from hybrid_jax.io.models import Model, save
 from hybrid_jax.vehicle import Vehicle
 
 Errors = Float[np.ndarray, "n t k"]
+KEEP = "Keep the model. If something did change, you should fly manoeuvres that excite it more."
+HEADER = ("parameter", "before", "after", "from", "to", "unit")
 ENDS = ("value", "low", "high")
 LINES = 5  # of what is not folded
 FITS = ("dt", "steps", "windows", "disturbance")  # options that a model remembers
@@ -69,11 +72,7 @@ def checked(options: Any, path: Path, model: VehicleModel) -> tuple[Flights, Any
 
 
 def read_checked(
-    folder: Path,
-    options: Any,
-    vehicle: Vehicle,
-    learn: Sequence[str],
-    start: Callable[[Sequence[Recording]], tuple[Any, str]],
+    folder: Path, options: Any, vehicle: Vehicle, learn: Sequence[str], start: Callable[..., tuple[Any, str]]
 ) -> tuple[Flights, Any]:
     """Read and check the logs of a folder like `checked`; `start` makes a field for them, and says what it lacks."""
     raws, contents, said = recordings_of(folder, options)
@@ -219,3 +218,79 @@ def figure(errors: Mapping[str, Errors], logs: Sequence[Recording], dt: float) -
         panel.set(xlabel="time from the start [s]", ylabel=f"RMS error [{_unit(name)}]", title=name)
         panel.legend()
     return picture
+
+
+def adapt(options: Any, model: Model) -> int:
+    """Identify the model again from logs after a change, beginning with its present parameters."""
+    (read, field), layout = _like(options, options.after, model), layout_of(model.about["identified"])
+    logs = read.logs
+    found = identified(field, logs, layout)
+    before, after = model.about["parameters"], values_of(found)
+    changed = changes(model.field, np.array(model.about["covariance"], float), found)  # null: infinite
+    if changed:
+        learned_from = {**model.about["learned_from"], **read.contents}
+        about = {**model.about, "parameters": after, "learned_from": learned_from, "covariance": found.covariance}
+        save(options.output, found.field, json_value(about))
+    lines = [
+        (name, f"{before[name]['value']:.4g}", *(f"{after[name][end]:.4g}" for end in ENDS), after[name]["unit"])
+        for name in dict.fromkeys([*changed, *after])
+    ]
+    alone = [
+        f"{name} from {before[name]['value']:.4g} to {value:.4g} ({low:.4g} to {high:.4g}) would by itself explain "
+        f"{share:.0%} of how these logs differ."
+        for name, (share, value, low, high) in changed.items()
+    ]
+    errors = {"before": window_errors(model.field, logs, layout), "adapted": window_errors(found.field, logs, layout)}
+    kept = errors["adapted" if changed else "before"]
+    shown = page.Page(
+        f"What changed in {page.counted(logs, 'log')} of {options.after} ({found.seconds:.0f} s)?",
+        f"Changed: {alone[0]}" if changed else "These logs show no change.",
+        page.Table("Before, and after with 95 % intervals", HEADER, lines[:LINES]),
+        [(f"Errors of predictions{' of the adapted model' * bool(changed)}", figure(kept, logs, layout.dt))],
+        [*read.warnings, *[STOPPED] * (not found.converged), *alone[1:]],
+        [f"On logs that were not used here: hybrid-jax check {options.output} LOGS." if changed else KEEP],
+        [
+            page.Table("All parameters", HEADER, lines),
+            *(predicted(each, layout, name) for name, each in errors.items()),
+        ],
+        read.said,
+    )
+    told = {"parameters": after, "changed": changed, "model": options.output if changed else None}
+    page.write(options.out, "adapt", shown, told)
+    return 0 if changed else NOTHING_CHANGED
+
+
+def check(options: Any, model: Model) -> int:
+    """Compare predictions with each measured quantity, over all logs and in each."""
+    (read, field), layout = _like(options, options.flights, model), layout_of(model.about["identified"])
+    logs = read.logs
+    errors, *each = (window_errors(field, part, layout) for part in (logs, *([log] for log in logs)))
+    whole = predicted(errors, layout, "all logs")
+    ends = "; ".join(f"{name} {error} {unit}" for name, unit, _, error in whole.lines)
+    shown = page.Page(
+        f"How well does {options.model.name} predict {page.counted(logs, 'log')} of {options.flights}?",
+        f"After {layout.dt * layout.steps:.3g} s its RMS errors are: {ends}.",
+        whole,
+        [("Errors of predictions, all logs", figure(errors, logs, layout.dt))],
+        read.warnings,
+        [f"If it is wrong: hybrid-jax adapt {options.model} {options.flights} -o adapted.npz."],
+        [predicted(one, layout, name) for name, one in zip(read.contents, each, strict=True)],
+        read.said,
+    )
+    rmse = {name: error for name, _, _, error in whole.lines}
+    page.write(options.out, "check", shown, {"flights": list(read.contents), "rmse": rmse})
+    return 0
+
+
+def _like(options: Any, folder: Path, model: Model) -> tuple[Flights, Any]:
+    """Read logs for an identified model; none of them may be one of its training logs."""
+    field = cast(Any, model.field)
+    body = field.body if isinstance(field, Actuated) else field
+    learned = tuple(name.partition("[")[0] for name in model.about["parameters"])
+    read, _ = read_checked(folder, options, body.vehicle, learned, lambda _: (field, ""))
+    told = "command" if isinstance(field, Actuated) else "rotor_speed"
+    for log in read.logs:
+        if told not in log.signals:
+            raise ValueError(f"{log.name}: has no {told}, which the model needs; leave it out")
+    require_unseen(model.about["learned_from"], read.contents)
+    return read, field

@@ -100,6 +100,7 @@ def _page(options: Options, found: Excitation, points: np.ndarray, values, units
     ]
     header = ("parameter", "value", "half-width", "of the value")
     worst, within = max(found.parameters, key=lambda name: shares[name]), sum(each < WELL for each in shares.values())
+    left = [(name, f"{share:.0%}") for name, share in found.margins.items()]
     least = f"{worst} is the least certain, to ± {shares[worst]:.0%}"
     return page.Page(
         f"Which {options.seconds:g} s of flight identify the parameters of {options.model.name} best?",
@@ -113,9 +114,7 @@ def _page(options: Options, found: Excitation, points: np.ndarray, values, units
         ],
         [
             *[page.Table("All intervals", header, rows)] * (len(rows) > MAIN),
-            page.Table(
-                "What is left of limits", ("limit", "left"), [(n, f"{x:.0%}") for n, x in found.margins.items()]
-            ),
+            page.Table("What is left of limits", ("limit", "left"), left),
         ],
     )
 
