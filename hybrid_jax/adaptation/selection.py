@@ -127,7 +127,7 @@ def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:
     n, m, t = len(windows), len(learned_from), windows.horizon
     places = np.arange(n) % m if m < n else np.linspace(0, m - 1, n).astype(int)
     own = Trajectories(learned_from.x0, learned_from.u[:, :t], learned_from.x[:, :t], learned_from.dt)
-    return jax.tree.map(lambda leaf, other: jnp.asarray(leaf[places], other.dtype), own, windows)
+    return jax.tree.map(lambda leaf, other: jnp.asarray(leaf[places], jnp.result_type(other)), own, windows)
 
 
 class Posterior(NamedTuple):

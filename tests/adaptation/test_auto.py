@@ -15,7 +15,7 @@ import hybrid_jax as hj
 from hybrid_jax.adaptation import FineTune, adapt
 from hybrid_jax.adaptation.anchored import fit_anchored, with_change
 from hybrid_jax.adaptation.auto import CANDIDATES, extended, free_parameters
-from hybrid_jax.adaptation.selection import STRONG, blocks_of, correlated, fit_each, posterior
+from hybrid_jax.adaptation.selection import STRONG, alike, blocks_of, correlated, fit_each, posterior
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
@@ -58,6 +58,11 @@ def test_windows_of_one_flight_are_correlated_whether_they_touch_overlap_or_not(
 def test_windows_that_overlap_are_adapted_to_with_a_warning():
     with pytest.warns(UserWarning, match="windows overlap: left-out blocks share samples"):
         adapt(pendulum(0.7), flight(5, 2)[:40], method="source")
+
+
+@pytest.mark.filterwarnings("error")
+def test_windows_of_double_precision_cause_no_warning():
+    assert len(alike(flown(pendulum()), jax.tree.map(np.float64, flight(5, 5)))) == 80
 
 
 FREE = np.array([[False, False], [True, False], [True, True]])
