@@ -4,6 +4,8 @@ import os
 import signal
 import sys
 
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # else XLA reports slow compilations
+
 
 def _leave(*_) -> None:
     os.write(2, b"interrupted\n")
