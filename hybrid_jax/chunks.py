@@ -9,22 +9,25 @@ import jax.numpy as jnp
 
 
 def in_chunks(function: Callable[[Any], Any], values: Any, size: int, distinct: Any = None) -> Any:
-    """`function` on n stacked values, `size` at a time; with `distinct`, the first so many are repeated in order.
+    """Evaluate `function` on n stacked values, `size` at a time.
 
-    `distinct` may be traced, so that one program serves any number of them.
+    Args:
+        distinct: how many of the values are distinct, if the others repeat them in order; only these are evaluated. It
+            may be traced, so that one program serves any number.
     """
     n = len(jax.tree.leaves(values)[0])
     size = -(-n // -(-n // size))  # at most `size`, with few left over
 
-    def part(first):
-        return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, size), values)
+    @jax.jit  # traced once for the shapes and the loop; the compiler inlines it
+    def evaluated(first):
+        return function(jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, size), values))
 
     def evaluate(i, found):
         first = jnp.minimum(i * size, n - size)
         put = partial(jax.lax.dynamic_update_slice_in_dim, start_index=first, axis=0)
-        return jax.tree.map(put, found, function(part(first)))
+        return jax.tree.map(put, found, evaluated(first.astype(jnp.int32)))
 
-    shapes = jax.eval_shape(lambda: function(part(0)))
+    shapes = jax.eval_shape(evaluated, jnp.int32(0))
     zeros = jax.tree.map(lambda leaf: jnp.zeros((n, *leaf.shape[1:]), leaf.dtype), shapes)
     found = jax.lax.fori_loop(0, -(-(n if distinct is None else distinct) // size), evaluate, zeros)
     return found if distinct is None else jax.tree.map(lambda leaf: leaf[jnp.arange(n) % distinct], found)

@@ -172,7 +172,7 @@ def test_an_interrupt_while_modules_load_is_told_in_a_line(module, program):
     assert re.fullmatch(r"(hybrid-jax: )?interrupted.*\n", done.stderr)
 
 
-# Those of rounding, which fusing kernels may change.
+# Those of rounding and of the derivative written by hand, which fusing kernels may change.
 SWEEP = (
     "a_lane_is_the_same_run_alone",
     "a_lane_is_a_run_by_the_plain_function",
@@ -181,7 +181,8 @@ SWEEP = (
     "a_diverged_lane_changes_no_bit_of_another",
 )
 NETWORK = (
-    "a_minibatch_is_that_of_the_plain_formula",
+    "the_derivative_written_by_hand_is_that_of_the_plain_formula",
+    "the_gradient_of_a_minibatch_is_that_of_its_samples_one_by_one",
     "what_few_samples_use_is_the_same_network_with_the_same_slopes_and_so_is_its_file",
 )
 LAWS = [

@@ -5,7 +5,7 @@ Tropp, SIAM Review 2011), with the penalty of largest evidence (L2-SP; Li, Grand
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -56,7 +56,7 @@ def fit_anchored(
     smooth, weigh = from_starts(windows, starts)
 
     def errors(change: Float[Array, " w"]) -> Float[Array, "n e"]:
-        changed = with_change(field, change)
+        changed: Any = eqx.filter_checkpoint(with_change(field, change))
         one = jax.vmap(lambda window: prediction_errors(changed, window, solver, scale))
         return weigh(one(smooth)).reshape(len(windows), -1)
 
@@ -89,14 +89,15 @@ def fit_anchored(
     penalties = jnp.asarray(PENALTIES, gram.dtype)
     sizes = jnp.broadcast_to(1 / (penalties * information[-1]), (len(values), len(penalties))).T
     apparent = error / values  # any of the directions may be all of it
-    with_both, naive = jax.vmap(evidence)(sizes + apparent), jax.vmap(evidence)(sizes)
+    told_of = jax.vmap(evidence)(jnp.concatenate([sizes + apparent, sizes, apparent[None]]))
+    with_both, naive = jnp.split(told_of[:-1], 2)
     best = jnp.argmax(with_both)
     held, share = penalties[best] * values[-1], sizes[best] / (sizes[best] + apparent)
     step = -vectors @ (share * jnp.sum(along, axis=0) / (values + held))
     held = held * jnp.eye(len(basis), dtype=gram.dtype)
     without = left_out_steps(NormalEquations(gram, score, score[:, 0]), held, jnp.zeros_like(step), blocks)
     without = (without @ vectors * share) @ vectors.T
-    odds, naive = jnp.exp(jnp.minimum(jnp.stack([with_both[best] - evidence(apparent), jnp.max(naive)]), 80.0))
+    odds, naive = jnp.exp(jnp.minimum(jnp.stack([with_both[best] - told_of[-1], jnp.max(naive)]), 80.0))
     return Anchored(step @ basis, without @ basis, odds, naive)
 
 

@@ -110,7 +110,7 @@ def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, field, lear
 
     Where windows are unlike that motion, the network's error is assumed to be as large as its effect.
     """
-    outside, missed = (shares_outside(field, *pair) for pair in ((learned_from, windows), (windows, learned_from)))
+    outside, missed = shares_outside(field, learned_from, windows)
     places = jnp.maximum(1.0, (1 - missed) * len(windows))
     known, information = (jnp.diagonal(each.equations.gram, axis1=1, axis2=2) for each in (own, found))
     beyond = jnp.sum(jnp.square(own.equations.score) - own.noise * known, axis=0)
@@ -167,11 +167,12 @@ def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array
         return mean, evidence
 
     changes = jnp.where(jnp.asarray(free) & around.seen, plausible, 0.0)
-    move, evidence = jax.lax.map(of_candidate, (changes, jnp.broadcast_to(apparent, changes.shape)))
-    _, naive = jax.lax.map(of_candidate, (changes, jnp.zeros_like(changes)))
-    evidence, naive = (jnp.where(jnp.isfinite(each), each, -jnp.inf).at[0].max(-1e30) for each in (evidence, naive))
+    of_source = jnp.broadcast_to(apparent, changes.shape)
+    priors = jnp.tile(changes, (2, 1)), jnp.concatenate([of_source, jnp.zeros_like(changes)])
+    move, evidence = (jnp.split(each, 2) for each in jax.lax.map(of_candidate, priors))
+    evidence, naive = (jnp.where(jnp.isfinite(each), each, -jnp.inf).at[0].max(-1e30) for each in evidence)
     taken = jnp.where(jnp.max(evidence) > evidence[0] + np.log(STRONG), jnp.argmax(evidence), 0)
-    return Posterior(start + jnp.nan_to_num(move), jax.nn.softmax(evidence), jax.nn.softmax(naive), taken)
+    return Posterior(start + jnp.nan_to_num(move[0]), jax.nn.softmax(evidence), jax.nn.softmax(naive), taken)
 
 
 def spread(equations: NormalEquations, free: Bool[Array, " p"], of_source: Float[Array, "p p"]) -> Float[Array, "p p"]:
@@ -197,20 +198,21 @@ def dispersion(found: Fit, sizes) -> Float[Array, ""]:
     return jnp.maximum(spread / jnp.maximum(jnp.sum(matrix * unit[:, None] * total * unit), TINY), found.noise)
 
 
-def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Trajectories) -> Float[Array, ""]:
-    """Return the largest share of samples outside the known 1 to 99 % range, over quantities of the state; it compiles.
+def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Trajectories) -> Float[Array, "2"]:
+    """Return the largest share of samples outside the other windows' 1 to 99 % range, over quantities of the state.
 
-    Inputs do not count: a vehicle that has changed, for example by a load, needs other ones for the same motion.
+    The first is of `asked` outside `known`; both are as many windows. Inputs do not count: a vehicle that has changed,
+    for example by a load, needs other ones for the same motion. It compiles.
     """
     space, t = state_space(field, known.x0.shape[-1]), min(known.horizon, asked.horizon)
 
-    def features(windows: Trajectories) -> dict[str, Any]:
-        parts: Any = (jnp.asarray(each)[:, :t] for each in (windows.x, 0 * windows.u))
-        return space.features(*(each.reshape(-1, each.shape[-1]) for each in parts))
+    def features(windows: Trajectories) -> Array:
+        x: Any = jnp.asarray(windows.x)[:, :t].reshape(-1, windows.x.shape[-1])
+        return jnp.stack([*space.features(x, 0 * x[:, :1]).values()])
 
-    ends = {name: jnp.nanquantile(values, jnp.asarray(RANGE)) for name, values in features(known).items()}
-    outside = [(values < ends[name][0]) | (values > ends[name][1]) for name, values in features(asked).items()]
-    return jnp.max(jnp.stack([jnp.mean(each) for each in outside]))
+    both = jnp.stack([features(known), features(asked)])
+    low, high = jnp.nanquantile(both, jnp.asarray(RANGE), axis=2, keepdims=True)
+    return jnp.max(jnp.mean((both[::-1] < low) | (both[::-1] > high), axis=2), axis=1)
 
 
 def blocks_of(windows: int, blocks: int) -> tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]:

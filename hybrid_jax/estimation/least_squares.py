@@ -248,7 +248,7 @@ def fit_and_linearise(
         move, expected, upper = move_of_rows(jnp.concatenate([rows, jnp.diag(to_start)]), r, damping)
         return (z + move, upper), expected, jnp.square(LEAST * rounding(windows, scale) / size)
 
-    shape = jax.eval_shape(lambda: linearised(start)[1])
+    shape = jax.eval_shape(lambda: linearised(start)[1] if compressed else own(jnp.asarray(windows.x)))
     zero = jnp.zeros(start.shape)  # of JAX's default precision, as all numbers of the loop but the errors are
     nothing = jnp.zeros((*shape.shape, start.size), shape.dtype), jnp.zeros(shape.shape, shape.dtype)
     jacobian, found = nothing if known is None else known[:2]

@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.by_product import fixed_residual
-from hybrid_jax.estimation.least_squares import Scale, Solver
+from hybrid_jax.estimation.least_squares import TOGETHER, Scale, Solver
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.matrices import solve
 from hybrid_jax.trajectories import Trajectories
@@ -73,7 +74,7 @@ def smoothed(
         rough = jnp.where(jnp.isnan(gaps), 0, jnp.square(jnp.diff(errors, n=order, axis=0)))
         return effect, r, _unexplained(rows, errors), jnp.sum(rough), jnp.sum(~jnp.isnan(gaps))
 
-    effect, r, left, noise, successive = jax.lax.map(one, windows, batch_size=64)
+    effect, r, left, noise, successive = in_chunks(jax.vmap(one), windows, TOGETHER)
     successive, noise = jnp.sum(successive), jnp.sum(noise) / math.comb(2 * order, order)
     left = jnp.sum(left) / jnp.sum(~jnp.isnan(windows.x))
     noise = jnp.where(successive > 0, noise / jnp.maximum(successive, 1), left)  # not known apart
