@@ -20,7 +20,7 @@ from hybrid_jax import metrics
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.least_squares import fit_least_squares
-from hybrid_jax.export import casadi_function, export_program, load_program
+from hybrid_jax.export import export_program, load_program
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import SplitSpec, random_flights
@@ -214,26 +214,3 @@ def test_a_program_answers_with_what_is_finite_or_refuses(programs, batched, sha
     )
     found = outcome(programs[batched], x, u)
     assert found is None or is_finite(found) or max(np.abs(x).max(), np.abs(u).max()) > 1e4
-
-
-SIZES = {"state_size": odd(2), "input_size": odd(1)}
-
-
-@cases(0.04)
-@given(
-    st.fixed_dictionaries(
-        SIZES, optional={"platforms": st.sampled_from([("cpu",), ("cuda",), "cpu", (), ("cpu", 1), (["cpu"],), None])}
-    ),
-    odd(0.05),
-    st.sampled_from([SWING, BODY, None, "field"]),
-)
-def test_a_program_is_written_whole_or_refused(folder, options, dt, field):
-    path = folder / "written.npz"
-    for step in ((), (dt,)):
-        path.unlink(missing_ok=True)
-        outcome(export_program, path, field, *step, **options)
-        if path.exists():
-            assert load_program(path).state_size == options["state_size"]
-    options.pop("platforms", None)
-    for made in (outcome(casadi_function, field, **options), outcome(casadi_function, field, dt, **options)):
-        assert made is None or is_finite(np.asarray(made(np.ones(2), np.ones(1))))

@@ -12,7 +12,6 @@ import hybrid_jax as hj
 from hybrid_jax.dynamics.base import check_windows, state_space
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, rigid_body
-from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.state_space import Angle, Attitude, Quantity, StateSpace
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
@@ -98,15 +97,6 @@ def test_a_quaternion_may_change_its_sign():
     flipped[:, 1:3, 3:7] *= -1
     joined = check_windows(rigid_body(hj.IRIS), hj.Trajectories(data.x0, data.u, flipped, data.dt))
     np.testing.assert_array_equal(joined.x, data.x)
-
-
-@pytest.mark.slow
-def test_a_pendulum_that_whirls_is_learned_from_angles_that_jump():
-    jumping = [wrap(CIRCLE, whirls(count)) for count in (60, 20)]
-    assert rollout_mse(whirling(), jumping[0]) < 1e-10 < 1 < rollout_mse(pendulum(), jumping[0])
-    result = hj.adapt(whirling(0.7), jumping[0], method="least_squares")
-    assert result.parameters["log_length"].value == pytest.approx(np.log(0.5), abs=1e-5)
-    assert hj.fit(whirling(0.6), *jumping, jax.random.key(0), max_epochs=40).best_mse < 1e-3
 
 
 def test_a_filter_follows_an_angle_through_its_turns():

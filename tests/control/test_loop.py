@@ -88,19 +88,6 @@ def test_observer_finds_the_wind_and_removes_its_error():
     assert np.linalg.norm(flight.x[-1, :3] - reference[0, :3]) < 0.01
 
 
-def test_actual_cost_equals_the_predicted_one_only_for_the_true_model():
-    """Predictions have steps of 0.05 s, the plant 0.01 s."""
-    reference, calls = reference_of("eight"), range(50, 200, 25)
-    costs = jax.jit(
-        lambda flight, wind: control.open_loop_costs(
-            plant(hj.Hybrid(BODY, ConstantDisturbance(wind))), flight, reference, CONTROLLER, calls
-        )
-    )
-    exact, windy = (costs(alone(wind, reference, reference[0], 0.0, NEVER)[0], wind) for wind in (np.zeros(6), WIND))
-    np.testing.assert_allclose(exact[1], exact[0], rtol=0.01)
-    assert (windy[1] > 5.0 * windy[0]).all()
-
-
 def still(periods=4):
     x = jnp.tile(control.sample(control.hover(), CONTROLLER, 0.1)[0], (periods + 1, 1))
     u = jnp.full((periods, 4), hj.IRIS.hover_speed)

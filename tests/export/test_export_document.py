@@ -1,4 +1,4 @@
-"""What docs/howto/c.md, export.md and solvers.md show is what happens; a program is read without the library."""
+"""What docs/howto/c.md and export.md show is what happens; a program is read without the library."""
 
 import re
 from contextlib import nullcontext
@@ -29,13 +29,6 @@ def test_the_examples_run_and_the_two_forms_agree(tmp_path):
     assert float(of_the_first.split()[-1]) < 1e-5  # single precision of states of size 1
     assert (tmp_path / "step.casadi").exists()
     assert "float32[13]" in said(f"sys.modules['hybrid_jax'] = None\n{without}", tmp_path)
-
-
-@pytest.mark.slow
-def test_the_example_solves_its_problem(tmp_path):
-    pytest.importorskip("casadi")
-    (program,) = programs("solvers.md")
-    assert "Solve_Succeeded" in said(program, tmp_path)
 
 
 @needs_compiler

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pendulum import pendulum
-from smoke import script
 from systems import Dense
 
 import hybrid_jax as hj
@@ -99,21 +98,6 @@ def test_a_loaded_model_is_the_saved_one(name, tmp_path):
     for loaded in (hj.load(path).field, hj.load(path, like=MAKERS[name]()).field):
         assert eqx.tree_equal(named_leaves(loaded), named_leaves(field))
         assert structure.Structure(loaded).tree == structure.Structure(field).tree
-
-
-@pytest.mark.slow
-def test_two_runs_of_a_script_share_its_classes(tmp_path):
-    (tmp_path / "script.py").write_text(
-        "import sys, jax, jax.numpy as jnp, hybrid_jax as hj\n"
-        "class Decay(hj.AbstractVectorField):\n"
-        "    rate: jax.Array\n"
-        "    def __init__(self, key): self.rate = jax.random.uniform(key, (2,))\n"
-        "    def __call__(self, x, u): return -self.rate * x\n"
-        "if sys.argv[1] == 'save': hj.save('model.npz', Decay(jax.random.key(3)))\n"
-        "print(hj.load('model.npz').field.rate)\n"
-    )
-    first, second = (script("script.py", what, cwd=tmp_path) for what in ("save", "load"))
-    assert first == second
 
 
 def module_with(monkeypatch, name, sign):
