@@ -13,6 +13,13 @@ FORMULA = re.compile(
     r'<(span|div) class="arithmatex">\s*\\[(\[](.*?)\\[)\]]\s*</\1>',
     re.DOTALL,
 )
+# Code and tags, which stay as they are, or a letter with an index.
+INDEXED = re.compile(
+    r"<(code|pre|math|script|style)\b.*?</\1>|<[^>]*>|"
+    r"(?<![\w/.])([^\W\d_]\u0302?)(?:\^([ST]))?"
+    r"_([Dipdkmtuvxyz0]|up|down|MSE|reg)(?![a-zA-Z0-9_])",
+    re.DOTALL,
+)
 DOTTED = re.compile(r"<mover><mi>(\w)</mi><mo>&#x002D9;</mo></mover>")
 ROOT = Path(__file__).parents[2]
 
@@ -49,7 +56,7 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def on_page_content(content, page, config, files):
-    """Replace each formula of the page by MathML, which needs no script."""
+    """Write formulas as MathML, which needs no script, and set indices."""
     display = {"span": "inline", "div": "block"}
 
     def formula(found):
@@ -58,7 +65,13 @@ def on_page_content(content, page, config, files):
         dotted = r'<mi style="font-style: italic">\1&#x0307;</mi>'
         return DOTTED.sub(dotted, convert(text, display=display[found[1]]))
 
-    return FORMULA.sub(formula, content)
+    def indexed(found):
+        if found[2] is None:
+            return found[0]
+        above = f"<sup>{found[3]}</sup>" if found[3] else ""
+        return f"<i>{found[2]}</i>{above}<sub>{found[4]}</sub>"
+
+    return INDEXED.sub(indexed, FORMULA.sub(formula, content))
 
 
 def on_post_template(output_content, template_name, config):
