@@ -3,7 +3,7 @@
 import itertools
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
@@ -29,7 +29,7 @@ from hybrid_jax.sweep.lanes import lane
 WORLDS: dict[str, World] = {world.name: world for world in (Iris(), *ROTORPY)}
 STEPS, LONG = 10, 100  # intervals of a window to learn from, and to test on
 LEARNING, TESTING = 20.0, 10.0  # s, of a flight
-SOURCE, TARGET, TEST, NOISE, TRAINING = range(5)  # purposes of a key
+SOURCE, TARGET, TEST, NOISE, TRAINING, LOGGING = range(6)  # purposes of a key
 MANY = 5  # flights to train on in the paper's protocol: 1000 windows
 WorldName = Literal["iris", "hummingbird", "crazyflie"]
 FlightName = Literal["moving", "hover", "near_ground", "short", "noisy", "outliers"]
@@ -74,7 +74,7 @@ class WorldsConfig(OneFlight):
     """How a log samples them: means over each interval, or values at its start."""
     rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
     """Changes after which other methods are compared with `hj.adapt`, on the first flight."""
-    test_flights: int = 6
+    test_flights: int = 20
     """Usual flights of ten seconds after each change, without noise."""
 
     def __post_init__(self):
@@ -94,14 +94,15 @@ def key_of(world: World, config: WorldsConfig, purpose: int, draw: int = 0) -> P
     return jax.random.fold_in(jax.random.fold_in(key, purpose), draw)
 
 
-def source_flights(world: World, config: WorldsConfig) -> Dataset:
+def source_flights(world: World, config: WorldsConfig, seed: int) -> Dataset:
+    """Fly a source's training and validation flights: each seed has its own, as intervals concern their errors too."""
     numbers = {"train": config.source_train, "validation": config.validating()}
     each = round(LEARNING / STEPS * 100)
     flights = {name: -(-number // each) for name, number in numbers.items()}
-    flown = world.fly(NOTHING, USUAL, sum(flights.values()), LEARNING, key_of(world, config, SOURCE))
+    flown = world.fly(NOTHING, USUAL, sum(flights.values()), LEARNING, key_of(world, config, SOURCE, seed))
     noise = config.noise if config.noise_on == "all" else 0.0
     log = partial(logged, steps=STEPS, noise=noise, averaged=config.rotor_speeds == "averaged")
-    windows, first = log(flown, key_of(world, config, NOISE)), each * flights["train"]
+    windows, first = log(flown, key_of(world, config, LOGGING, seed)), each * flights["train"]
     splits = {"train": windows[: numbers["train"]], "validation": windows[first : first + numbers["validation"]]}
     return Dataset(splits, {"config": {"domain": world.name}})
 
@@ -140,8 +141,9 @@ def many_after(world: World, change: str, config: WorldsConfig) -> tuple[hj.Traj
 
 def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
     """Return a world's rows: for each case, draw, source and method the change of the error on usual flights."""
-    flown = source_flights(world, config)
-    fields = pretrained(HYBRID, world.vehicle, config, stages, flown).fields
+    flown = [source_flights(world, config, seed) for seed in range(config.seeds)]
+    one = replace(config, seeds=1)
+    fields = [lane(pretrained(HYBRID, world.vehicle, one, stages, own).fields, 0) for own in flown]
 
     def of_case(change: str, flight: str) -> Found:
         test = tests_after(world, change, config)
@@ -150,7 +152,7 @@ def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
         rows: list[dict[str, Any]] = []
         for draw, seed in itertools.product(range(config.draws), range(config.seeds)):
             windows, noise = flown_after(world, change, flight, draw, config), FLIGHTS[flight].noise * config.noise
-            task = Task(world, lane(fields, seed), flown.splits["train"], windows, noise, many)
+            task = Task(world, fields[seed], flown[seed].splits["train"], windows, noise, many)
             tags: dict[str, Any] = {"world": world.name, "change": change, "flight": flight, "draw": draw, "seed": seed}
             rows += [
                 tags | row_of(name, task, change, test) for name in (METHODS if compare and draw == 0 else (AUTO,))
@@ -159,7 +161,7 @@ def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
         return [row if flight == USUAL else row | dict.fromkeys(EXPECTED) for row in rows], {}
 
     jobs = {f"{change} {flight}": partial(of_case, change, flight) for change, flight in config.cases()}
-    return rows_of(stages.kept(f"adapt {world.name}", jobs, identity_of(config.described(), fields, flown)))
+    return rows_of(stages.kept(f"adapt {world.name}", jobs, identity_of(config.described(), *fields, *flown)))
 
 
 def row_of(method: str, task: Task, change: str, test: Tests) -> dict[str, Any]:
