@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
-from hybrid_jax.adaptation.auto import NETWORK, Auto, Choice, extended, has_network
+from hybrid_jax.adaptation.auto import Auto, Choice, extended, has_network
 from hybrid_jax.adaptation.expectation import expected_errors
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.outliers import outliers
@@ -54,7 +54,7 @@ NOT_FINITE = "the fit diverged; check dt and all units"
 NOT_FITTED = "no parameter was fitted"
 NO_MOTION = "field: its training windows are unknown, so all its errors count as changes; pass learned_from="
 FEW = "windows: {} do not determine {} parameters; the others stay at the source's values"
-BY_NETWORK = "the source's network can express a part of such a change; hj.pool of several sources gives intervals"
+BY_NETWORK = "the network has an effect as large as much of such a change; hj.pool of several sources gives intervals"
 BY_ROTORS = "it is relative to the rotors' efficiencies, which were fitted too"
 OVERLAP = "windows overlap: left-out blocks share samples with the others, so the expected errors are too small"
 
@@ -152,7 +152,7 @@ def adapt(
     space, found = state_space(field, windows.x0.shape[-1]), disturbance_of(adapted)
     choice = {} if solution.choice is None else _chosen(solution.choice, train, space)
     status = Status(int(solution.status))
-    without = None if exact and choice.get("chosen") != NETWORK else NOT_LEAST_SQUARES
+    without = None if exact else NOT_LEAST_SQUARES
     without = NOT_FINITE if status == Status.DIVERGED else without
     ranges = [] if learned_from is None else [features_of(w, space) for w in (learned_from, windows)]
     return Adaptation(
@@ -240,11 +240,12 @@ def _parameters(
     values, groups = named_parameters(field), groups_of([*named_parameters(field)])
     units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
     found = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
-    free, absorbed = np.ones(len(values), bool), np.zeros(len(values))
+    free, absorbed, vague = np.ones(len(values), bool), np.zeros(len(values)), np.zeros(len(values), bool)
     if choice is not None:
         places = [choice.parameters.index(name) for name in values]
         free = np.asarray(choice.free)[choice.taken][places]
         absorbed = np.where(free, np.asarray(choice.absorbed)[places], 0.0)
+        vague = np.asarray(choice.vague)[places]
     if without is None and not free.any():
         without = NOT_FITTED
     if without is None and len(windows) <= free.sum():
@@ -262,7 +263,7 @@ def _parameters(
         covariance = np.asarray(sandwich(choice.equations, int(free.sum()), cluster))[np.ix_(places, places)]
         covariance = covariance + np.diag(np.where(unseen, np.inf, 0.0))
         inherited, of_source = np.asarray(choice.inherited)[np.ix_(places, places)], float(choice.degrees)
-    # What the network absorbs is the size of a bias and no estimate from a sample, so of infinite degrees (GUM, G.4.3).
+    # What the network may have taken is a bound and no estimate from a sample: its degrees are infinite (GUM, G.4.3).
     parts = np.stack([np.diag(covariance), np.diag(inherited), absorbed])
     degrees = satterthwaite(parts, np.array([own_degrees, of_source, np.inf]))
     covariance = covariance + inherited
@@ -270,15 +271,16 @@ def _parameters(
         return {"parameters": found, "without_intervals": NOT_FINITE}
     whole = covariance + np.diag(absorbed)
     bounds = intervals(field, jnp.asarray(whole), level, degrees)
+    apart = intervals(field, jnp.asarray(covariance), level, degrees)  # the source has the same network
     before = jax.device_get(named_parameters(extended(source, d)))
     scaled, moved = "efficiency" in np.array(groups)[free], dict[str, float]()
     for i, name in enumerate(values):
         value, low, high = jax.device_get(tuple(bounds[name]))
         if free[i]:
-            if not low <= before[name] <= high:
-                moved[name] = float(abs(value - before[name]) / max(high - low, TINY))
-            network, rotors = absorbed[i] > covariance[i, i], scaled and groups[i] == "theta"
-            reason = BY_NETWORK if network else BY_ROTORS if rotors else None
+            _, *ends = jax.device_get(tuple(apart[name]))
+            if not ends[0] <= before[name] <= ends[1]:
+                moved[name] = float(abs(value - before[name]) / max(ends[1] - ends[0], TINY))
+            reason = BY_NETWORK if vague[i] else BY_ROTORS if scaled and groups[i] == "theta" else None
             bound = {"effective": reason} if reason else {"low": float(low), "high": float(high)}
             found[name] = replace(found[name], **bound)
     return {

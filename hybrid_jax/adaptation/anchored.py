@@ -1,4 +1,4 @@
-"""Adapt a network to few windows by one ridge Gauss–Newton step from the source's weights.
+"""Adapt a network to few windows by one ridge Gauss–Newton step from the source's weights, and measure its effect.
 
 The step minimises Σ ‖r + J δ‖² + penalty ‖δ‖² over δ in a random subspace of the range of Jᵀ (Halko, Martinsson and
 Tropp, SIAM Review 2011), with the penalty of largest evidence (L2-SP; Li, Grandvalet and Davoine 2018).
@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax.adaptation.selection import TINY, left_out_steps
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
-from hybrid_jax.estimation.normal_equations import NormalEquations
+from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, inverse
 from hybrid_jax.estimation.starts import Starts, from_starts
 from hybrid_jax.trajectories import Trajectories
 
@@ -110,3 +111,32 @@ def weights_of(field: AbstractVectorField) -> tuple[Float[Array, " w"], Callable
     """Return the network's trainable weights as a vector, and the network as a function of it."""
     assert isinstance(field, Hybrid)
     return ravel_learned(field.residual)
+
+
+def network_effect(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> Float[Array, ""]:
+    fields = field, without_network(field)
+
+    def effect(part: Trajectories):
+        errors = [jax.vmap(lambda w, f=f: prediction_errors(f, w, solver, scale))(part) for f in fields]
+        return errors[0] - errors[1]
+
+    return jnp.sum(jnp.square(in_chunks(effect, windows, CHUNK)))
+
+
+def taken_by_network(effect: Float[Array, ""], equations: NormalEquations) -> Float[Array, " p"]:
+    """Compute the variance of each parameter from an effect that physics lacks, of the size of the network's.
+
+    An effect b in place of the network's moves a fit by H⁻¹ Jᵀ b, H = JᵀJ: parameter j by at most ‖b‖ (H⁻¹)_jj^½, by
+    the inequality of Cauchy and Schwarz. Within these bounds any bias is as probable as another, so that the variance
+    is a third of their square (ISO/IEC Guide 98-3, GUM, Sec. 4.3.7).
+
+    Args:
+        effect: ‖b‖², the squared difference of predictions with and without the network, summed over the windows.
+        equations: of the same windows and the fitted parameters.
+    """
+    return effect / 3 * jnp.diagonal(inverse(jnp.sum(equations.gram, axis=0)).matrix)
+
+
+def without_network(field: AbstractVectorField) -> AbstractVectorField:
+    weights, unravel = weights_of(field)
+    return eqx.tree_at(lambda hybrid: hybrid.residual, field, unravel(jnp.zeros_like(weights)))

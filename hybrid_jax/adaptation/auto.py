@@ -12,7 +12,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation.anchored import fit_anchored, weights_of, with_change
+from hybrid_jax.adaptation.anchored import (
+    fit_anchored,
+    network_effect,
+    taken_by_network,
+    weights_of,
+    with_change,
+    without_network,
+)
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, groups_of, names_of
 from hybrid_jax.adaptation.selection import (
@@ -30,13 +37,12 @@ from hybrid_jax.adaptation.selection import (
     spread,
     unchanged,
 )
-from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
-from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors, ravel_parameters
-from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, masked
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import sandwich_of_repeated
 from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_by_size
@@ -59,6 +65,7 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "all": ("theta", "force", "torque", "drag", "efficiency"),
 }
 PLAUSIBLE = Plausible()
+VAGUE = 1 / 3  # of a plausible change: if a network may have taken more, a parameter is called effective
 ROUNDS = 2  # the second one around what the first has taken: squared errors are not quadratic over large changes
 NETWORK = "network"  # the candidate that changes the network
 CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
@@ -81,7 +88,8 @@ class Choice(NamedTuple):
         ends: errors of left-out blocks, see `errors_at_ends` (b, 2, d).
         inherited: covariance at the chosen parameters from errors of those that the source keeps (p, p).
         degrees: degrees of freedom of `inherited`.
-        absorbed: square of how far the source's parameters move on its own motion without its network (p,).
+        absorbed: variance from what the network may have taken from each parameter, see `taken_by_network` (p,).
+        vague: parameters of which that is a large part of the plausible change (p,).
     """
 
     names: tuple[str, ...]
@@ -98,6 +106,7 @@ class Choice(NamedTuple):
     inherited: Float[Array, "p p"]
     degrees: Float[Array, ""]
     absorbed: Float[Array, " p"]
+    vague: Bool[Array, " p"]
 
 
 @dataclass(frozen=True)
@@ -142,9 +151,9 @@ class Auto(Method):
         learned_from = motion_of(field) if learned_from is None else learned_from
         if learned_from is not None:
             distinct, learned_from = jnp.array(min(len(learned_from), len(train))), alike(learned_from, train)
-            own, refit, _ = fits(larger, learned_from, both, *options, distinct)
+            own = fits(larger, learned_from, both, *options, distinct)[0]
             rival = None if physics is None else fits(physics, learned_from, both, *options, distinct)[1]
-            larger, source = replace(self, larger, own, refit, rival, distinct)
+            larger, source = replace(self, larger, own, rival, distinct)
         options = *options, jnp.array(len(train))
         (found, every, starts), fitted = fits(larger, train, both, *options), None
         for _ in range(ROUNDS):
@@ -155,11 +164,10 @@ class Auto(Method):
 
 
 class OfSource(NamedTuple):
-    """Fits to `distinct` windows of the source: of the one adapted, whether it is physics `alone`, `absorbed`."""
+    """The errors on `distinct` windows of the source of what is adapted, and whether that is physics `alone`."""
 
     own: Fit
     alone: Bool[Array, ""]
-    absorbed: Float[Array, " p"]
     distinct: Int[Array, ""]
 
 
@@ -174,15 +182,14 @@ def _fits(field, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
     return at(found, 0), at(found, 1), starts
 
 
-def _replace(method: Auto, larger, own: Fit, refit: Fit, rival: Fit | None, distinct) -> tuple[Any, OfSource]:
+def _replace(method: Auto, larger, own: Fit, rival: Fit | None, distinct) -> tuple[Any, OfSource]:
     """Replace the source by physics if these predict its own motion better."""
     if rival is None:
-        return larger, OfSource(own, jnp.array(False), jnp.zeros_like(own.theta), distinct)
+        return larger, OfSource(own, jnp.array(False), distinct)
     alone = rival.surely_better(own) & method.networks
-    absorbed = jnp.where(alone, 0.0, jnp.square(rival.theta - refit.theta))
     physics = ravel_parameters(without_network(larger))[1](rival.theta)
     larger, own = (_where(alone, *pair) for pair in ((physics, larger), (rival, own)))
-    return larger, OfSource(own, alone, absorbed, distinct)
+    return larger, OfSource(own, alone, distinct)
 
 
 def _judge(
@@ -207,9 +214,9 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
     theta, blocks = chosen.theta.at[taken].set(found.theta), blocks_of(len(train), method.blocks)
     probability, refused = chosen.probability, chosen.naive > chosen.naive[taken]
     equations = masked(found.equations, free[taken] & found.seen)
-    alone, absorbed, of_source, degrees = jnp.array(False), jnp.zeros_like(start), jnp.diag(nothing.apparent), jnp.inf
+    alone, of_source, degrees = jnp.array(False), jnp.diag(nothing.apparent), jnp.inf
     if source is not None:
-        own, alone, absorbed, distinct = source
+        own, alone, distinct = source
         of_source = jnp.where(alone, sandwich_of_repeated(own.equations, len(start), distinct), of_source)
         degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
     inherited = spread(found.equations, free[taken] & found.seen, of_source)
@@ -236,10 +243,14 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[blocks[0]], train)
     ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(blocks[1])))
     first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
-    choice = Choice(*first, inherited, jnp.asarray(degrees), absorbed)
+    choice = Choice(*first, inherited, jnp.asarray(degrees), jnp.zeros_like(start), jnp.zeros(len(start), bool))
+    adapted = candidate(extended(field, train.x0.shape[1]), choice, taken)
+    if has_network(larger):
+        absorbed = taken_by_network(network_effect(adapted, train, solver, scale), equations)
+        size = jnp.where(jnp.isfinite(sizes), sizes, jnp.abs(found.theta))
+        choice = choice._replace(absorbed=absorbed, vague=jnp.sqrt(absorbed) > VAGUE * size)
     finite = (found.status == Status.OK) | ~jnp.isinf(ends).any()
-    status = jnp.where(finite, found.status, Status.DIVERGED)
-    return Solution(candidate(extended(field, train.x0.shape[1]), choice, taken), found.steps, status, choice)
+    return Solution(adapted, found.steps, jnp.where(finite, found.status, Status.DIVERGED), choice)
 
 
 STEPS: tuple[Any, ...] = (_begin, _fits, _replace, _judge, _conclude)
@@ -253,21 +264,6 @@ def at(fits: Fit, index: Int[Array, ""] | int) -> Fit:
 def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
     arrays, rest = eqx.partition(other, eqx.is_array)
     return eqx.combine(jax.tree.map(partial(jnp.where, which), eqx.filter(one, eqx.is_array), arrays), rest)
-
-
-def network_effect(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> Float[Array, ""]:
-    fields = field, without_network(field)
-
-    def effect(part: Trajectories):
-        errors = [jax.vmap(lambda w, f=f: prediction_errors(f, w, solver, scale))(part) for f in fields]
-        return errors[0] - errors[1]
-
-    return jnp.sum(jnp.square(in_chunks(effect, windows, CHUNK)))
-
-
-def without_network(field: AbstractVectorField) -> AbstractVectorField:
-    weights, unravel = weights_of(field)
-    return eqx.tree_at(lambda hybrid: hybrid.residual, field, unravel(jnp.zeros_like(weights)))
 
 
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:

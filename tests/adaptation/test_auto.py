@@ -192,14 +192,14 @@ def learned(damping, share):
     return adapt(source, flown(after), learned_from=flown(before, seed=1))
 
 
-@pytest.mark.parametrize("share", [0.0, 1.5])
-def test_a_parameter_of_which_the_network_has_a_share_is_effective(share):
+@pytest.mark.parametrize(("share", "widest"), [(0.0, 0.005), (1.5, 0.3), (5.0, np.nan)])
+def test_an_interval_is_as_wide_as_the_network_s_possible_share_and_without_limit_there_is_none(share, widest):
     found = learned(0.001, share)
     one = found.parameters["log_length"]
     assert found.changed == ("log_length",)
-    assert (one.effective is None) == one.has_interval == (share == 0)
-    assert one.effective or one.low < np.log(LENGTH) < one.high
-    assert ("Effective, so without an interval: log_length" in found.report()) == (share > 0)
+    assert (one.effective is None) == one.has_interval == (share < 5)
+    assert one.effective or one.low < np.log(LENGTH) < one.high < one.low + widest
+    assert ("Effective, so without an interval: log_length" in found.report()) == (share == 5)
 
 
 def test_results_of_auto_are_pooled_with_what_the_networks_express():
@@ -231,9 +231,10 @@ def example(key, scaling):
     return adapt(source, windows(0.8, 20, draws[2]))
 
 
-@pytest.mark.parametrize("keys", [2, pytest.param(100, marks=pytest.mark.slow)])
-def test_the_interval_of_readme_s_example_contains_the_length_or_it_is_effective(keys):
+@pytest.mark.parametrize("keys", [10, pytest.param(100, marks=pytest.mark.slow)])
+def test_the_interval_of_readme_s_example_contains_the_length(keys):
+    """The source's own length is 1 to 5 % too large, as a longer pendulum resembles one with damping."""
     scaling = ChannelScaling(output=(0.1, 1.0))  # one for all, so that one program serves
     found = [example(key, scaling).parameters["log_length"] for key in jax.random.split(jax.random.key(7), keys)]
-    assert np.mean([not one.has_interval or one.low <= np.log(0.8) <= one.high for one in found]) >= 0.9
-    assert any(one.effective for one in found)
+    assert np.mean([one.low <= np.log(0.8) <= one.high for one in found]) >= 0.9
+    assert np.median([one.high - one.low for one in found]) < 0.25
