@@ -233,10 +233,6 @@ def _ring(residual) -> System:
     )
 
 
-def _dense() -> System:
-    return _ring(Dense(eqx.nn.MLP(GRID + 1, GRID, 32, 1, activation=jax.nn.softplus, key=jax.random.key(1))))
-
-
 def _convolution() -> System:
     first, second = jax.random.split(jax.random.key(1))
     options = {"kernel_size": 5, "padding": "SAME", "padding_mode": "CIRCULAR"}
@@ -248,7 +244,6 @@ SYSTEMS: dict[str, Callable[[], System]] = {
     "circle": cache(_circle),
     "car": cache(_car),
     "multirotor": cache(_multirotor),
-    "ring_dense": cache(_dense),
     "ring_convolution": cache(_convolution),
     "wrapper": cache(lambda: _pendulum(lambda network: Gain(jnp.zeros(()), network))),
 }

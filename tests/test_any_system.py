@@ -40,7 +40,7 @@ def attempt(call, *arguments, **options):
         return str(error)
 
 
-@pytest.fixture(scope="module", params=["car", "multirotor", "circle", "ring_dense", "ring_convolution", "wrapper"])
+@pytest.fixture(scope="module", params=["car", "multirotor", "circle", "ring_convolution", "wrapper"])
 def adapted(request):
     """A system, its source model and what each method made of it."""
     system = SYSTEMS[request.param]()

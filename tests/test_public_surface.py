@@ -4,8 +4,6 @@
 some 200, in seconds. Both are the same every time.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -141,26 +139,6 @@ def test_what_is_made_of_windows_is_finite_or_refused(found, number, name):
     made = outcome(OF_WINDOWS[name], found, number)
     moderate = whole and max(np.abs(part).max(initial=0) for part in (found.x0, found.u, found.x)) < 1e4
     assert made is None or is_finite(made) or not moderate
-
-
-CONSTANTS = {
-    field.name: st.one_of(st.just(getattr(hj.IRIS, field.name)), odd(1.0, 2, 1e-6))
-    for field in dataclasses.fields(hj.Vehicle)
-} | {
-    "inertia": st.one_of(st.just(hj.IRIS.inertia), st.tuples(*3 * [odd(0.1)]), odd(1.0)),
-    "spin": st.one_of(st.just(hj.IRIS.spin), st.tuples(*4 * [odd(1, -1.0)]), odd(1.0)),
-    "rotor_positions": st.one_of(st.just(hj.IRIS.rotor_positions), st.tuples(*4 * [st.tuples(*2 * [odd(0.1, -0.2)])])),
-}
-
-
-@cases(0.08)
-@given(st.fixed_dictionaries({}, optional=CONSTANTS))
-def test_a_vehicle_flies_or_is_refused(changed):
-    vehicle = outcome(lambda: dataclasses.replace(hj.IRIS, **changed))
-    if vehicle is not None:
-        assert 0 < vehicle.hover_speed < np.inf
-        assert hash(vehicle) == hash(dataclasses.replace(vehicle))
-        assert is_finite(hj.rigid_body(vehicle).theta())
 
 
 @cases(0.05)

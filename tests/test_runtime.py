@@ -182,7 +182,6 @@ SWEEP = (
 )
 NETWORK = (
     "the_derivative_written_by_hand_is_that_of_the_plain_formula",
-    "the_gradient_of_a_minibatch_is_that_of_its_samples_one_by_one",
     "what_few_samples_use_is_the_same_network_with_the_same_slopes_and_so_is_its_file",
 )
 LAWS = [

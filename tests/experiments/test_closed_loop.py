@@ -86,13 +86,6 @@ def test_a_flight_of_a_scenario_equals_the_flight_alone(models, flights):
 
 
 @pytest.mark.slow
-def test_true_model_tracks_better_than_the_nominal_one_and_predicts_its_cost(flights):
-    rows = {row["model"]: row for row in flights.rows()}
-    assert rows["oracle"]["position_rmse"] < rows["nominal"]["position_rmse"]
-    assert abs(rows["oracle"]["excess"]) < 0.02  # plans have steps of 0.05 s, the simulation of 0.01 s
-
-
-@pytest.mark.slow
 def test_sensors_and_rotors_act_with_a_noise_for_each_seed(models, flights, tmp_path):
     noisy = Hardware(latency=0.01, rotor_lag=0.03, noise=(0.001, 0.002, 0.02, 0.02))
     own = {Agent("hybrid"): models[0][Agent("hybrid")]}  # two seeds of the same model

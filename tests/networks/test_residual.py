@@ -185,26 +185,6 @@ def test_without_a_batch_s_statistics_training_is_deployment_and_both_the_plain_
         assert eqx.tree_equal(field.update_running_stats(x, u), field)
 
 
-@pytest.mark.parametrize("norm", ["layer", "none"])
-def test_the_gradient_of_a_minibatch_is_that_of_its_samples_one_by_one(norm):
-    with jax.enable_x64(True):
-        field, (x, u) = unbatched(norm), batch()
-
-        def one_by_one(field):
-            return sum(jnp.sum(plain_one(field, x[:, i], u[:, i]) ** 2) for i in range(3))
-
-        found = jax.jit(jax.grad(lambda field: jnp.sum(field.train_batch(x[:, :3], u[:, :3]) ** 2)))(field)
-        expected = jax.jit(jax.grad(one_by_one))(field)
-        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)  # round-off of float64
-        assert all(jax.tree.leaves(base.trainable(field)))
-
-
-def test_without_normalisation_the_bias_starts_as_a_linear_layer_s():
-    shift = residual_network(13, 4, jax.random.key(0), norm="none").norm.shift
-    assert 0.85 / 17**0.5 < jnp.abs(shift).max() <= 1 / 17**0.5  # 64 draws of a fixed seed
-
-
 @pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])
 @pytest.mark.parametrize("sizes", [(1, 1), (3, 2)], ids=["few inputs", "more"])
 @pytest.mark.parametrize("norm", ["batch", "layer", "none"])

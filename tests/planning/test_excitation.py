@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax.control.references import reference_state
@@ -95,7 +96,7 @@ def test_a_parameter_that_nothing_excites_is_named():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"parameters": ("d",)}, r"parameters must be names of b, got \('d',\)"),
+        ({"parameters": ("d",)}, "parameters must be names of b, got ('d',)"),
         ({"model": Doubled(jnp.array(1.0), jnp.array(2.0))}, "no input distinguishes a and b"),
         ({"bounds": hj.FlightBounds()}, "bounds must be InputBounds"),
         ({"bounds": hj.InputBounds((-1.0,), (1.0,), (2.0,), (-1.0,), (1.0,))}, "x0 leaves its limits even at rest"),
@@ -106,23 +107,14 @@ def test_a_parameter_that_nothing_excites_is_named():
 )
 def test_bad_input_is_refused_in_one_line(change, said):
     given = {"model": GAIN, "bounds": FREE, "steps": 0} | change
-    with pytest.raises(ValueError, match=said) as refused:
-        search(**given)
-    assert "\n" not in str(refused.value)
+    refusal(lambda: search(**given), said)
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: hj.FlightBounds(low=(0.0, 0.0, 2.0), high=(1.0, 1.0, 1.0)), "low must be below high"),
-        (lambda: hj.FlightBounds(rotor_speed=(0.5, 1.2)), "two shares between 0 and 1"),
-        (lambda: hj.InputBounds((0.0,), (1.0, 2.0), (0.0,)), "equally many"),
-        (lambda: hj.InputBounds((0.0,), (1.0,), (0.0,), state_low=(0.0,)), "given together"),
-    ],
-)
-def test_an_empty_box_is_refused(make, said):
-    with pytest.raises(ValueError, match=said):
-        make()
+def test_an_empty_box_is_refused():
+    refusal(lambda: hj.FlightBounds(low=(0.0, 0.0, 2.0), high=(1.0, 1.0, 1.0)), "low must be below high")
+    refusal(lambda: hj.FlightBounds(rotor_speed=(0.5, 1.2)), "two shares between 0 and 1")
+    refusal(lambda: hj.InputBounds((0.0,), (1.0, 2.0), (0.0,)), "equally many")
+    refusal(lambda: hj.InputBounds((0.0,), (1.0,), (0.0,), state_low=(0.0,)), "given together")
 
 
 @pytest.fixture(scope="module")
