@@ -21,6 +21,7 @@ from experiments.reporting.tables import (
 )
 
 TUNED, PHYSICS = (HYBRID, FINE_TUNED, FEW), (PHYSICS_ONLY, FINE_TUNED, FEW)
+SOLVED = names.LEAST_SQUARES, names.CONSTANT_DISTURBANCE  # not trained, though their rows have the mode
 EXPERT = (names.EXPERT_AUGMENTATION, SOURCE_ONLY, 0)
 UNITS = {"Ix": "kg m²", "Iy": "kg m²", "k": "N/(rad/s)²"}
 # Errors printed in the paper: a mean with its std, or the smallest of ten seeds.
@@ -55,7 +56,7 @@ def by_size(rows: Results) -> list[Table]:
         # A source-only model is what fine-tuning starts from: it stands at the head of that column.
         modes = {FINE_TUNED: (FINE_TUNED, SOURCE_ONLY), TARGET_ONLY: (TARGET_ONLY,)}
         columns = {
-            label(model, mode): {"model": model, "mode": seen}
+            label(model) if model in SOLVED else label(model, mode): {"model": model, "mode": seen}
             for mode, seen in modes.items()
             for model in MODELS
             if len((trained or group).where(model=model, mode=seen))
