@@ -49,6 +49,8 @@ def written(folder: Path, report: Report) -> dict[str, str]:
 
 
 def main() -> None:
+    if unknown := [each for each in sys.argv[1:] if not Path(each).is_dir()]:
+        sys.exit(f"{__doc__}\nNo such folder: {', '.join(unknown)}")
     for path in sorted(found for folder in sys.argv[1:] or [REFERENCE] for found in Path(folder).rglob(JSON_NAME)):
         report, folder = report_of(path.parent), path.parent
         save_figures(folder, report.figures)
