@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hybrid_jax.codegen.nodes import Address, Assign, Element, Entry, Expression, Loop, Operation, Statement, nested
+from hybrid_jax.codegen.nodes import Address, Assign, Entry, Expression, Loop, Operation, Statement, nested
 
 LOOPED = 8  # so many entries are copied by a loop
 
@@ -55,14 +55,14 @@ def indexed(tables: Tables, entries: np.ndarray, shape: tuple[int, ...]) -> Expr
         kept = [bool((grid != grid.take([0], axis)).any()) for axis in range(grid.ndim)]
         core = grid[tuple(slice(None) if keep else slice(0, 1) for keep in kept)]
         strides = np.array(_strides(core.shape)) * kept
-        return Element(tables.table(core.ravel()), 0, tuple(strides.tolist()))
+        return Entry(tables.table(core.ravel()), 0, steps=tuple(strides.tolist()))
     if (places := _places(entries)) is None:
         return None
     grid = places.reshape(shape)
     corner = int(grid.flat[0])
     steps = [int(grid.take(1, axis).flat[0]) - corner if size > 1 else 0 for axis, size in enumerate(shape)]
     linear = (grid == corner + np.tensordot(steps, np.indices(shape), 1)).all()
-    return Element(first.name, corner, tuple(steps)) if linear else None
+    return Entry(first.name, corner, steps=tuple(steps)) if linear else None
 
 
 def _strides(shape: Sequence[int]) -> tuple[int, ...]:
@@ -79,13 +79,13 @@ def _places(entries: np.ndarray) -> np.ndarray | None:
 
 def mapping(out: str, value: Expression, shape: tuple[int, ...]) -> Statement:
     """Set each entry of an array of this shape to a value that depends on its indices."""
-    return nested(shape, Assign(Element(out, 0, _strides(shape)), value))
+    return nested(shape, Assign(Entry(out, 0, steps=_strides(shape)), value))
 
 
 def folding(out: str, name: str, operand: Expression, shape: tuple[int, int]) -> Statement:
     """Reduce the entries of each row by a binary operation."""
-    first = replace(operand, steps=operand.steps[:1]) if isinstance(operand, Element) else operand
-    total = Element(out, 0, (1,))
+    first = replace(operand, steps=operand.steps[:1]) if isinstance(operand, Entry) else operand
+    total = Entry(out, 0, steps=(1,))
     more = Loop("i1", shape[1], (Assign(total, Operation(name, (total, operand))),), start=1)
     return nested(shape[:1], Assign(total, first), more)
 
@@ -96,8 +96,8 @@ def stores(out: str, entries: np.ndarray, begin: int = 0) -> tuple[Statement, ..
     while i < len(entries):
         first, (run, step) = entries[i], _run(entries[i:])
         if run >= LOOPED:
-            source = Element(first.name, first.index, (step,)) if step else first
-            statements.append(nested((run,), Assign(Element(out, begin + i, (1,)), source)))
+            source = Entry(first.name, first.index, steps=(step,)) if step else first
+            statements.append(nested((run,), Assign(Entry(out, begin + i, steps=(1,)), source)))
         else:
             run = 1
             statements.append(Assign(Entry(out, begin + i), first))

@@ -1,6 +1,6 @@
 """Generated code as values (expressions and statements) that a printer writes in a language.
 
-An expression is a number (a float, a bool, or an int for a count), a `Reference` or an `Operation`, named as in JAX.
+An expression is a number (a float, a bool, or an int for a count), an `Entry` or an `Operation`, named as in JAX.
 Loop counters are numbered from the outermost: i0, i1, …
 """
 
@@ -11,30 +11,20 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Reference:
-    """A node with the name of a variable or an array."""
+class Entry:
+    """A variable, or the entry of an array at index + Σ steps[k] ik, in loops with counters ik.
+
+    A logical one is an int (0 or 1) instead of a real.
+    """
 
     name: str
-
-
-@dataclass(frozen=True)
-class Entry(Reference):
-    """A variable, or with an index an entry of an array; a logical one is an int (0 or 1) instead of a real."""
-
     index: int | None = None
     logical: bool = False
-
-
-@dataclass(frozen=True)
-class Element(Reference):
-    """The entry of an array at corner + Σ steps[k] ik, in loops with counters ik."""
-
-    corner: int = 0
     steps: tuple[int, ...] = ()
 
 
-class Address(Element):
-    """The start of entries of an array, at an index like `Element`'s."""
+class Address(Entry):
+    """The start of entries of an array, at an index like `Entry`'s."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +35,7 @@ class Operation:
     operands: tuple["Expression", ...]
 
 
-Expression = float | bool | int | Reference | Operation
+Expression = float | bool | int | Entry | Operation
 
 
 @dataclass(frozen=True)
@@ -80,7 +70,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Assign:
-    target: Entry | Element
+    target: Entry
     value: Expression
 
 
@@ -127,15 +117,15 @@ def walk(node: Any) -> Iterator[Any]:
 
 
 def names(node: Any) -> frozenset[str]:
-    """Names of the references in a node."""
-    return frozenset(one.name for one in walk(node) if isinstance(one, Reference))
+    """Names of the variables and arrays in a node."""
+    return frozenset(one.name for one in walk(node) if isinstance(one, Entry))
 
 
 def renamed(node: Any, others: Mapping[str, str]) -> Any:
     """Rename some variables and arrays in a node."""
     if isinstance(node, tuple):
         return tuple(renamed(one, others) for one in node)
-    if isinstance(node, Reference):
+    if isinstance(node, Entry):
         return replace(node, name=others.get(node.name, node.name))
     if is_dataclass(node):
         return replace(node, **{key: renamed(one, others) for key, one in vars(node).items()})  # type: ignore

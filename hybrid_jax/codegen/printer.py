@@ -8,7 +8,7 @@ import numpy as np
 
 from hybrid_jax.codegen import nodes
 from hybrid_jax.codegen.loops import Tables
-from hybrid_jax.codegen.nodes import Address, Element, Entry, Operation
+from hybrid_jax.codegen.nodes import Address, Entry, Operation
 
 _INFIX = {
     **{"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&&", "or": "||"},
@@ -91,12 +91,10 @@ class CPrinter:
                 return str(int(node))
             case float():
                 return self.number(node)
-            case Entry(name, index):
-                return name if index is None else f"{name}[{index}]"
-            case Address(name, corner, steps):
-                return f"{name} + {_place(corner, steps)}" if corner or any(steps) else name
-            case Element(name, corner, steps):
-                return f"{name}[{_place(corner, steps)}]"
+            case Address(name, index, _, steps):
+                return f"{name} + {_place(index or 0, steps)}" if index or any(steps) else name
+            case Entry(name, index, _, steps):
+                return name if index is None else f"{name}[{_place(index, steps)}]"
             case Operation(name, operands):
                 return self.operations[name].format(*map(self._operand, operands), f="" if self.double else "f")
         raise TypeError(f"{type(node).__name__} is not an expression")

@@ -9,7 +9,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from hybrid_jax.codegen import loops, nodes
 from hybrid_jax.codegen.loops import Tables
-from hybrid_jax.codegen.nodes import Address, Call, Element, Entry, Expression, Loop, Operation, Statement
+from hybrid_jax.codegen.nodes import Address, Call, Entry, Expression, Loop, Operation, Statement
 from hybrid_jax.codegen.operations import LOGICAL, CTranslation, column, is_zero
 from hybrid_jax.codegen.printer import OPERATIONS, CPrinter
 from hybrid_jax.codegen.translation import Entries
@@ -36,8 +36,8 @@ class SampleTranslation(CTranslation):
         if n > 1:
             return super()._loops(a, b) if m > 1 else self._loops(b.T, a.T).T
         matrix, steps = loops.indexed(self.tables, a.ravel(), a.shape), (k, 1)
-        if isinstance(matrix, Element):
-            matrix, steps = Address(matrix.name, matrix.corner), matrix.steps
+        if isinstance(matrix, Entry) and matrix.steps:
+            matrix, steps = Address(matrix.name, matrix.index), matrix.steps
         else:
             matrix = loops.address(self.tables, self._gathered(a.ravel()))
         given = matrix, *steps, loops.address(self.tables, self._gathered(b.ravel(), b.shape))
