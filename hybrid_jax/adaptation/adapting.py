@@ -87,9 +87,9 @@ def adapt(
 
     Args:
         field: a trained `Hybrid`, or any other field.
-        windows: you should pass them in the order of time and without overlap, more windows than parameters. If the
-            windows follow each other, for example in one flight, the intervals allow for errors that are correlated
-            within a fifth of the windows. NaN in x means not measured, and counts as no error; x0 and u must be whole.
+        windows: windows of the changed system, more than parameters, in the order of time and without overlap. If
+            they follow each other, for example in one flight, intervals allow for errors that are correlated within a
+            fifth of the windows. NaN in x means "not measured" and counts as no error; x0 and u must be finite.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` to write your own.
         validation: windows for early stopping and penalties; you should take them from another flight. By default the
             last fifth of `windows` is held out if the method needs validation.
@@ -101,7 +101,7 @@ def adapt(
 
     Raises:
         ValueError: if the method is unknown, windows are malformed, too few or of another system, or the method cannot
-    adapt the field.
+            adapt the field.
     """
     checks.not_traced("adapt", field, windows, validation, learned_from)
     name, method = _named(method)

@@ -92,7 +92,7 @@ def covariance_of(
 
     Raises:
         ValueError: if there are no more windows than parameters, they are malformed, or kind is unknown or
-    homoscedastic with an `error`.
+            homoscedastic with an `error`.
     """
     windows = least_squares.check_windows(field, windows, missing=True)
     traced = checks.is_traced(windows.x)  # else NumPy counts, which keeps no program for each size
