@@ -158,9 +158,9 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: in
 
     Args:
         logs: evenly sampled flights.
-        steps: intervals per window.
-        stride: samples between the starts of two windows.
-        most: largest number of windows, of which evenly spaced ones are kept; by default all are.
+        steps: number of intervals in each window.
+        stride: number of samples between the starts of two windows.
+        most: the largest number of windows to return, spread evenly; by default all.
 
     Returns:
         Windows in float32, ordered by flight.

@@ -165,8 +165,8 @@ def identify_in_turn(
     """Fit first the thrust to the accelerometer, then the torques to the gyro, given the thrust.
 
     An error in the torques, for example the delay of a filtered gyro, then cannot bias the thrust curve and the lag.
-    The second intervals include the uncertainty of the first fit. If one of the two has no parameter or no sensor, you
-    get `identify`. Windows for the forces are `FORCE_STEPS` times as long.
+    The second intervals include the uncertainty of the first fit. If one of the two has no parameter or no sensor, this
+    is `identify`. Windows for the forces are `FORCE_STEPS` times as long.
 
     Args:
         field: an `Actuated` field if the input is commands; any other field takes the measured rotor speeds.

@@ -96,11 +96,11 @@ def grid_network(
     """Make a network that is the same at each point of a grid, with the paper's initial weights.
 
     Args:
-        grid: the points, and the components at each.
-        input_size: m, the size of u, which every point reads; 0 if the network does not depend on u.
-        kernel: points along each axis that it reads, odd: 1 is pointwise, 3 a convolution.
-        hidden: units at each point.
-        activation: of the hidden units, by default smooth; see `residual_network`.
+        grid: the grid of the state.
+        input_size: m, the size of u, which the network reads at each point; 0 if it does not depend on u.
+        kernel: number of points along each axis that it reads, odd. For example, 1 is pointwise and 3 a convolution.
+        hidden: number of hidden units at each point.
+        activation: activation of the hidden units, by default smooth; see `residual_network`.
         norm: normalisation of the hidden units, by default none; see `residual_network`.
         scaling: scaling of inputs and outputs; see `residual_network`.
 

@@ -57,13 +57,13 @@ class OnlineAdaptation(AbstractEstimator):
         dt: time between two samples [s].
         noise: standard deviation of the measurement of each state.
         prior: standard deviation of each parameter before and after a change, in the physics' own parametrisation (for
-            a rigid body: logarithms), one number for all or by name: efficiency[0] is one
+            example logarithms for a rigid body). It is one number for all, or a number by name: efficiency[0] is one
             entry, efficiency a whole array. Zero keeps a parameter constant.
         disturbance: standard deviation of the constant part of ẋ at each disturbed state; 0 for none.
         indices: indices of the disturbed states, by default the field's or its state space's.
         process: standard deviation of the white process noise of each state [1/√s].
         hypotheses: mutually exclusive changes of a few parameters, weighted by how well they explain the samples. The
-            model stays the field's own until a change is detected.
+            model stays the given field until a change is detected.
         tuning: settings of forgetting and change detection.
         names: names of the parameters, in the order of θ.
         scales: the prior standard deviation of each parameter, in the same order.
