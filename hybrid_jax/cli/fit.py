@@ -121,7 +121,6 @@ def _about(options: Options, model: VehicleModel, flights: Flights, found: Learn
     features = RIGID_BODY_SPACE.features(
         *(np.concatenate([getattr(log, part) for log in flights.logs]) for part in "xu")
     )
-    ends = {name: list(each) for name, *each in zip(UNITS, *found.expected, strict=True)}
     return {
         "steps": STEPS,
         "vehicle": model.vehicle.name,
@@ -131,7 +130,7 @@ def _about(options: Options, model: VehicleModel, flights: Flights, found: Learn
         "windows": {part: getattr(found.windows, part).tolist() for part in ("x0", "u", "x")},
         "motion": {name: np.quantile(values, QUANTILES).tolist() for name, values in features.items()},
         "chosen": found.chosen,
-        "expected": ends,
+        "expected": {name: each for name, *each in zip(UNITS, *found.expected, strict=True)},
     }
 
 

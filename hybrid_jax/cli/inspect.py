@@ -16,7 +16,7 @@ from hybrid_jax.cli import page
 from hybrid_jax.cli.command import BAD_INPUT, in_flags
 from hybrid_jax.cli.logs import LogOptions, Looked, content_of, grouped, look, paths_of, printable
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
-from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS
+from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import Recording, Signal, unit_of
 from hybrid_jax.identification.estimates import estimate
@@ -196,14 +196,13 @@ def _signals(logs: Sequence[Looked]) -> page.Table:
 
 def _checks(logs: Sequence[Looked]) -> page.Table:
     """List the results of all checks."""
-    every = dict.fromkeys(check.name for log in logs for check in log.checks)
-    lines = []
-    for log in logs:
-        own = dict.fromkeys(every, EMPTY)
-        for check in log.checks:
-            number = f" {check.value:.3g} {check.unit}" if check.unit and math.isfinite(check.value) else ""
-            own[check.name] = f"{SHOWN.get(check.verdict, 'ok')}{number}"
-        lines.append((log.name, *own.values()))
+
+    def shown(check: Check) -> str:
+        number = f" {check.value:.3g} {check.unit}" if check.unit and math.isfinite(check.value) else ""
+        return f"{SHOWN.get(check.verdict, 'ok')}{number}"
+
+    every = dict.fromkeys((check.name for log in logs for check in log.checks), EMPTY)
+    lines = [(log.name, *(every | {each.name: shown(each) for each in log.checks}).values()) for log in logs]
     return page.Table("Checks (?: cannot tell; docs/howto/logs.md explains each)", ("log", *every), lines)
 
 

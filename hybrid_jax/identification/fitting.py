@@ -138,11 +138,10 @@ def _search(
 ) -> tuple[Search, Windows, Float[np.ndarray, "m k"]]:
     physics = physics_of(field)
     commanded = isinstance(physics, Actuated)
-    if volts := commanded and physics.reads_voltage:
-        for recording in recordings:
-            if "voltage" not in recording.signals:
-                mend = "leave nominal_voltage and voltage_exponent out of [actuator], or leave this log out"
-                raise ValueError(f"{recording.name}: has no battery voltage, which the actuator depends on; {mend}")
+    volts = commanded and physics.reads_voltage
+    for name in (each.name for each in recordings if volts and "voltage" not in each.signals):
+        mend = "leave nominal_voltage and voltage_exponent out of [actuator], or leave this log out"
+        raise ValueError(f"{name}: has no battery voltage, which the actuator depends on; {mend}")
     told = "command" if commanded else "rotor_speed"
     windows, axes, root = cut(recordings, layout, told, measured, most, volts)
     model = in_double(Multirotor(with_hidden(physics, RandomWalk(PUSHED)), axes, layout.ahead))

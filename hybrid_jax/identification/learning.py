@@ -64,16 +64,13 @@ class Learned(NamedTuple):
 
 
 def learnable(model: VehicleModel, seconds: float, window: float, moves: bool = True) -> tuple[VehicleModel, str]:
-    """Leave out of the parameters that are learned by default those that the logs do not determine.
+    """Leave out of the parameters that are learned by default those that the logs do not determine; say which.
 
     Args:
         model: is returned as it is if its file, or the user, named parameters.
         seconds: of flight in all logs.
         window: length of a window [s].
         moves: whether the logs have a velocity.
-
-    Returns:
-        The model, and a line about what was left out, or an empty one.
     """
     if model.learn != LEARN:
         return model, ""
