@@ -18,6 +18,7 @@ from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.dynamics.disturbance import disturbance_of
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.export import casadi_function, export_adaptation_c, export_c, export_program
@@ -35,7 +36,7 @@ RESPONSE, FASTER = 0.2, 1.05  # of the figure: seconds, and factor on the speed 
 UNITS = "velocity [m/s]", "body rates [rad/s]"
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
 PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.md
-DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
+FORCE, TORQUE = 3.0, 5.0  # standard deviations of a disturbance: m/s² and rad/s²
 STATES = "x: position [m], quaternion w x y z, velocity [m/s], body rates [rad/s]; u: rotor speeds [rad/s]."
 WITHOUT = "The model is written without its past: in a program you would have to filter its errors yourself."
 
@@ -167,7 +168,11 @@ def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> 
         expected = f"1, {len(PARTS)} or {d}" if d == STATE_SIZE else f"1 or {d}"
         raise ValueError(f"--noise must be {expected} numbers, got {len(noise)}")
     field = field if options.smooth is None else smoothed(field, options.smooth)
-    beyond, process = (DISTURBANCE, np.repeat(PROCESS, PARTS)) if rigid else (0.0, 0.0)
+    beyond, process = 0.0, 0.0
+    if rigid:  # an adapted model may have a disturbance of some states alone
+        own = getattr(disturbance_of(field), "indices", None) or range(VELOCITY.start, STATE_SIZE)
+        beyond = tuple(TORQUE if i >= BODY_RATES.start else FORCE for i in own)
+        process = np.repeat(PROCESS, PARTS)
     noise = np.repeat(noise, known[len(noise)])
     return OnlineAdaptation(field, dt, noise, disturbance=beyond, process=process)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
+from hybrid_jax.cli.export import TORQUE, Options, _filter
 from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.export import export_adaptation_c, load_program
 from hybrid_jax.networks.standardise import with_motion
@@ -34,6 +35,15 @@ def test_all_that_is_written_is_the_model(field, tmp_path, called):
     np.testing.assert_allclose(ca.Function.load(str(out / "step.casadi"))(X, U).full()[:, 0], predicted, atol=1e-5)
     derivative = ca.Function.load(str(out / "field.casadi"))(X, U).full()[:, 0]
     np.testing.assert_allclose(field(X, U), derivative, rtol=1e-5, atol=1e-4)
+
+
+def test_the_filter_keeps_which_states_an_adapted_model_disturbs(tmp_path):
+    """Of a model with a torque alone the exported filter had six disturbances for three."""
+    body = hj.with_disturbance(hj.rigid_body(hj.IRIS), (10, 11, 12))
+    made = _filter(Options(tmp_path, tmp_path), body, 0.01, 13)
+    assert isinstance(made, hj.OnlineAdaptation)
+    scales = dict(zip(made.names, made.scales, strict=True))
+    assert [size for name, size in scales.items() if name.startswith("disturbance")] == [TORQUE] * 3
 
 
 def test_c_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, called, monkeypatch):
