@@ -101,7 +101,7 @@ def _page(options: Options, found: Excitation, points: np.ndarray, values, units
     header = ("parameter", "value", "half-width", "of the value")
     worst, within = max(found.parameters, key=lambda name: shares[name]), sum(each < WELL for each in shares.values())
     left = [(name, f"{share:.0%}") for name, share in found.margins.items()]
-    least = f"{worst} is the least certain, to ± {shares[worst]:.0%}"
+    least = f"{worst} is the least certain: {values[worst]:.2g} ± {halves[worst]:.2g}"
     return page.Page(
         f"Which {options.seconds:g} s of flight identify the parameters of {options.model.name} best?",
         f"{options.output} determines {within} of {len(rows)} parameters to ± {WELL:.0%} or better; {least}.",
