@@ -1,8 +1,6 @@
 """Trajectories of a vector field with piecewise constant inputs, by any one-step ODE solver of diffrax."""
 
-import dataclasses
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from typing import ClassVar
 
@@ -11,28 +9,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, state_space
 from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.implicit_solvers import prepared
 from hybrid_jax.runtime import entry, jit_by_size
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
-NEWTON_STEPS = 50  # of Newton's method in a stage of an implicit solver
 LONG = 1000  # intervals in which solvers change the norm of a quaternion by more than rounding
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
 _infer = jit_by_size()(lambda field, x, u: as_field(field).infer_batch(x, u))
-
-
-class _Newton(optimistix.Newton):
-    """Newton's method that ends when its update is small, and not, as diffrax's default, at the first that grows."""
-
-    def terminate(self, fn, y, args, options, state, tags):
-        return state.diffsize < 1, state.result
 
 
 class RK4(diffrax.AbstractSolver):
@@ -101,20 +91,24 @@ def integrate(
 
     Each interval is a separate solve with its input as `args`: a single one would read the next input at its end.
     """
-    solver = _prepared(solver, jnp.result_type(x0))
-    term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
+    solver = prepared(solver, jnp.result_type(x0))
+    term = diffrax.ODETerm(lambda t, x, args: derivative(x, args[0]))
     substeps *= solver.substeps if isinstance(solver, RK4) else 1
     begin, end = 0.0, dt / substeps
     if implicit := isinstance(solver, diffrax.AbstractImplicitSolver):
-        begin, end = jnp.asarray(begin), jnp.asarray(end)  # its root finder accepts no plain numbers
+        begin, end = jnp.asarray(begin, x0.dtype), jnp.asarray(end, x0.dtype)  # its root finder takes no plain numbers
 
     def interval(x, held):
         # The solver starts afresh in each interval: the input jumped, so nothing may be reused from the last one.
-        started = x, solver.init(term, begin, end, x, held)
+        started = x, solver.init(term, begin, end, x, (held, x))
 
         def step(carry, _):
-            x, _, _, state, result = solver.step(term, begin, end, carry[0], held, carry[1], made_jump=False)
-            return (jnp.where(result == diffrax.RESULTS.successful, x, jnp.nan) if implicit else x, state), None
+            x, state = carry
+            known = jnp.isfinite(x).all() if implicit else True
+            x = jnp.where(known, x, x0) if implicit else x  # a later step must be differentiable
+            x, _, _, state, result = solver.step(term, begin, end, x, (held, x), state, made_jump=False)
+            solved = known & (result == diffrax.RESULTS.successful)
+            return (jnp.where(solved, x, jnp.nan) if implicit else x, state), None
 
         # Training takes one step: that program has no loop in it. Many, written out, would take minutes to compile.
         (x, _), _ = step(started, None) if substeps == 1 else jax.lax.scan(step, started, length=substeps)
@@ -143,20 +137,6 @@ def traced_once(derivative: Derivative, x: Float[Array, " d *b"]) -> Derivative:
 @jit_by_size()
 def _evaluate(field: AbstractVectorField, x, u):
     return field(x, u)
-
-
-def _prepared(solver: Solver, dtype) -> Solver:
-    """The solver with a root finder that converges and a bounded loop, which `shard_map` can differentiate."""
-    if isinstance(solver, diffrax.HalfSolver):
-        return eqx.tree_at(lambda half: half.solver, solver, _prepared(solver.solver, dtype))
-    if isinstance(solver, diffrax.AbstractImplicitSolver) and not isinstance(solver.root_finder.rtol, float):  # pyright: ignore[reportAttributeAccessIssue]
-        tolerance = 1e-5 if jnp.finfo(dtype).bits < 64 else 1e-10
-        # A step here is a whole interval, and is not tried again with a smaller one as diffrax's default expects.
-        newton = _Newton(tolerance, tolerance, cauchy_termination=False)
-        solver = dataclasses.replace(solver, root_finder=newton, root_find_max_steps=NEWTON_STEPS)
-    if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
-        return dataclasses.replace(solver, scan_kind="bounded")
-    return solver
 
 
 @entry
@@ -246,16 +226,6 @@ def check_solver(solver) -> None:
     # A step starts at time zero, of which a multistep method would remember the wrong ones.
     if solver.term_structure is not diffrax.AbstractTerm or isinstance(solver, diffrax.LeapfrogMidpoint):
         raise ValueError(f"solver must be a one-step method for ODEs of one term, got {type(solver).__name__}")
-
-
-@contextmanager
-def solver_errors(solver: Solver | None) -> Iterator[None]:
-    """Shorten the message of an implicit solver whose equations are not finite to one line."""
-    try:
-        yield
-    except eqx.EquinoxRuntimeError:
-        found = f"{type(solver).__name__} finds no step where the search went"
-        raise ValueError(f"solver: {found}; start nearer, or bound the field") from None
 
 
 def check_callable(field) -> None:

@@ -164,9 +164,12 @@ def test_an_attitude_stays_one_however_long_it_turns():
     np.testing.assert_allclose(rollout(body, x0, u[:500], 0.01), flown[:500], rtol=1e-6, atol=1e-6)
 
 
+LAGGED = [np.random.default_rng(0).normal(size=size).astype(np.float32) for size in ((24, 1), (24, 10, 1))]
+
+
 @pytest.mark.parametrize("name", ["ImplicitEuler", "Kvaerno3", "Kvaerno5"])
 def test_an_implicit_solver_solves_its_equations_or_says_that_it_did_not(name):
-    """A state that follows the sine of a slow one, from a start beside it."""
+    """A state that follows the sine of a slow one, from a start beside it; a lag of 1 ms; one without a step."""
 
     def rolled(rate):
         def field(x, u):
@@ -174,5 +177,9 @@ def test_an_implicit_solver_solves_its_equations_or_says_that_it_did_not(name):
 
         return rollout(field, jnp.array([0.3, 0.3015]), jnp.full((2, 1), 0.1), 0.1, getattr(diffrax, name)())[-1]
 
-    np.testing.assert_allclose(rolled(3.6e4), (0.3002, 0.2957), atol=1e-3)
-    assert jnp.isnan(rolled(1e13)).all()
+    for rate in (3.6e4, 1e9):
+        np.testing.assert_allclose(rolled(rate), (0.3002, 0.2957), atol=1e-3)
+    at_rest = rollout_batch(lambda x, u: 1e3 * (u - x), *LAGGED, 0.01, getattr(diffrax, name)())
+    assert jnp.isfinite(at_rest).all()  # the slope is there a difference of large numbers
+    grown = rollout(lambda x, u: 1e3 + x**2, jnp.zeros(1), jnp.zeros((2, 1)), 0.1, getattr(diffrax, name)())
+    assert jnp.isnan(grown).all()

@@ -13,9 +13,9 @@ ROOT = Path(__file__).parents[1]
 # Modules and packages of the library, from the bottom: each may import what stands before it.
 ORDER = (
     *("_version", "state", "rotation", "matrices", "chunks", "runtime", "checks", "vehicle", "state_space", "records"),
-    *("trajectories", "status", "extrapolation", "dynamics", "integrate", "networks", "codegen", "kernels"),
-    *("rollouts", "metrics", "io", "estimation", "training", "adaptation", "online", "sweep", "sim", "flights"),
-    *("control", "export", "planning", "identification", "cli", "__main__"),
+    *("trajectories", "status", "extrapolation", "dynamics", "implicit_solvers", "integrate", "networks"),
+    *("codegen", "kernels", "rollouts", "metrics", "io", "estimation", "training", "adaptation", "online", "sweep"),
+    *("sim", "flights", "control", "export", "planning", "identification", "cli", "__main__"),
 )
 # These serve any field, whatever trained it: no learning, no reporting, and none of them knows another.
 SERVICES = {"sim", "flights", "control", "export"}

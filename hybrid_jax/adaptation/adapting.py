@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -31,10 +32,11 @@ from hybrid_jax.dynamics.disturbance import (
     without_zeros,
 )
 from hybrid_jax.dynamics.rigid_body import uncorrected
-from hybrid_jax.estimation.least_squares import Solver
+from hybrid_jax.estimation.least_squares import Solver, check_steps
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters, sandwich
 from hybrid_jax.extrapolation import features_of, shares_outside
-from hybrid_jax.integrate import checked, compact, solver_errors
+from hybrid_jax.implicit_solvers import solver_errors
+from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import CHUNK
 from hybrid_jax.networks.standardise import motion_of
@@ -149,6 +151,8 @@ def adapt(
     adapted = solution.field
     if disturbance_of(field) is None:
         adapted = uncorrected(without_zeros(adapted))  # what windows need
+    if exact and isinstance(solver, diffrax.AbstractImplicitSolver):  # others cost no step more
+        check_steps(adapted, train, solver, scale_of(settings.objective, windows.x0.shape[-1]))
     space, found = state_space(field, windows.x0.shape[-1]), disturbance_of(adapted)
     choice = {} if solution.choice is None else _chosen(solution.choice, train, space)
     status = Status(int(solution.status))

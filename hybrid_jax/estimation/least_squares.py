@@ -19,7 +19,8 @@ from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_l
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, corrected, judged, minimise, move_of_rows
-from hybrid_jax.integrate import compact, rollout, solver_errors
+from hybrid_jax.implicit_solvers import solver_errors, unsolved
+from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.runtime import entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories, errors_of
@@ -28,6 +29,7 @@ MANY, CHUNK = 10_000, 1000  # windows: of more, a triangle takes the place of J 
 TOGETHER = 64  # windows that are linearised at a time
 LEAST = 0.1  # of what rounding does to the states: a step of which less is expected is the last
 COARSE = 0.5  # standard errors that half the solver's step may move a parameter
+REMEDY = "windows with a smaller dt, or a solver with more substeps, such as RK4(substeps=2)"
 FINE = 1e-3  # of how far the states move: smaller errors do not count as noise of which a fit is
 
 Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
@@ -91,14 +93,20 @@ def fit_least_squares(
     with solver_errors(solver):
         found = _fit_and_compare(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
     if not checks.is_traced(found.discretisation):
-        warn_of_steps(float(found.discretisation), "a solver with more substeps, such as RK4(substeps=2)")
+        if isinstance(solver, diffrax.AbstractImplicitSolver) and found.status == Status.DIVERGED:
+            raise unsolved(solver)
+        warn_of_steps(float(found.discretisation), REMEDY)
     return found
 
 
+def check_steps(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> None:
+    warn_of_steps(float(_fit_and_compare(field, windows, solver, 1, scale).discretisation), REMEDY)
+
+
 def warn_of_steps(discretisation: float, remedy: str) -> None:
+    moved = f"half the solver's step would move a parameter by {discretisation:.2g} standard errors"
     if discretisation > COARSE:
-        errors = f"{discretisation:.2g} standard errors"
-        warnings.warn(f"half the solver's step would move a parameter by {errors}: give {remedy}", stacklevel=3)
+        warnings.warn(f"{moved}: give {remedy}", stacklevel=4)
 
 
 @jit_by_size()
@@ -265,8 +273,7 @@ def fit_and_linearise(
 
 def _units(jacobian, errors, windows: Trajectories, scale: Scale, free, held) -> tuple[Theta, Float[Array, ""]]:
     """Return units of the parameters and errors in which dampings and tolerances are dimensionless (Moré 1978)."""
-    size = _nonzero(jnp.linalg.norm(errors))
-    effect = jnp.linalg.norm(jacobian.reshape(-1, jacobian.shape[-1]), axis=0)
+    size, effect = _nonzero(jnp.linalg.norm(errors)), jnp.linalg.norm(jacobian.reshape(-1, jacobian.shape[-1]), axis=0)
     seen, effect = effect > rounding(windows, scale), jnp.sqrt(jnp.square(effect) + jnp.square(held))
     return jnp.where(seen if free is None else free & seen, size / _nonzero(effect), 0), size
 

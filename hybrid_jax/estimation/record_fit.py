@@ -26,7 +26,8 @@ from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.estimation.record_search import TINY, size_of
 from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
-from hybrid_jax.integrate import RK4, solver_errors
+from hybrid_jax.implicit_solvers import solver_errors
+from hybrid_jax.integrate import RK4
 from hybrid_jax.records import Between, Record, Signal, on_grid
 from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status

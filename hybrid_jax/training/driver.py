@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, trainable
 from hybrid_jax.dynamics.composition import check_batch_norm
+from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_motion, with_scaling
@@ -208,7 +209,7 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     # The default is not an argument: an optimiser holds closures, with which a program is not kept.
     chosen = {} if optimiser is fitting.ADAM else {"optimiser": optimiser}
     train = _train_by_kernels if compiler_options(state.field, data, settings) else _train
-    with _reporting(progress, int(plan.max_epochs)) as report:
+    with _reporting(progress, int(plan.max_epochs)) as report, solver_errors(settings.solver):
         try:
             while int(state.status) == Status.RUNNING:
                 began, first = time.perf_counter(), int(state.epoch)
