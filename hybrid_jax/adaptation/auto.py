@@ -22,6 +22,7 @@ from hybrid_jax.adaptation.anchored import (
 )
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, groups_of, names_of
+from hybrid_jax.adaptation.results import NETWORK
 from hybrid_jax.adaptation.selection import (
     BLOCKS,
     STRONG,
@@ -67,7 +68,6 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
 PLAUSIBLE = Plausible()
 VAGUE = 1 / 3  # of a plausible change: if a network may have taken more, a parameter is called effective
 ROUNDS = 2  # the second one around what the first has taken: squared errors are not quadratic over large changes
-NETWORK = "network"  # the candidate that changes the network
 CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
 

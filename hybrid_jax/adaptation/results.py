@@ -15,6 +15,7 @@ from hybrid_jax.extrapolation import WARN
 from hybrid_jax.io.files import json_value
 from hybrid_jax.status import Status
 
+NETWORK = "network"  # the candidate that changes the network
 SHOWN = 0.01  # less probable candidates are not reported
 
 
@@ -121,9 +122,12 @@ class Adaptation:
             yield f"Not measured: {self.not_measured:.1%} of the states, which are NaN; they count as no error."
         yield f"Mean squared prediction error: {self.mse_before:.3g} before, {self.mse_after:.3g} after."
         if self.chosen is not None:
-            known = sorted(self.candidates.items(), key=lambda one: -one[1])
-            found = ", ".join(f"{name} {share:.2g}" for name, share in known if share >= SHOWN)
+            known = dict(sorted(self.candidates.items(), key=lambda one: -one[1]))
+            rather = known.pop(NETWORK, None)
+            found = ", ".join(f"{name} {share:.2g}" for name, share in known.items() if share >= SHOWN)
             yield f"Chosen: {self.chosen}. Probability of each change: {found}."
+            if rather is not None:
+                yield f"Probability that the network changed, rather than the most probable of these: {rather:.2g}."
         if self.alone:
             yield "Physics without the network predicts the source's own motion better and replaces the source."
         if self.refused:
