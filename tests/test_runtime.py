@@ -147,6 +147,7 @@ def test_nothing_is_deleted_in_a_folder_that_the_user_named(tmp_path):
 # Ctrl-C while the first module of a program loads.
 INTERRUPTED = """
 import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 sys.argv[0] = "-m"
 class Interrupt:
     def find_spec(self, name, *_):
