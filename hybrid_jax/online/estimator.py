@@ -38,7 +38,9 @@ from hybrid_jax.online.tuning import HOLD, PAUSE, Tuning
 from hybrid_jax.runtime import entry
 
 RISE, FALL = 10.0, 0.2  # of the logarithm of how much faster [1/s]
-BREEZE = 0.15  # random walk of a disturbance, in its prior [1/√s], whose effects a parameter's must exceed
+# Random walk of a disturbance, in its prior [1/√s], whose effects a parameter's must exceed: of a gust that lasts for a
+# second, with an rms of a sixth of the prior. The filter cannot know of gusts before they come.
+BREEZE = 0.25
 TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a parameter explains
 
 
@@ -212,6 +214,7 @@ class OnlineAdaptation(AbstractEstimator):
         covariance = state.covariance[d:, d:]
         if state.mixture is not None:
             covariance = multiple_model.covariance(state.mixture, self._models(), state.joint)
+            covariance = covariance + state.excitation.bias(self.tuning)
         return scales * state.trusted, scales[:, None] * covariance * scales
 
     @entry
@@ -266,7 +269,8 @@ class OnlineAdaptation(AbstractEstimator):
         """Update the filter of all parameters along excited directions; also return excitation and gains of θ."""
         d, tuning, ones = len(state.x), self.tuning, jnp.ones_like(state.theta)
         walk = tuning.drift * jnp.exp(state.haste)
-        diffusion = self.dt / tuning.pace * sample.elapsed * jnp.square(walk)
+        periods = self.dt / tuning.pace
+        diffusion = periods * sample.elapsed * jnp.square(walk)
         diffusion = diffusion + state.opened * jnp.maximum(1 - jnp.sum(jnp.square(state.root[d:]), axis=1), 0.0)
         belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted)
         belief = kalman.limit_covariance(belief, ones)
@@ -276,9 +280,7 @@ class OnlineAdaptation(AbstractEstimator):
         if tuning.excitation:
             varies = jnp.asarray(np.where(self._varies(), 1.0, 0.0), ones.dtype)
             hidden, share = jnp.maximum(walk, BREEZE * varies), 1 + (TAKEN - 1) * varies
-            told = excitation.after_sample(
-                told, slope, correction, sample, hidden, share, self.dt / tuning.pace, tuning
-            )
+            told = excitation.after_sample(told, slope, correction, sample, hidden, share, periods, tuning)
             belief, gains = excitation.consider(predicted, belief, correction, told, share)
         return kalman.triangular(belief, d), told, correction, gains
 

@@ -1,7 +1,7 @@
 """Move θ, and shrink its covariance, only along directions that the samples excite.
 
 In hover, a thrust coefficient and a disturbance along z are distinguishable only by the controller's response to noise.
-That noise is correlated with the input, so the filter becomes certain of a wrong value, with a bias of about 0.04 / √I
+That noise is correlated with the input, so the filter becomes certain of a wrong value, with a bias of about BIAS / √I
 of the prior, where I is the information of a sample in units of the prior. Directions with little information are
 therefore considered, not estimated: they keep their value and variance, and add to the uncertainty of the others
 (Schmidt, "Application of state-space methods to navigation problems", 1966). The others are corrected on the condition
@@ -18,6 +18,7 @@ from hybrid_jax.online.kalman import Belief, Correction
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import MEMORY, Tuning
 
+BIAS = 0.04  # for an information of 1 in a sample, in the prior
 LARGEST = 1e5  # information of a number beyond which its last digits would count for some
 SHARPER = 5  # passes that make shares zero or one
 LOOSE, LEAST = 1e-4, 1e-9  # variance of a condition over what it is about; share of a parameter
@@ -38,6 +39,11 @@ class Excitation(eqx.Module):
     def begin(cls, d: int, p: int, dtype) -> "Excitation":
         """Initialise before the first sample, without information."""
         return cls(jnp.zeros((d, p), dtype), jnp.eye(p, dtype=dtype))
+
+    def bias(self, tuning: Tuning) -> Float[Array, "*n p p"]:
+        """Covariance of the bias of a hypothesis, which learns from any information; see above."""
+        size = BIAS**2 / tuning.excitation if tuning.excitation else 0.0
+        return size * self.root @ self.root.mT
 
     def considered(self) -> Float[Array, "*n p p"]:
         """The projection on the directions that are not excited."""
