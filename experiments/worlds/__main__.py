@@ -31,7 +31,8 @@ NAME = "worlds"
 HEAD = """\
 A hybrid that was trained on usual flight of a vehicle adapts by `hj.adapt` to one flight after a change, or after none,
 and is tested over 1 s of usual flights after it. Ratio: its test error over the error of the source. Seeds are of
-sources, draws of flights to adapt to. For some changes other methods adapt to the same ten seconds:
+sources, each trained on flights of its own, draws of flights to adapt to. For some changes other methods adapt to the
+same ten seconds:
 
 - **fine_tune**, **l2_sp**: Adam, and Adam with a penalty on the distance from the source's parameters
 - **fine_tune_paper**: Adam on 1000 windows of five flights without noise, another flight says when to stop
