@@ -32,7 +32,8 @@ class Newton(optimistix.Newton):
         finite = jnp.isfinite(y).all()
         y, result = jnp.where(finite, y, before), RESULTS.where(finite, state.result, RESULTS.nonlinear_divergence)
         size = jnp.abs(start) + jnp.abs(partial + per * y)
-        size = self.rtol * size + ROUNDED * jnp.finfo(size.dtype).eps * jnp.max(size)
+        # Off a slow manifold the earlier stages move far, and the last digits of where they end are lost.
+        size = self.rtol * size + ROUNDED * jnp.finfo(size.dtype).eps * jnp.max(size + jnp.abs(partial))
         change = jnp.max(jnp.abs(per * state.diff) / jnp.where(size > 0, size, 1))
         return y, eqx.tree_at(lambda state: (state.diffsize, state.result), state, (change, result)), aux
 

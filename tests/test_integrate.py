@@ -179,6 +179,8 @@ def test_an_implicit_solver_solves_its_equations_or_says_that_it_did_not(name):
 
     for rate in (3.6e4, 1e9):
         np.testing.assert_allclose(rolled(rate), (0.3002, 0.2957), atol=1e-3)
+    beside = rollout_batch(lambda x, u: 1e4 * (jnp.sin(u) - x), *LAGGED, 0.1, getattr(diffrax, name)())
+    assert jnp.isfinite(beside).all()
     at_rest = rollout_batch(lambda x, u: 1e3 * (u - x), *LAGGED, 0.01, getattr(diffrax, name)())
     assert jnp.isfinite(at_rest).all()  # the slope is there a difference of large numbers
     grown = rollout(lambda x, u: 1e3 + x**2, jnp.zeros(1), jnp.zeros((2, 1)), 0.1, getattr(diffrax, name)())
