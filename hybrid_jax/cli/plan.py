@@ -94,14 +94,13 @@ def run(options: Options) -> int:
 def _page(options: Options, found: Excitation, points: np.ndarray, values, units, said) -> page.Page:
     halves = {name: HALF * error for name, error in found.standard_errors.items()}
     shares = {name: half / abs(values[name]) if values[name] else np.inf for name, half in halves.items()}
-    rows = [
-        (name, f"{values[name]:.4g} {units.get(name.partition('[')[0], '')}", f"± {half:.2g}", f"{shares[name]:.1%}")
-        for name, half in halves.items()
-    ]
+    named = {name: f"{values[name]:.4g} {units.get(name.partition('[')[0], '')}" for name in halves}
+    share = {name: f"{each:.1%}" if each < 1 else "more than 100%" for name, each in shares.items()}
+    rows = [(name, named[name], f"± {half:.2g}", share[name]) for name, half in halves.items()]
     header = ("parameter", "value", "half-width", "of the value")
     worst, within = max(found.parameters, key=lambda name: shares[name]), sum(each < WELL for each in shares.values())
-    left = [(name, f"{share:.0%}") for name, share in found.margins.items()]
-    least = f"{worst} is the least certain: {values[worst]:.2g} ± {halves[worst]:.2g}"
+    left = [(name, f"{margin:.0%}") for name, margin in found.margins.items()]
+    least = f"{worst} is the least certain: {named[worst]} ± {halves[worst]:.2g}"
     return page.Page(
         f"Which {options.seconds:g} s of flight identify the parameters of {options.model.name} best?",
         f"{options.output} determines {within} of {len(rows)} parameters to ± {WELL:.0%} or better; {least}.",
