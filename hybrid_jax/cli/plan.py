@@ -15,6 +15,7 @@ from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
 from hybrid_jax.dynamics.disturbance import with_disturbance
+from hybrid_jax.dynamics.rigid_body import hold_corrections
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.identification.learning import without_past
 from hybrid_jax.io.files import write_atomic
@@ -73,7 +74,7 @@ class Options:
 
 def run(options: Options) -> int:
     model = load(options.model)
-    dt, field = model.about.get("dt", 0.01), with_disturbance(without_past(model.field))
+    dt, field = model.about.get("dt", 0.01), with_disturbance(hold_corrections(without_past(model.field)))
     box = FlightBounds(options.low, options.high, options.speed, options.tilt, options.yaw, options.rotor_speed)
     search = {name: getattr(options, name) for name in ("seconds", "bandwidth", "starts", "steps")}
     search |= {"noise": options.noise or None, "window": WINDOW * dt, "dt": dt}

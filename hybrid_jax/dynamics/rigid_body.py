@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -106,9 +106,9 @@ class RigidBody(AbstractVectorField):
 
     def theta(self) -> dict[str, Float[Array, "..."]]:
         """Return the learned parameters in SI units, by name; see `Vehicle` and `Terms`."""
-        shapes = {name: shape_of(self.vehicle, name) for name in self.deviations}
-        entries = self.entries().items()
-        return {name: jnp.stack(rows).reshape(at) if (at := shapes[name]) else rows[0] for name, rows in entries}
+        shapes = {name: shape_of(self.vehicle, name) for name, each in self.deviations.items() if not _is_held(each)}
+        entries = self.entries()
+        return {name: jnp.stack(entries[name]).reshape(at) if at else entries[name][0] for name, at in shapes.items()}
 
     def entries(self) -> dict[str, Rows]:
         """Return the numbers of θ_p."""
@@ -198,6 +198,20 @@ def uncorrected(field: AbstractVectorField) -> AbstractVectorField:
         return body if used else replace(body, deviations=kept)
 
     return _with_bodies(field, smaller)
+
+
+def hold_corrections(field: AbstractVectorField) -> AbstractVectorField:
+    """The field with its corrections as constants, which are no parameters; outside of compiled code."""
+
+    def held(body: RigidBody) -> RigidBody:
+        known = {name: tuple(body.deviations[name].tolist()) for name in CORRECTIONS if name in body.deviations}
+        return replace(body, deviations={**body.deviations, **known})  # Python numbers are constants
+
+    return _with_bodies(field, held)
+
+
+def _is_held(deviation: Any) -> bool:
+    return isinstance(deviation, tuple) and not any(map(eqx.is_array, deviation))
 
 
 def _with_bodies(field: AbstractVectorField, change: Callable[[RigidBody], RigidBody]) -> AbstractVectorField:

@@ -9,7 +9,9 @@ import pytest
 import hybrid_jax as hj
 from experiments.flying.changes import DOUBLED_DRAG, LOADED, WEAK_ROTOR, loaded
 from hybrid_jax.dynamics.disturbance import with_disturbance, without_zeros
-from hybrid_jax.dynamics.rigid_body import corrected, uncorrected
+from hybrid_jax.dynamics.rigid_body import corrected, hold_corrections, uncorrected
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.sim.domain import SOURCE
 
@@ -34,6 +36,14 @@ def test_without_a_change_it_is_the_body_and_is_simplified_to_it():
     assert eqx.tree_equal(uncorrected(without_zeros(with_disturbance(larger))).physics, BODY)
     weak = changed((0.9, 1, 1, 1))
     assert eqx.tree_equal(uncorrected(weak), weak)
+
+
+def test_held_corrections_act_and_are_no_parameters():
+    weak = changed((0.85, 1, 1, 1), 0.3)
+    held = hold_corrections(weak)
+    np.testing.assert_allclose(held(moving(), U), weak(moving(), U), rtol=1e-6)
+    assert [*named_parameters(held)] == [*named_parameters(BODY)]
+    assert len(ravel_parameters(held)[0]) == len(ravel_parameters(BODY)[0])
 
 
 def test_an_efficiency_is_a_factor_on_thrust_and_reaction_torque():
