@@ -129,5 +129,5 @@ def _figure(found: Excitation, points: np.ndarray) -> Figure:
     for name, values in (("height [m]", points[:, 3]), ("yaw [rad]", points[:, 4]), ("speed [m/s]", speed)):
         time.plot(found.t, values, label=name)
     time.set_xlabel("time [s]")
-    time.legend()
+    figure.legend(loc="outside lower center", ncols=3)
     return figure
