@@ -28,8 +28,8 @@ ALONE = "physics alone predicts the flights before better than with the network,
 STILL = "These flights hardly move, so they determine hardly anything."
 TAUGHT = ", to which the model was adapted"
 WITHIN = (
-    "An interval may contain the value before: it is of the value itself, of which the network may have taken a part. "
-    "That part is the same before and after, so the change is known better."
+    "Some intervals contain the value before. They are of the values themselves, which the network makes uncertain; "
+    "the changes are more certain, since the network is the same before and after."
 )
 LACKED = (
     "Effects that the model lacked explain these flights as well: {}. Flights before may have had them: name those "
