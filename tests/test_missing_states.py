@@ -55,9 +55,9 @@ def test_intervals_hold_and_widen_as_measurements_are_lost():
         widths.append(found.high - found.low)
         assert all(np.isfinite(each).all() for of in result.expected.values() for each in of.values())
     assert widths[0] < widths[1] < widths[2]
-    # White noise: with half of the numbers at random the variance doubles, as the degrees of freedom are counted.
+    # White noise: with half of the numbers at random the variance doubles.
     field = fit_least_squares(pendulum(0.7), WHOLE).field
-    whole, half = (float(covariance_of(field, w, kind="homoscedastic")[0, 0]) for w in (WHOLE, CASES["half"]))
+    whole, half = (float(covariance_of(field, w)[0, 0]) for w in (WHOLE, CASES["half"]))
     assert half / whole == pytest.approx(2, rel=0.3)
 
 

@@ -1,6 +1,5 @@
 """The normal equations of θ_p for each window, and the effect of leaving windows out."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -14,8 +13,6 @@ from hybrid_jax.estimation import least_squares
 from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
 from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.trajectories import Trajectories
-
-ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 FLAT = 1e-12  # least size of an error
 CHUNK = 250  # windows in memory at a time
@@ -49,7 +46,7 @@ class NormalEquations(NamedTuple):
 # A program of its own: selecting a disturbance and the covariance share it.
 @jit_by_size()
 def normal_equations(
-    field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, error: ErrorLoss | None, scale: Scale
+    field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, scale: Scale
 ) -> NormalEquations:
     """Return the normal equations of each window at a field's θ_p; for arguments see `uncertainty.covariance_of`."""
     theta, unravel = ravel_parameters(field)
@@ -60,21 +57,14 @@ def normal_equations(
             return r, r
 
         jacobian, r = jax.jacfwd(errors, has_aux=True)(theta)
-        return equations_of(jacobian, r, error)
+        return equations_of(jacobian, r)
 
     return in_chunks(jax.vmap(one), windows, chunk)
 
 
-def equations_of(
-    jacobian: Float[Array, "t d p"], r: Float[Array, "t d"], error: ErrorLoss | None = None
-) -> NormalEquations:
-    bent, slope = jacobian, r  # half the curvature of the square times J, half its slope
-    if error is not None:
-        bent = jnp.einsum("tde,tep->tdp", jax.vmap(jax.hessian(error))(r), jacobian)
-        slope = jax.vmap(jax.grad(error))(r)
-    p = jacobian.shape[-1]
-    effect, r = jacobian.reshape(-1, p), r.ravel()
-    return NormalEquations(effect.T @ bent.reshape(-1, p), effect.T @ slope.ravel(), r @ r)
+def equations_of(jacobian: Float[Array, "t d p"], r: Float[Array, "t d"]) -> NormalEquations:
+    effect, r = jacobian.reshape(-1, jacobian.shape[-1]), r.ravel()
+    return NormalEquations(effect.T @ effect, effect.T @ r, r @ r)
 
 
 @jit_by_size()

@@ -1,7 +1,7 @@
 """Covariance and intervals of θ_p from its normal equations, and the choice of a constant disturbance."""
 
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,7 +24,6 @@ from hybrid_jax.estimation import least_squares
 from hybrid_jax.estimation.least_squares import LeastSquaresFit, Scale, Solver, fit_free, ravel_parameters
 from hybrid_jax.estimation.normal_equations import (
     CHUNK,
-    ErrorLoss,
     NormalEquations,
     has_effect,
     inverse,
@@ -35,8 +34,6 @@ from hybrid_jax.estimation.normal_equations import (
 )
 from hybrid_jax.runtime import entry, jit_by_size
 from hybrid_jax.trajectories import Trajectories
-
-Kind = Literal["sandwich", "homoscedastic"]
 
 
 class Interval(NamedTuple):
@@ -58,10 +55,8 @@ def covariance_of(
     field: AbstractVectorField,
     windows: Trajectories,
     *,
-    kind: Kind = "sandwich",
     solver: Solver = None,
     chunk: int = CHUNK,
-    error: ErrorLoss | None = None,
     scale: Scale = None,
     free: Bool[Array | np.ndarray, " p"] | None = None,
     cluster: int = 1,
@@ -73,17 +68,15 @@ def covariance_of(
     network as exact and does not include bias: intervals are too narrow if a network was trained on the same windows,
     or if the model lacks an effect such as drag.
 
+    It is the sandwich H⁻¹ M H⁻¹ with H = Σ_i J_iᵀJ_i and M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ: only windows must be
+    independent; errors within one may be correlated and of any unit (Huber 1967; White 1980; the factor is MacKinnon
+    and White's HC1, 1985).
+
     Args:
         field: at, or near, the minimum over θ_p of Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p.
         windows: the windows that the field was fitted to.
-        kind: with H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2),
-            sandwich is H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Only windows must be independent; errors
-            within one may be correlated and of any unit (Huber 1967; White 1980; the factor is
-            MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for white noise of one variance.
         solver: integrates the field over each sample interval, by default one step of RK4.
         chunk: number of windows in memory at a time.
-        error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
-            The slope and curvature of another loss enter M and H (Huber 1967).
         scale: divides the error of each state, as in `fit_least_squares`.
         free: which parameters were fitted, all by default; the others are known and have no variance.
         cluster: number of consecutive windows that may be correlated, for example in one flight. The sandwich is then
@@ -91,42 +84,27 @@ def covariance_of(
             sandwich of summed J_iᵀr_i is too narrow for few clusters, and intervals need Student's t.
 
     Raises:
-        ValueError: if there are no more windows than parameters, they are malformed, or kind is unknown or
-            homoscedastic with an `error`.
+        ValueError: if there are no more windows than parameters, or they are malformed.
     """
     windows = least_squares.check_windows(field, windows, missing=True)
-    traced = checks.is_traced(windows.x)  # else NumPy counts, which keeps no program for each size
-    measured = jnp.sum(~jnp.isnan(windows.x)) if traced else np.count_nonzero(~np.isnan(windows.x))
     fitted = ravel_parameters(field)[0].size if free is None else jnp.sum(free)
     if not checks.is_traced(fitted):
-        # White noise makes each number of a window an observation; otherwise each window is one.
-        numbers = windows.x.size if traced else measured
-        n = numbers if kind == "homoscedastic" else len(windows)
-        check_determined(field, int(n), int(fitted))
+        check_determined(field, len(windows), int(fitted))
     checks.count("chunk", chunk)
     checks.count("cluster", cluster)
-    if kind not in Kind.__args__:
-        raise ValueError(f"kind must be one of {', '.join(Kind.__args__)}, got {kind!r}")
-    if error is not None and kind == "homoscedastic":
-        raise ValueError("kind must be sandwich where an error is given: homoscedastic is that of squared errors")
-    equations = normal_equations(field, windows, solver, chunk, error, scale)
+    equations = normal_equations(field, windows, solver, chunk, scale)
     seen = has_effect(equations, windows, scale)
     equations = masked(equations, seen if free is None else free & seen)
     unknown = ~seen if free is None else free & ~seen
-    found = _covariance(equations, kind, jnp.asarray(measured), fitted, cluster, len(windows))
-    return found + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
+    return _covariance(equations, fitted, cluster, len(windows)) + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
 
 
 @jit_by_size()
-def _covariance(
-    equations: NormalEquations, kind: Kind, measured, p: Int[Array, ""] | int, cluster: int, n: Int[Array, ""] | int
-):
-    gram, score, square = equations
+def _covariance(equations: NormalEquations, p: Int[Array, ""] | int, cluster: int, n: Int[Array, ""] | int):
+    gram, score, _ = equations
     bread = inverse(jnp.sum(gram, axis=0))
     told = bread.told
-    if kind == "homoscedastic":
-        found = jnp.sum(square) / (measured - p) * bread.matrix
-    elif cluster > 1:
+    if cluster > 1:
         clusters, of = -(-len(score) // cluster), np.arange(len(score)) // cluster
         gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
         without = inverses(jnp.sum(gram, axis=0) - gram)
@@ -143,14 +121,14 @@ def _covariance(
 
 def sandwich(equations: NormalEquations, fitted: int, cluster: int = 1) -> Float[Array, "p p"]:
     """Compute H⁻¹ M H⁻¹ of `covariance_of` from equations in which all but `fitted` parameters are `masked`."""
-    return _covariance(equations, "sandwich", 1, fitted, cluster, len(equations.score))
+    return _covariance(equations, fitted, cluster, len(equations.score))
 
 
 def sandwich_of_repeated(equations: NormalEquations, fitted: int, distinct: Int[Array, ""]) -> Float[Array, "p p"]:
     """Compute `sandwich` from windows of which only the first `distinct` are independent: the others repeat them."""
     of = jnp.arange(len(equations.score)) % distinct
     score = jax.ops.segment_sum(equations.score, of, len(equations.score))
-    return _covariance(equations._replace(score=score), "sandwich", 1, fitted, 1, distinct)
+    return _covariance(equations._replace(score=score), fitted, 1, distinct)
 
 
 @entry
@@ -276,7 +254,7 @@ def select_disturbance(
     every = np.ones(parameters.size, bool), np.arange(parameters.size) < own
     options = windows, solver, max_steps, scale
     fits = [fit_free(start, *options, jnp.asarray(free)) for start, free in zip((larger, none), every, strict=True)]
-    equations = [normal_equations(fit.field, windows, solver, CHUNK, None, scale) for fit in fits]
+    equations = [normal_equations(fit.field, windows, solver, CHUNK, scale) for fit in fits]
     equations[1] = masked(equations[1], every[1])
     return _selection(fits, equations, windows.horizon)
 

@@ -73,7 +73,7 @@ class Drag(AbstractVectorField):
 def test_left_out_of_a_linear_problem_is_a_fit_to_the_others():
     windows, design = pushes(12, 0.1)
     field = fit_least_squares(Push(jnp.ones(2)), windows).field
-    found = left_out(normal_equations(field, windows, None, 5, None, None), windows.horizon)
+    found = left_out(normal_equations(field, windows, None, 5, None), windows.horizon)
     truth = np.asarray(windows.x, float).reshape(12, -1)
     for i in range(12):
         others = np.arange(12) != i

@@ -1,7 +1,6 @@
 """Laws of the covariance of θ_p, against closed forms, and of its intervals, against simulation."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,32 +13,26 @@ from experiments.paper.known_body import coverage
 from hybrid_jax import IRIS, AbstractVectorField, Hybrid, fit_least_squares, rigid_body, with_disturbance
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals
 from hybrid_jax.status import Status
-from hybrid_jax.training.channels import Channel, ChannelLoss
-
-SWINGS = swings(40)
 
 
-def closed_form(windows, design, gains, kind):
+def closed_form(windows, design, gains):
     """The covariance of a linear problem, in double precision, as the docstring writes it."""
     n, _, p = design.shape
     errors = np.asarray(windows.x, float).reshape(n, -1) - design @ np.asarray(gains, float)
     bread = np.linalg.inv(np.einsum("nip,niq->pq", design, design))
-    if kind == "homoscedastic":
-        return (errors**2).sum() / (errors.size - p) * bread
     scores = np.einsum("nip,ni->np", design, errors)
     return n / (n - p) * bread @ (scores.T @ scores) @ bread
 
 
-@pytest.mark.parametrize("kind", ["sandwich", "homoscedastic"])
-def test_a_linear_problem_meets_its_closed_form(kind):
+def test_a_linear_problem_meets_its_closed_form():
     windows, design = pushes(30, 0.1)
     offset = 0.2 * np.random.default_rng(1).normal(size=(30, 1, 2))  # an error that a whole window shares
     windows = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(offset, np.float32))
     field = fit_least_squares(Push(jnp.ones(2)), windows).field
-    expected = closed_form(windows, design, field.gains, kind)
-    np.testing.assert_allclose(covariance_of(field, windows, kind=kind), expected, rtol=1e-4)  # float32 sums
+    expected = closed_form(windows, design, field.gains)
+    np.testing.assert_allclose(covariance_of(field, windows), expected, rtol=1e-4)  # float32 sums
     # In pieces that do not divide the windows the sums are the same.
-    np.testing.assert_allclose(covariance_of(field, windows, kind=kind, chunk=7), expected, rtol=1e-4)
+    np.testing.assert_allclose(covariance_of(field, windows, chunk=7), expected, rtol=1e-4)
 
 
 def test_a_parameter_that_the_windows_do_not_depend_on_stays_and_may_be_anything():
@@ -82,15 +75,9 @@ def test_parameters_that_no_window_tells_apart_have_no_interval_and_others_have_
     np.testing.assert_allclose(variances[2], known[2, 2] * factor, rtol=1e-3)
 
 
-def test_one_long_record_has_an_interval_if_its_noise_is_white():
-    assert 0 < float(covariance_of(pendulum(), SWINGS[:1], kind="homoscedastic")[0, 0]) < np.inf
-
-
-def test_what_makes_no_sense_is_refused():
+def test_too_few_windows_are_refused():
     with pytest.raises(ValueError, match=r"windows: 1 are too few for the 1 parameters of Pendulum, at least 2"):
-        covariance_of(pendulum(), SWINGS[:1])
-    with pytest.raises(ValueError, match="kind must be sandwich where an error is given"):
-        covariance_of(pendulum(), SWINGS, kind="homoscedastic", error=jnp.sum)
+        covariance_of(pendulum(), swings(1))
 
 
 LEARN = ("Ix", "k_rotors", "drag")
@@ -119,34 +106,6 @@ def test_matrices_and_a_disturbance_have_intervals_entry_by_entry():
     found = intervals(field, np.eye(9) * 1e-4)
     assert list(found) == ["Ix", "Iy", "k", *(f"disturbance[{name}]" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))]
     np.testing.assert_allclose(found["disturbance[wz]"], Z * 0.01 * np.array([0, -1, 1]), rtol=1e-5)  # float32
-
-
-def weighed(windows, design, gains, scales, huber):
-    """H⁻¹ M H⁻¹ of a linear problem in double precision, by derivatives of the whole loss."""
-    n, _, p = design.shape
-    with jax.enable_x64(True):
-        shapes, truth = np.asarray(design).reshape(n, -1, 2, p), jnp.asarray(windows.x, float).reshape(n, -1, 2)
-
-        def counted(gains):  # (n,)
-            r = jnp.abs(truth - jnp.asarray(shapes) @ gains) / jnp.asarray(scales)
-            one = r**2 if huber is None else jnp.where(r > huber, 2 * huber * r - huber**2, r**2)
-            return one.sum(axis=(1, 2))
-
-        gains = jnp.asarray(np.asarray(gains, float))
-        scores = np.asarray(jax.jacfwd(counted)(gains))
-        bread = np.linalg.inv(np.asarray(jax.hessian(lambda gains: counted(gains).sum())(gains)))
-    return n / (n - p) * bread @ (scores.T @ scores) @ bread
-
-
-@pytest.mark.parametrize("huber", [None, 0.8])
-def test_a_loss_of_channels_has_its_own_covariance(huber):
-    """In channels of one entry each a linear problem's loss is bent by the data alone, so the formula is exact."""
-    windows, design = pushes(40, 0.1)
-    objective = ChannelLoss((Channel(0, 1, 0.1), Channel(1, 2, 0.05)), huber)
-    gains = np.array([0.7, -0.4]) if huber is None else fit_least_squares(Push(jnp.ones(2)), windows).field.gains
-    found = covariance_of(Push(jnp.asarray(gains)), windows, error=objective.error)
-    expected = weighed(windows, design, gains, np.array([0.1, 0.05]), huber)
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * abs(expected).max())  # float32 sums
 
 
 REPEATS = 100
