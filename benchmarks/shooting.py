@@ -16,7 +16,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.export import casadi_function
-from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
+from hybrid_jax.vehicle import INPUT_SIZE, QUATERNION, STATE_SIZE
 
 TOLERANCE = 1e-6
 LIMIT = float(np.tanh(VARIABLE_BOUND))  # of the shares −1 … 1 of the range of rotor speeds, as in the controller

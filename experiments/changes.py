@@ -40,12 +40,11 @@ from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.training import evaluate
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, STATE_SIZE
 
 NAME = "changes"
 INSIDE = "expected_inside"  # column: see `_share_inside`

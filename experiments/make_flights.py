@@ -19,8 +19,8 @@ from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.rotation import tilt
 from hybrid_jax.sim.domain import DOMAINS, Domain
 from hybrid_jax.sim.flight import SplitSpec, configuration, make_dataset
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 LOW = (0.5, 0.2)  # m, mean altitudes over a window below which ground effect adds at least 0.4 % and 2.6 % of thrust
 PERCENTILES = (1, 50, 99)

@@ -12,8 +12,6 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from hybrid_jax.state import QUATERNION
-
 Numbers = jax.Array | np.ndarray
 T = TypeVar("T")
 
@@ -72,8 +70,8 @@ def finite(name: str, array: Numbers, remedy: str = "", missing: bool = False) -
     return array
 
 
-def unit_quaternions(name: str, states: Numbers, part: slice = QUATERNION) -> None:
-    """Require states (..., d) with unit quaternions at `part`, by default at the place of a rigid body's."""
+def unit_quaternions(name: str, states: Numbers, part: slice) -> None:
+    """Require states (..., d) with unit quaternions at `part`."""
     if is_traced(states):
         return
     norms = np.linalg.norm(np.asarray(states)[..., part], axis=-1)

@@ -1,4 +1,8 @@
-"""The constants of a multirotor (mass, geometry and nominal coefficients) and their TOML file."""
+"""A multirotor: its state x (13) and input u, its constants, and their TOML file.
+
+x = [p, q, v, ω]: position p [m, world frame, z up]; unit quaternion q = (w, x, y, z), body → world; velocity
+v [m/s, world frame]; body rates ω [rad/s, body frame: x forward, y left, z up]. u: the rotor speeds [rad/s].
+"""
 
 import math
 import tomllib
@@ -8,11 +12,21 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 
 T = TypeVar("T")
+State = Float[Array, "13"]
+Input = Float[Array, " rotors"]  # rad/s
+
+POSITION, QUATERNION, VELOCITY, BODY_RATES = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
+STATE_NAMES = ("px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz")
+INPUT_NAMES = ("u0", "u1", "u2", "u3")  # of a quadrotor; see `input_names`
+STATE_SIZE, INPUT_SIZE = len(STATE_NAMES), len(INPUT_NAMES)
+# Typical standard deviations of each entry of these four: motion capture [m, of quaternions, m/s], a gyroscope [rad/s].
+SENSOR_NOISE = (0.001, 0.002, 0.02, 0.02)
+
 FEWEST_ROTORS, MOST_ROTORS = 3, 12
 TABLES = ("vehicle", "learn", "terms", "actuator")  # of a vehicle file: see `dynamics.vehicle_file`
 # Of vehicles that fly, the radius of gyration √(I / m) is 0.2 to 1 times the longest arm.
@@ -104,6 +118,10 @@ class Vehicle:
         """Thrust [N] and torque [N m, body] of the rotors per square of their speeds [(rad/s)²]."""
         (x, y), k = np.array(self.rotor_positions).T, self.thrust_coefficient
         return np.stack([np.full(self.rotors, k), k * y, -k * x, self.torque_coefficient * np.array(self.spin)])
+
+
+def input_names(rotors: int) -> tuple[str, ...]:
+    return tuple(f"u{i}" for i in range(rotors))
 
 
 def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:

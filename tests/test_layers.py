@@ -12,7 +12,7 @@ from smoke import script
 ROOT = Path(__file__).parents[1]
 # Modules and packages of the library, from the bottom: each may import what stands before it.
 ORDER = (
-    *("_version", "state", "rotation", "matrices", "chunks", "runtime", "checks", "vehicle", "state_space", "records"),
+    *("_version", "rotation", "matrices", "chunks", "runtime", "checks", "vehicle", "state_space", "records"),
     *("trajectories", "status", "extrapolation", "dynamics", "implicit_solvers", "integrate", "networks"),
     *("codegen", "kernels", "rollouts", "metrics", "io", "estimation", "training", "adaptation", "online", "sweep"),
     *("sim", "flights", "control", "export", "planning", "identification", "cli", "__main__"),

@@ -17,8 +17,7 @@ from hybrid_jax.flights.load import load_log
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import random_flights
-from hybrid_jax.state import STATE_NAMES, input_names
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, STATE_NAMES, input_names
 
 
 def regular(rotors):

@@ -24,8 +24,8 @@ from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, Domain
-from hybrid_jax.state import POSITION, STATE_SIZE
 from hybrid_jax.sweep.lanes import LaneMap, count, lane
+from hybrid_jax.vehicle import POSITION, STATE_SIZE
 
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)  # the two changes
 CALL_EVERY = 50  # calls between two whose open-loop cost is computed

@@ -25,9 +25,8 @@ from hybrid_jax.io import portable
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.forces import WIND_MEAN, drag, ground_effect, parameters_of, wind
-from hybrid_jax.state import QUATERNION, VELOCITY, Input, State
 from hybrid_jax.sweep.lanes import lane
-from hybrid_jax.vehicle import IRIS, Vehicle
+from hybrid_jax.vehicle import IRIS, QUATERNION, VELOCITY, Input, State, Vehicle
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from experiments.reporting.statistics import Estimate, mean_interval
 from experiments.reporting.tables import Table, cross_table, over_seeds, tabulate
 from hybrid_jax.planning import Excitation, FlightBounds
 from hybrid_jax.rotation import heading
-from hybrid_jax.state import POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import POSITION, QUATERNION, VELOCITY
 
 RANDOM, DESIGNED = "random", "designed"
 FLIGHTS = ("hover", "figure-8", RANDOM, DESIGNED)

@@ -8,8 +8,7 @@ import numpy as np
 from hybrid_jax.rotation import normalise, rotate
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.forces import Parameters, Scalar, Wrench, drag, ground_effect, wind
-from hybrid_jax.state import QUATERNION, Input, State
-from hybrid_jax.vehicle import IRIS, Vehicle
+from hybrid_jax.vehicle import IRIS, QUATERNION, Input, State, Vehicle
 
 LOST_THRUST = 0.15  # of the weak rotor
 

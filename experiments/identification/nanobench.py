@@ -35,7 +35,7 @@ from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.identification.fitting import identify
 from hybrid_jax.identification.log_checks import inputs_of
 from hybrid_jax.identification.recordings import Layout
-from hybrid_jax.state import VELOCITY
+from hybrid_jax.vehicle import VELOCITY
 
 OF_A = """B2_circle_slow_rep1 B2_circle_medium_rep1 B2_circle_fast_rep1 B3_figure8_slow_rep1 B3_figure8_fast_rep1
     B7_oval_fast_rep2 B8_star_medium_rep1 B10_lissajous_fast_rep1"""

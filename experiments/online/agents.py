@@ -24,8 +24,7 @@ from hybrid_jax.online.hypotheses import Hypothesis
 from hybrid_jax.rotation import body_z
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.forces import DRAG_COEFFICIENT
-from hybrid_jax.state import QUATERNION
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, QUATERNION
 
 CHANGES: Mapping[str, Domain] = {
     "inertia": PARAMETER_SHIFT,

@@ -27,9 +27,9 @@ from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.online.estimator import OnlineAdaptation
 from hybrid_jax.sim import flight as random_flight
 from hybrid_jax.sim.forces import wind
-from hybrid_jax.state import POSITION
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.trajectories import Trajectories, windows_of
+from hybrid_jax.vehicle import POSITION
 
 WINDOW = 10  # periods of a window of least squares
 SAME_BEFORE = {"least_squares": "unadapted", "oracle": "unadapted"}  # agents that are another before the change

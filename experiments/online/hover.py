@@ -24,8 +24,7 @@ from hybrid_jax.runtime import FASTEST_COMPILE, configure, jit_with
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import SOURCE
 from hybrid_jax.sim.forces import Wrench, parameters_of
-from hybrid_jax.state import BODY_RATES, VELOCITY, State
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import BODY_RATES, IRIS, VELOCITY, State
 
 HOME, BLOCK = np.array([0.0, 0.0, 2.0], np.float32), 10  # m; periods of a prediction
 MEMORY = 1.0  # s, of a gust

@@ -24,14 +24,13 @@ from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.flight import permutation
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, VELOCITY
 from hybrid_jax.sweep.lanes import count, lane, stack
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config
 from hybrid_jax.training.loss import REGULARISERS
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, VELOCITY, Vehicle
 
 FORCES = 6  # v̇ and ω̇ are the last outputs of every residual network
 FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # outputs of `multirotor_network` that are forces

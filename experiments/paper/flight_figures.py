@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.names import label
 from experiments.reporting.plots import DRAWABLE, PAGE, STYLE, colour, legend_below
-from hybrid_jax.state import POSITION
+from hybrid_jax.vehicle import POSITION
 
 MIN_HALF_WIDTH = 0.2  # m, of a view: a hovering vehicle is not magnified beyond it
 VIEW_RATIO = 1.3  # width of a view over the extent of the truth

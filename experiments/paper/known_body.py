@@ -19,9 +19,8 @@ from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
-from hybrid_jax.state import VELOCITY
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, VELOCITY
 
 DT, STEPS, WINDOWS = 0.01, 10, 100  # s, intervals in a window, windows in a recording
 TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": IRIS.thrust_coefficient}  # SI: the paper's changed inertia

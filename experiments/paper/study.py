@@ -27,14 +27,13 @@ from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import DT, SplitSpec
-from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 from hybrid_jax.status import Status
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.sweep.training import evaluate, evaluate_windows, sweep
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import INPUT_SIZE, QUATERNION, STATE_SIZE, Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
 # The models that are not trained: a method of the library adapts the hybrid.

@@ -21,8 +21,7 @@ from hybrid_jax import rotation
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.flight import CLOCK
 from hybrid_jax.sim.forces import Scalar
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY, Vehicle
 
 SUBSTEPS = 10  # of an interval: 1 ms, a fifth of the fastest motor's lag
 POSITION_GAIN, VELOCITY_GAIN = np.array([6.5, 6.5, 15.0]), np.array([4.0, 4.0, 9.0])  # 1/s², 1/s

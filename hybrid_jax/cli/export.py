@@ -29,7 +29,7 @@ from hybrid_jax.io.models import load
 from hybrid_jax.networks import smoothed
 from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.online import OnlineAdaptation
-from hybrid_jax.state import BODY_RATES, SENSOR_NOISE, STATE_SIZE, VELOCITY
+from hybrid_jax.vehicle import BODY_RATES, SENSOR_NOISE, STATE_SIZE, VELOCITY
 
 __all__ = ["Options", "run"]
 RESPONSE, FASTER = 0.2, 1.05  # of the figure: seconds, and factor on the speed of the first rotor

@@ -21,7 +21,7 @@ from hybrid_jax.identification.learning import without_past
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.io.models import load
 from hybrid_jax.planning import Excitation, FlightBounds, excitation
-from hybrid_jax.state import POSITION, VELOCITY
+from hybrid_jax.vehicle import POSITION, VELOCITY
 
 __all__ = ["Options", "run"]
 WINDOW, HALF, WELL = 10, 1.96, 0.1  # intervals; standard errors of half an interval; share of a value

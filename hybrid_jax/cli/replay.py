@@ -22,8 +22,8 @@ from hybrid_jax.identification.learning import without_past
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.io.models import load
-from hybrid_jax.state import POSITION
 from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vehicle import POSITION
 
 __all__ = ["Options", "run"]
 SHOWN = 10  # pictures a second

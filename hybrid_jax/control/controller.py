@@ -23,8 +23,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.matrices import solve
 from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
-from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, Input, State
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import BODY_RATES, QUATERNION, STATE_SIZE, Input, State, Vehicle
 
 VARIABLE_BOUND = 3.0  # there tanh is within 0.5 % of its limit, and its slope is still 1 %
 # The line search varies the damping (Levenberg–Marquardt), not the length of a step: after a large initial rate a long
@@ -63,8 +62,8 @@ def checked_states(
     if x.shape != (STATE_SIZE,) or not fits:
         expected = f"{name} (13,) and reference ({steps or 'n'}, 13)"
         raise ValueError(f"{expected} expected, got {x.shape} and {reference.shape}")
-    checks.unit_quaternions(name, x)
-    checks.unit_quaternions("reference", reference)
+    checks.unit_quaternions(name, x, QUATERNION)
+    checks.unit_quaternions("reference", reference, QUATERNION)
     dtype = jnp.result_type(*jax.tree.leaves((x, reference, plan)))
     return jax.tree.map(lambda leaf: leaf.astype(dtype), (x, reference, plan))
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.rotation import attitude_error
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, State
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY, State
 
 Scalar = Float[Array, ""]
 

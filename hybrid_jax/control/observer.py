@@ -10,7 +10,7 @@ from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.rotation import canonicalize_quaternion
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, State
+from hybrid_jax.vehicle import BODY_RATES, QUATERNION, VELOCITY, State
 
 MOTION = slice(VELOCITY.start, BODY_RATES.stop)
 

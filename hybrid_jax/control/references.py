@@ -18,7 +18,7 @@ from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller
 from hybrid_jax.control.cost import Scalar
 from hybrid_jax.rotation import Quaternion, conjugate, from_axis_angle, multiply
-from hybrid_jax.state import BODY_RATES, STATE_SIZE, State
+from hybrid_jax.vehicle import BODY_RATES, STATE_SIZE, State
 
 Path = Callable[[Scalar], tuple[Float[Array, "3"], Scalar]]
 

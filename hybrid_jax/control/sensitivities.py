@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns
 from hybrid_jax.integrate import RK4, Derivative, rk4_step, traced_once
 from hybrid_jax.rotation import normalise
-from hybrid_jax.state import QUATERNION, STATE_SIZE, Input, State
+from hybrid_jax.vehicle import QUATERNION, STATE_SIZE, Input, State
 
 
 def lagged_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple[Input, Input]:

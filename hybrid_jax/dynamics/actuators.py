@@ -20,9 +20,8 @@ from hybrid_jax import checks
 from hybrid_jax.checks import Numbers
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
-from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.state_space import Quantity
-from hybrid_jax.vehicle import as_tuple, require_numbers
+from hybrid_jax.vehicle import STATE_SIZE, as_tuple, require_numbers
 
 NAMES = ("curve", "time_constant", "time_constants", "voltage_exponent", "delay")  # of learnable parameters
 GIVES = ("speed", "thrust")

@@ -9,7 +9,7 @@ from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import AbstractWrapper
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import BODY_RATES, QUATERNION, VELOCITY
 
 
 class HoldState(AbstractVectorField):

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float, PyTree
 from hybrid_jax import rotation
 from hybrid_jax.dynamics.terms import Terms, nominal_values
 from hybrid_jax.rotation import Rows
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import BODY_RATES, QUATERNION, VELOCITY, Vehicle
 
 Constants = dict[str, Rows | tuple[float, ...]]  # name → entries: numbers if known, arrays if learned
 

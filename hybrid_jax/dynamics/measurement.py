@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 STATES = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "rates": BODY_RATES}
 MEASURED = (*STATES, "body_velocity", "specific_force", "rotor_speed")

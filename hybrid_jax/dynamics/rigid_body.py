@@ -16,9 +16,8 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import expand_trailing
 from hybrid_jax.dynamics.terms import CORRECTIONS, LOGARITHMIC, Terms, check_names, nominal_values, shape_of, units_of
 from hybrid_jax.rotation import Rows
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_NAMES, STATE_SIZE, VELOCITY
 from hybrid_jax.state_space import Attitude, Quantity, StateSpace
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_NAMES, STATE_SIZE, VELOCITY, Vehicle
 
 LEARNED = ("Ix", "Iy", "k")
 UNITS = {"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "k": "N s²", "k_rotors": "N s²", "torque_coefficient": "N m s²"}
@@ -29,7 +28,7 @@ INERTIAS = {"mass": VELOCITY, "Ix": BODY_RATES.start, "Iy": BODY_RATES.start + 1
 
 @dataclass(frozen=True)
 class RigidBodySpace(StateSpace):
-    """The state space of state.py: position, attitude, velocity and body rates; see `RIGID_BODY_SPACE`."""
+    """The state space of a multirotor: position, attitude, velocity and body rates; see `RIGID_BODY_SPACE`."""
 
     def features(self, x, u):
         lengths = {"speed [m/s]": x[:, VELOCITY], "body rates [rad/s]": x[:, BODY_RATES]}
@@ -49,7 +48,7 @@ RIGID_BODY_SPACE = RigidBodySpace(
 
 
 class RigidBody(AbstractVectorField):
-    """A rigid body carried by its rotors, with further `Terms`; x (13) as in state.py, u the rotor speeds [rad/s].
+    """A rigid body carried by its rotors, with further `Terms`; x (13) and u are as in `hybrid_jax.vehicle`.
 
         ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
         m f = C (τ_y, −τ_x, 0) − D Rᵀv − m c Rᵀv,   E = diag(1, 1, 0)

@@ -13,8 +13,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.integrate import Derivative, check_field, rk4_step
 from hybrid_jax.networks import smoothed
-from hybrid_jax.state import STATE_SIZE
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import STATE_SIZE, Vehicle
 
 Size = int | None  # d or m; by default what the field knows
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hybrid_jax.state import INPUT_NAMES, QUATERNION, STATE_NAMES, STATE_SIZE, input_names
-from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
+from hybrid_jax.vehicle import FEWEST_ROTORS, INPUT_NAMES, MOST_ROTORS, QUATERNION, STATE_NAMES, STATE_SIZE, input_names
 
 NORM_TOLERANCE = 0.02  # allows |q| of two printed digits; wrong columns are hardly ever within it
 COLUMNS = ("t", *STATE_NAMES, *INPUT_NAMES)  # of a quadrotor
@@ -22,7 +21,7 @@ class FlightLog:
 
     Attributes:
         t: time of each sample [s], strictly increasing.
-        x: state (n, 13) at that time, as in `hybrid_jax.state`: z up, forward-left-up, SI units.
+        x: state (n, 13) at that time, as in `hybrid_jax.vehicle`: z up, forward-left-up, SI units.
         u: rotor speeds (n, rotors) [rad/s], constant from this sample to the next.
         name: name of the flight in messages and reports, usually its file.
 

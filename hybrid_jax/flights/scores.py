@@ -12,8 +12,8 @@ from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
 CHUNK = 500  # windows at a time
 Errors = Float[Array | np.ndarray, "*n"]
@@ -47,13 +47,13 @@ def flight_errors(field: AbstractVectorField, windows: Trajectories) -> FlightEr
 
     Args:
         field: the model.
-        windows: measured states and inputs; the first 13 numbers of a state are as in `hybrid_jax.state`.
+        windows: measured states and inputs; the first 13 numbers of a state are as in `hybrid_jax.vehicle`.
 
     Raises:
         ValueError: if the windows are malformed, or their states are not a multirotor's.
     """
     if check(windows, "windows").x.shape[-1] < STATE_SIZE:
-        raise ValueError(f"windows: states of {STATE_SIZE} expected, as in state.py, got {windows.x.shape[-1]}")
+        raise ValueError(f"windows: states of {STATE_SIZE} expected, as in vehicle.py, got {windows.x.shape[-1]}")
     RIGID_BODY_SPACE.check("windows: x0", windows.x0)
     RIGID_BODY_SPACE.check("windows: x", windows.x)
     # The last part is padded, so that all flights share one program.

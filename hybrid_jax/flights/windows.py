@@ -58,7 +58,7 @@ def load_windows(
         failed: whether a failed check raises an error ("refuse") or warns ("warn").
 
     Returns:
-        Windows in float32: x0 (n, 13), u (n, steps, rotors) [rad/s], x (n, steps, 13), as in `hybrid_jax.state`.
+        Windows in float32: x0 (n, 13), u (n, steps, rotors) [rad/s], x (n, steps, 13), as in `hybrid_jax.vehicle`.
 
     Raises:
         ValueError: if a file or argument is invalid.

@@ -32,8 +32,8 @@ from hybrid_jax.identification.multirotor import PUSHED, TANGENT, Multirotor
 from hybrid_jax.identification.recordings import Layout, Windows, cut
 from hybrid_jax.integrate import RK4
 from hybrid_jax.runtime import entry
-from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.status import Status
+from hybrid_jax.vehicle import STATE_SIZE
 
 ROUNDS, MAX_STEPS = 3, 20  # of weights, and of Levenberg–Marquardt in each
 CANDIDATES = 8  # windows for each one that is fitted

@@ -10,8 +10,8 @@ import numpy as np
 from hybrid_jax.dynamics.actuators import Actuated, held_means
 from hybrid_jax.dynamics.measurement import difference, measure
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
-from hybrid_jax.state import STATE_SIZE, VELOCITY
 from hybrid_jax.state_space import Quantity
+from hybrid_jax.vehicle import STATE_SIZE, VELOCITY
 
 PUSHED = tuple(range(VELOCITY.start, STATE_SIZE))  # the states that a constant disturbance acts on
 TANGENT = RIGID_BODY_SPACE.tangent_size

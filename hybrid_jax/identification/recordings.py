@@ -18,7 +18,7 @@ from hybrid_jax.flights.checks.airborne import airborne
 from hybrid_jax.flights.recording import AXES, Recording, Signal
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.records import integral
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
 UNKNOWN = {"velocity": 2.0, "tilt": 0.3, "rates": 1.0}  # spread of what nothing measures: m/s, rad, rad/s
 WARM = 0.4  # s of commands before a window, from which the speeds of rotors at its start follow

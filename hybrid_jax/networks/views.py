@@ -13,8 +13,7 @@ from hybrid_jax.dynamics.composition import AbstractWrapper, Hybrid
 from hybrid_jax.dynamics.equations import dot
 from hybrid_jax.networks.mlp import LinearSkip, residual_network, zero_output
 from hybrid_jax.networks.normalisation import AbstractScaling
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
-from hybrid_jax.vehicle import IRIS, Vehicle
+from hybrid_jax.vehicle import BODY_RATES, IRIS, POSITION, QUATERNION, STATE_SIZE, VELOCITY, Vehicle
 
 # Name → how many numbers the network reads besides u (and one of each rotor near the ground), or returns.
 INPUTS = {"all": STATE_SIZE, "no_xy": STATE_SIZE - 2, "no_xy_yaw": 10, "near_ground": 10, "body": 10, "body_motion": 9}

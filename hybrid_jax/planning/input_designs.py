@@ -20,8 +20,7 @@ from hybrid_jax.control.references import Path, attitude_along
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout
 from hybrid_jax.rotation import body_z, conjugate, heading, multiply
-from hybrid_jax.state import POSITION, QUATERNION, VELOCITY
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import POSITION, QUATERNION, VELOCITY, Vehicle
 
 Coefficients = Float[Array, "outputs harmonics 2"]  # of sine and cosine, in units of `unit`
 Trajectory = tuple[Float[Array, "n+1 d"], Float[Array, "n m"]]

@@ -33,8 +33,8 @@ from hybrid_jax.planning.input_designs import (
     Trajectory,
 )
 from hybrid_jax.runtime import FAST_COMPILE, entry
-from hybrid_jax.state import SENSOR_NOISE, STATE_SIZE
 from hybrid_jax.trajectories import windows_of
+from hybrid_jax.vehicle import SENSOR_NOISE, STATE_SIZE
 
 SPARE = 0.98  # share of each limit that is used at most, as limits are looked at between samples only
 SHRUNK = 1 - np.arange(64) / 64  # factors on a series, the first of which that keeps the limits is taken

@@ -15,8 +15,7 @@ from hybrid_jax.rotation import derivative as quaternion_derivative
 from hybrid_jax.rotation import normalise
 from hybrid_jax.sim.forces import DRAG_COEFFICIENT, Force, Parameters, Scalar, drag, ground_effect, parameters_of, wind
 from hybrid_jax.sim.pilot import scale_of
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, Input, State
-from hybrid_jax.vehicle import IRIS, Vehicle
+from hybrid_jax.vehicle import BODY_RATES, IRIS, QUATERNION, VELOCITY, Input, State, Vehicle
 
 CHUNK = 64  # flights per vmap: the most that fit into the cache of one core
 _DERIVED: Any = None  # a default that depends on the vehicle

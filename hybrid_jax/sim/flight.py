@@ -20,9 +20,8 @@ from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import CHUNK, Domain, Quadrotor
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
-from hybrid_jax.state import POSITION, VELOCITY
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
-from hybrid_jax.vehicle import IRIS, Vehicle
+from hybrid_jax.vehicle import IRIS, POSITION, VELOCITY, Vehicle
 
 DT = pilot.PERIOD  # s
 AXIS = "flights"
@@ -39,7 +38,7 @@ class Flights(NamedTuple):
     """n simulated flights of t intervals, in float64.
 
     Attributes:
-        states: states (n, t + 1, 13), as in `hybrid_jax.state`.
+        states: states (n, t + 1, 13), as in `hybrid_jax.vehicle`.
         inputs: rotor speeds (n, t, rotors) [rad/s], held from one state to the next.
         lowest_rotor: altitude of the lowest rotor (n, t + 1) [m].
         start: time of the first state (n,) [s].

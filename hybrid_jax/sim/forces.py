@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.rotation import body_z, normalise, rotate
-from hybrid_jax.state import POSITION, QUATERNION, VELOCITY, Input, State
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import POSITION, QUATERNION, VELOCITY, Input, State, Vehicle
 
 Scalar = Float[Array, ""]
 

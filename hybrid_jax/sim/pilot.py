@@ -10,8 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax.rotation import Vector, body_z, conjugate, from_axis_angle, multiply, normalise
 from hybrid_jax.sim.forces import Parameters, Scalar
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, Input, State
-from hybrid_jax.vehicle import IRIS, Vehicle
+from hybrid_jax.vehicle import BODY_RATES, IRIS, POSITION, QUATERNION, VELOCITY, Input, State, Vehicle
 
 PERIOD = 0.01  # s, one decision
 FASTEST = 1 / 3  # scale of time below which the rate loop would be too fast for PERIOD

@@ -18,8 +18,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # mjx prints a message about it
     from mujoco import mjx
 
 from hybrid_jax.sim.forces import Parameters
-from hybrid_jax.state import Input, State
-from hybrid_jax.vehicle import IRIS, Vehicle
+from hybrid_jax.vehicle import IRIS, Input, State, Vehicle
 
 
 def build_model(vehicle: Vehicle) -> mujoco.MjModel:

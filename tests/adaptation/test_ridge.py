@@ -13,8 +13,8 @@ from hybrid_jax.adaptation.ridge import PENALTIES, fit_ridge, last_layer, linear
 from hybrid_jax.dynamics.rigid_body import perturbed
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
-from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.sweep.lanes import lane, stack
+from hybrid_jax.vehicle import QUATERNION, VELOCITY
 
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
 # Compiled once for all tests: fields and windows here have few shapes, and a penalty is an array.

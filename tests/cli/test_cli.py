@@ -20,9 +20,8 @@ from hybrid_jax.cli.page import Page, Table, document, write
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.io.models import load, save
-from hybrid_jax.state import SENSOR_NOISE
 from hybrid_jax.status import Status
-from hybrid_jax.vehicle import IRIS, load_vehicle
+from hybrid_jax.vehicle import IRIS, SENSOR_NOISE, load_vehicle
 
 
 @pytest.mark.parametrize("verb", VERBS)

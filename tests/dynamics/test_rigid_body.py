@@ -15,7 +15,7 @@ from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 

@@ -17,7 +17,7 @@ from hybrid_jax.dynamics.disturbance import ConstantDisturbance, with_disturbanc
 from hybrid_jax.estimation.normal_equations import left_out, normal_equations
 from hybrid_jax.estimation.uncertainty import select_disturbance
 from hybrid_jax.networks.views import multirotor_network
-from hybrid_jax.state import VELOCITY
+from hybrid_jax.vehicle import VELOCITY
 
 PUSH = jnp.array([0.3, 2.7, -0.5, 0.2, -0.1, 0.05])
 RATIOS = {"Ix": 0.6, "Iy": -0.3, "k": 0.05}

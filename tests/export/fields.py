@@ -17,7 +17,7 @@ from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, Terms
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
 from hybrid_jax.networks.views import multirotor_network
-from hybrid_jax.state import QUATERNION, VELOCITY
+from hybrid_jax.vehicle import QUATERNION, VELOCITY
 
 KEY = np.zeros(2, np.uint32)  # jax.random.key(0)
 SCALING = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)

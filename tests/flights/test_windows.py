@@ -18,8 +18,7 @@ from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import errors_between, flight_errors
 from hybrid_jax.flights.windows import flight_of, folds, hold_out, manoeuvre_of
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import BODY_RATES, IRIS, POSITION, QUATERNION, VELOCITY
 
 
 def test_windows_are_those_of_all_logs(tmp_path, recwarn):

@@ -20,7 +20,7 @@ from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import identify, identify_in_turn
 from hybrid_jax.identification.recordings import Layout, initial_states, resampled
 from hybrid_jax.records import integral
-from hybrid_jax.state import STATE_SIZE
+from hybrid_jax.vehicle import STATE_SIZE
 
 DT, SECONDS = 0.005, 16.0
 ACTUATOR = Actuator((100.0, 900.0), time_constants=0.05)

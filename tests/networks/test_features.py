@@ -17,7 +17,7 @@ from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.networks.views import INPUTS, RotorThrust, View, _nearness, multirotor_network
 from hybrid_jax.sim.forces import ground_effect, parameters_of, rotor_altitudes
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 

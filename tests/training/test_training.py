@@ -13,13 +13,13 @@ from hybrid_jax import IRIS, Hybrid, Settings, Trajectories, fit, residual_netwo
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.state import VELOCITY
 from hybrid_jax.status import Status
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import sweep
 from hybrid_jax.training.driver import FitInterrupted
 from hybrid_jax.training.fitting import make_run_config, run, start
 from hybrid_jax.training.loss import trajectory_correlation
+from hybrid_jax.vehicle import VELOCITY
 
 BATCH = 20
 SETTINGS = Settings(batch_size=BATCH)

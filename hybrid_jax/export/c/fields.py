@@ -20,7 +20,7 @@ from hybrid_jax.export.c.templates import HEADER, SOURCE
 from hybrid_jax.export.program import Size, prepared, sizes_of, vehicle_in
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.runtime import entry
-from hybrid_jax.state import STATE_NAMES
+from hybrid_jax.vehicle import STATE_NAMES
 
 
 @entry

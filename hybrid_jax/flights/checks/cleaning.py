@@ -9,7 +9,7 @@ from hybrid_jax import checks
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.checks.airborne import on_ground
 from hybrid_jax.flights.log import GAP, FlightLog, even_segments, repeats, runs_of, segments
-from hybrid_jax.state import QUATERNION
+from hybrid_jax.vehicle import QUATERNION
 
 TIME_CONSTANTS = (0.0, *np.geomspace(0.005, 0.2, 24).tolist())  # s
 

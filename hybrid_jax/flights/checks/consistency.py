@@ -13,8 +13,7 @@ from hybrid_jax.flights.checks.airborne import flying_intervals, on_ground
 from hybrid_jax.flights.checks.mistakes import NOTHING, UP, Pairs, Vectors, middle, moving_mean
 from hybrid_jax.flights.checks.motor_response import respond
 from hybrid_jax.flights.log import FlightLog, gaps, repeats
-from hybrid_jax.state import QUATERNION, STATE_NAMES, VELOCITY, input_names
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import QUATERNION, STATE_NAMES, VELOCITY, Vehicle, input_names
 
 OK, WARNS, FAILS, UNKNOWN = "ok", "warns", "fails", "cannot tell"
 GROUND = "cut it out: in_flight=True"

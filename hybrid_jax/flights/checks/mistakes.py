@@ -8,7 +8,7 @@ from jaxtyping import Float
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rates_between, rotation_of
 from hybrid_jax.flights.checks.airborne import flying_intervals
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 NOTHING = "nothing to correct"  # the log as it is
 LATE = (0.1, 0.2)  # delays and advances that are tried [s]

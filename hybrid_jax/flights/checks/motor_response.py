@@ -9,8 +9,7 @@ from jaxtyping import Float, Int
 
 from hybrid_jax.flights.checks.mistakes import band_passed, middle, moving_mean
 from hybrid_jax.flights.log import FlightLog, sound_intervals
-from hybrid_jax.state import BODY_RATES
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import BODY_RATES, Vehicle
 
 LONGEST_LAG, SHORT_LAG = 0.25, 0.1  # s, either way; of logs of less than 2 s
 # Moving means of torque and motors: the short one removes noise. Subtracting the long one removes aerodynamic moments

@@ -26,8 +26,19 @@ from jaxtyping import Float
 from hybrid_jax.flights.attitude import Frames, from_euler
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.csv import header_of, read_table
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_NAMES, VELOCITY, input_names
-from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS, from_table, read_tables, require_known
+from hybrid_jax.vehicle import (
+    BODY_RATES,
+    FEWEST_ROTORS,
+    MOST_ROTORS,
+    POSITION,
+    QUATERNION,
+    STATE_NAMES,
+    VELOCITY,
+    from_table,
+    input_names,
+    read_tables,
+    require_known,
+)
 
 SCALES = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
