@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybrid_jax as hj
-from hybrid_jax.chunks import in_chunks
+from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import fit_records
 from hybrid_jax.records import Record

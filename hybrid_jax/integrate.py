@@ -253,12 +253,6 @@ def check_field(field, x: Array | jax.ShapeDtypeStruct, u: Array | jax.ShapeDtyp
     return slope
 
 
-def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):
-    """The states and inputs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
-    starts = jnp.concatenate([x0[None], x[:-1]])
-    return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], a.shape[0] * a.shape[2]) for a in (starts, u))
-
-
 SOLVERS: dict[str, Solver] = {
     "rk4": RK4(),
     "heun": diffrax.Heun(),

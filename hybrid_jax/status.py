@@ -2,10 +2,6 @@
 
 from enum import IntEnum
 
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Int
-
 
 class Status(IntEnum):
     """How a fit ended, as an integer in compiled programs (`Status(int(number))`); as text it is its name.
@@ -32,10 +28,3 @@ class Status(IntEnum):
 
     def __format__(self, form: str) -> str:
         return format(str(self), form)
-
-
-def ended(
-    converged: Bool[Array | np.ndarray, "*runs"], finite: Bool[Array | np.ndarray, "*runs"]
-) -> Int[Array, "*runs"]:
-    """The status of finished fits; those that have not converged reached their limit of steps."""
-    return jnp.where(finite, jnp.where(converged, Status.OK, Status.CAPPED), Status.DIVERGED).astype(jnp.int32)

@@ -1,7 +1,7 @@
 """Windows of recorded trajectories: an initial state, the next inputs, and the resulting states."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import equinox as eqx
 import jax
@@ -10,8 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
+from hybrid_jax.state_space import StateSpace
 
 SAME = 1e-3  # two dt that differ by less, relatively, are of clocks and not of windows
+RANGE = 0.01, 0.99  # quantiles of the training samples
+WARN = 0.1  # share of samples outside of it that is worth a warning
+
+Features = Mapping[str, np.ndarray]
 
 
 def _plain(dt):
@@ -167,3 +172,15 @@ def concatenate(parts: Iterable[Trajectories]) -> Trajectories:
         sizes = [(part.dt, part.horizon, part.x.shape[-1], part.u.shape[-1]) for part in parts]
         raise ValueError(f"parts must share dt and horizon, and sizes of state and input, got {sizes}")
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def features_of(windows: Trajectories, space: StateSpace) -> Features:
+    x, u = np.asarray(windows.x), np.asarray(windows.u)
+    x, u = (part.reshape(x.shape[0] * x.shape[1], part.shape[-1]) for part in (x, u))
+    return space.features(x, u)
+
+
+def shares_outside(known: Features, asked: Features) -> dict[str, float]:
+    """By quantity, the fraction of samples outside the 1 to 99 % range of the known ones."""
+    ends = {name: np.nanquantile(values, RANGE) for name, values in known.items()}
+    return {name: float(np.mean((asked[name] < low) | (asked[name] > high))) for name, (low, high) in ends.items()}

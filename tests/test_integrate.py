@@ -12,8 +12,9 @@ from pendulum import pendulum
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.integrate import RK4, SOLVERS, integrate, rollout, rollout_batch
+from hybrid_jax.metrics import predict
 from hybrid_jax.networks.mlp import residual_network
-from hybrid_jax.rollouts import predict, rollout_minibatch
+from hybrid_jax.training.loss import rollout_minibatch
 from hybrid_jax.vehicle import IRIS
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off

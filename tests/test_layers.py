@@ -12,9 +12,9 @@ from smoke import script
 ROOT = Path(__file__).parents[1]
 # Modules and packages of the library, from the bottom: each may import what stands before it.
 ORDER = (
-    *("_version", "rotation", "matrices", "chunks", "runtime", "checks", "vehicle", "state_space", "records"),
-    *("trajectories", "status", "extrapolation", "dynamics", "implicit_solvers", "integrate", "networks"),
-    *("codegen", "kernels", "rollouts", "metrics", "io", "estimation", "training", "adaptation", "online", "sweep"),
+    *("_version", "rotation", "batches", "runtime", "checks", "vehicle", "state_space", "records"),
+    *("trajectories", "status", "dynamics", "implicit_solvers", "integrate", "networks"),
+    *("codegen", "kernels", "metrics", "io", "estimation", "training", "adaptation", "online", "sweep"),
     *("sim", "flights", "control", "export", "planning", "identification", "cli", "__main__"),
 )
 # These serve any field, whatever trained it: no learning, no reporting, and none of them knows another.

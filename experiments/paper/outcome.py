@@ -23,7 +23,7 @@ from experiments.reporting.tables import over_seeds
 from experiments.runner.run_record import record_of
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.integrate import compact
-from hybrid_jax.rollouts import predict
+from hybrid_jax.metrics import predict
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sweep import hosts

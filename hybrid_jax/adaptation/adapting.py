@@ -22,7 +22,7 @@ from hybrid_jax.adaptation.plausible import groups_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, correlated, longest_chain, overlap
-from hybrid_jax.chunks import in_chunks
+from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
@@ -34,19 +34,17 @@ from hybrid_jax.dynamics.disturbance import (
 from hybrid_jax.dynamics.rigid_body import uncorrected
 from hybrid_jax.estimation.least_squares import Solver, check_steps
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters, sandwich
-from hybrid_jax.extrapolation import features_of, shares_outside
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
-from hybrid_jax.metrics import CHUNK
+from hybrid_jax.metrics import CHUNK, predict
 from hybrid_jax.networks.standardise import motion_of
-from hybrid_jax.rollouts import predict
 from hybrid_jax.runtime import FAST_COMPILE, entry, jit_by_size, keep_programs, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.objective import Settings
-from hybrid_jax.trajectories import Trajectories, check_like, overflows
+from hybrid_jax.trajectories import Trajectories, check_like, features_of, overflows, shares_outside
 
 FEWEST = 10  # windows, of which outliers are told apart
 HELD_OUT = 5  # one in so many windows validates

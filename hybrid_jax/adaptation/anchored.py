@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax.adaptation.selection import TINY, left_out_steps
-from hybrid_jax.chunks import in_chunks
+from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors

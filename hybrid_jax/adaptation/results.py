@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from hybrid_jax.adaptation.expectation import Expected, lines_of
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.extrapolation import WARN
 from hybrid_jax.io.files import json_value
 from hybrid_jax.status import Status
+from hybrid_jax.trajectories import WARN
 
 NETWORK = "network"  # the candidate that changes the network
 SHOWN = 0.01  # less probable candidates are not reported

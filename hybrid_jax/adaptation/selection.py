@@ -22,9 +22,8 @@ from hybrid_jax.estimation.normal_equations import (
     steps_without,
 )
 from hybrid_jax.estimation.starts import Starts, from_starts, smoothed
-from hybrid_jax.extrapolation import RANGE
 from hybrid_jax.integrate import compact, rollout
-from hybrid_jax.trajectories import Trajectories, errors_of
+from hybrid_jax.trajectories import RANGE, Trajectories, errors_of
 
 BLOCKS = 10
 CLUSTERS = 5  # of windows of one flight, for intervals: in gusts, errors a second apart are still correlated

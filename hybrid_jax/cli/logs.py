@@ -14,7 +14,6 @@ from hybrid_jax.cli.help import RARE
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.export.program import vehicle_in
-from hybrid_jax.extrapolation import WARN, shares_outside
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean, lag_motors
 from hybrid_jax.flights.checks.consistency import (
     FAILS,
@@ -38,6 +37,7 @@ from hybrid_jax.flights.windows import require_length
 from hybrid_jax.identification.learning import STEPS
 from hybrid_jax.io.archive import digest
 from hybrid_jax.io.models import Model
+from hybrid_jax.trajectories import WARN, shares_outside
 from hybrid_jax.vehicle import Vehicle
 
 ONE_TO_ONE = (0.0, 1.0)  # rotor speed = command, in whatever unit: motors are still compared with the motion

@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
+from hybrid_jax.batches import solve
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
 from hybrid_jax.control.sensitivities import advance_lagged, condensed
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.batching import like
-from hybrid_jax.matrices import solve
 from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
 from hybrid_jax.vehicle import BODY_RATES, QUATERNION, STATE_SIZE, Input, State, Vehicle
 

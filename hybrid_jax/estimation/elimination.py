@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hybrid_jax.batches import solve
 from hybrid_jax.estimation.levenberg_marquardt import begin, in_python, minimise, move_of_equations
 from hybrid_jax.estimation.normal_equations import RANK, NormalEquations, inverse, inverses
-from hybrid_jax.matrices import solve
 from hybrid_jax.status import Status
 
 TRACE = 1e-2  # share of a direction: names with less are left out

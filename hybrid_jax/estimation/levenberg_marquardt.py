@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from hybrid_jax.matrices import solve
-from hybrid_jax.status import Status, ended
+from hybrid_jax.batches import solve
+from hybrid_jax.status import Status
 
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
 SMALLEST, LARGEST = 1e-12, 1e8  # damping: beyond, no direction leads down
@@ -57,7 +57,8 @@ class State(NamedTuple):
     @property
     def status(self) -> Int[Array, ""]:
         stalled = ~self.converged & (self.damping > LARGEST)
-        return jnp.where(stalled, Status.STALLED, ended(self.converged, jnp.isfinite(self.cost)))
+        ended = jnp.where(self.converged, Status.OK, jnp.where(stalled, Status.STALLED, Status.CAPPED))
+        return jnp.where(jnp.isfinite(self.cost) | stalled, ended, Status.DIVERGED).astype(jnp.int32)
 
 
 def begin(point: PyTree, found: PyTree, damping: float = DAMPING) -> State:

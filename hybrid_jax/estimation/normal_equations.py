@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hybrid_jax.chunks import in_chunks
+from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation import least_squares
 from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
@@ -110,7 +110,7 @@ def inverse(gram: Float[Array, "p p"]) -> Inverse:
 
 
 def inverses(grams: Float[Array, "n p p"]) -> Inverse:
-    """Invert one after the other: two batches at once can wait for each other, see `matrices.solve`."""
+    """Invert one after the other: two batches at once can wait for each other, see `batches.solve`."""
     return jax.lax.map(inverse, grams)
 
 

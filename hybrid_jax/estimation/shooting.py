@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hybrid_jax.chunks import in_chunks
+from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import ravel_learned
 from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.integrate import Solver, integrate

@@ -13,12 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.chunks import in_chunks
+from hybrid_jax.batches import in_chunks, solve
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.estimation.least_squares import TOGETHER, Scale, Solver
 from hybrid_jax.integrate import compact, rollout
-from hybrid_jax.matrices import solve
 from hybrid_jax.trajectories import Trajectories
 
 ORDER = 3  # of the differences

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.chunks import in_chunks
+from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import CHUNK

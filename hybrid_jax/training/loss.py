@@ -10,10 +10,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import as_field
+from hybrid_jax import kernels
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
+from hybrid_jax.dynamics.batching import batch_norms, over_samples, training_mode
 from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.integrate import RK4, along
-from hybrid_jax.rollouts import rollout_minibatch
+from hybrid_jax.integrate import RK4, Solver, integrate
+
+# Traced once for all stages of a step, not once for each; the compiler inlines it again.
+_train = eqx.filter_jit(lambda field, x, u: as_field(field).train_batch(x, u))
+_evaluate = eqx.filter_jit(lambda field, x, u: field(x, u))
 
 
 class Minibatch(eqx.Module):
@@ -23,10 +28,34 @@ class Minibatch(eqx.Module):
     u: Float[Array, "t m b"]
     x: Float[Array, "t d b"]
     dt: float = eqx.field(static=True)
-    solver: diffrax.AbstractSolver = eqx.field(static=True, default_factory=RK4)
+    solver: Solver = eqx.field(static=True, default_factory=RK4)
 
 
 Regulariser = Callable[[Hybrid, Minibatch, Float[Array, "t d b"]], Float[Array, ""]]
+
+
+def rollout_minibatch(
+    field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver
+) -> Float[Array, "t d b"]:
+    """The trajectories of a minibatch in training mode, features first: batch normalisation sees all windows."""
+    if (states := kernels.trained(field, x0, u, dt, solver)) is not None:
+        return states
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    # Implicit and coupled: one system of equations.
+    if batch_norms(field) if implicit else as_field(field).features_first:
+        return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver)
+    alone = training_mode(field)  # samples first: transposing in each evaluation costs up to half the step
+
+    def one_window(x0, u):
+        return integrate(lambda x, held: _evaluate(alone, x, held), x0, u, dt, solver)
+
+    return over_samples(one_window)(x0, u)
+
+
+def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):
+    """The states and inputs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
+    starts = jnp.concatenate([x0[None], x[:-1]])
+    return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], a.shape[0] * a.shape[2]) for a in (starts, u))
 
 
 def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:

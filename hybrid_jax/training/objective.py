@@ -12,11 +12,10 @@ from hybrid_jax import checks, kernels
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.batching import batch_norms
 from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.integrate import RK4, along, check_solver
+from hybrid_jax.integrate import RK4, check_solver
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.rollouts import rollout_minibatch
 from hybrid_jax.runtime import FAST_COMPILE
-from hybrid_jax.training.loss import Minibatch, Regulariser
+from hybrid_jax.training.loss import Minibatch, Regulariser, along, rollout_minibatch
 from hybrid_jax.trajectories import Trajectories, check, errors_of
 
 Learner = Any  # an Equinox module: a vector field, or anything that the objective can evaluate

@@ -10,7 +10,7 @@ from evaluations import infer_batch, train_batch
 from hybrid_jax import RK4, residual_network
 from hybrid_jax.dynamics import base
 from hybrid_jax.dynamics.composition import Frozen, Hybrid, check_batch_norm
-from hybrid_jax.rollouts import rollout_minibatch
+from hybrid_jax.training.loss import rollout_minibatch
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 

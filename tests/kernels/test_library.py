@@ -15,7 +15,7 @@ import pytest
 from benchmarks.subjects import DT, untrained
 from hybrid_jax import kernels, rollout_batch, runtime
 from hybrid_jax.kernels import fields, library
-from hybrid_jax.rollouts import predict
+from hybrid_jax.metrics import predict
 
 LONG_AGO = time.time() - runtime.UNUSED - 3600
 CONTENT = b"a library"

@@ -11,16 +11,18 @@ import pytest
 from systems import ODD
 
 from benchmarks.subjects import DT, untrained
-from hybrid_jax import IRIS, Hybrid, Trajectories, kernels, rollouts
+from hybrid_jax import IRIS, Hybrid, Trajectories, kernels
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import RK4, integrate, rollout_batch
 from hybrid_jax.kernels import library
+from hybrid_jax.metrics import predict
 from hybrid_jax.networks import multirotor_network
 from hybrid_jax.networks.mlp import LinearSkip, residual_network
 from hybrid_jax.networks.normalisation import ChannelScaling
 from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.training.loss import rollout_minibatch
 from hybrid_jax.training.objective import Settings, compiler_options
 
 HEXACOPTER = replace(
@@ -73,7 +75,7 @@ def windows(field, b, steps=3, lanes=()):
 
 
 def trained(field, x0, u, dt=DT):
-    return rollouts.rollout_minibatch(field, x0, u, dt, RK4())
+    return rollout_minibatch(field, x0, u, dt, RK4())
 
 
 def trained_by_jax(field, x0, u, dt=DT):
@@ -150,7 +152,7 @@ class Sorting(AbstractVectorField):
 @needs_kernels
 def test_the_reason_is_told_why_a_field_has_no_kernel():
     x0, u = (jnp.ones((16, 3)), jnp.ones((16, 2, 1)))
-    assert not calls(rollouts.predict, Sorting(), x0, u, DT)
+    assert not calls(predict, Sorting(), x0, u, DT)
     assert "not for Sorting: its operation 'sort'" in kernels.status()
 
 
@@ -167,7 +169,7 @@ def test_others_are_plain_jax_and_fusion_emitters_are_spared_where_kernels_serve
 @pytest.mark.parametrize("solver", [RK4(substeps=2), RK4(scanned=True)])
 def test_only_one_step_of_rk4_an_interval_is_a_kernel(solver):
     x0, u, _ = windows(FIELD, 16)
-    found = calls(lambda field, x0, u: rollouts.rollout_minibatch(field, x0, u, DT, solver), FIELD, x0, u)
+    found = calls(lambda field, x0, u: rollout_minibatch(field, x0, u, DT, solver), FIELD, x0, u)
     assert found == (solver.substeps == 1 and (library.obstacle() is None))
 
 
@@ -177,8 +179,8 @@ def test_windows_are_predicted_as_by_jax_in_double_precision(name):
     field = FIELDS[name]
     x0, u, _ = windows(field, 150, steps=5)  # no multiple of a vector
     x0, u = x0.T, np.moveaxis(u, -1, 0)
-    assert calls(rollouts.predict, field, x0, u, DT)
-    found = eqx.filter_jit(rollouts.predict)(field, x0, u, DT)
+    assert calls(predict, field, x0, u, DT)
+    found = eqx.filter_jit(predict)(field, x0, u, DT)
     with jax.enable_x64(True):
         exact = rollout_batch(*doubled((field, x0, u)), DT)
     np.testing.assert_allclose(found, exact, rtol=0, atol=5e-6 * np.abs(exact).max())
@@ -194,5 +196,5 @@ def test_a_prediction_has_the_derivative_of_jax():
         arrays, rest = eqx.partition(field, eqx.is_array)
         return jax.grad(lambda arrays: jnp.sum(jnp.square(predict(eqx.combine(arrays, rest), x0, u, DT))))(arrays)
 
-    for one, other in zip(*map(jax.tree.leaves, (slopes(rollouts.predict), slopes(rollout_batch))), strict=True):
+    for one, other in zip(*map(jax.tree.leaves, (slopes(predict), slopes(rollout_batch))), strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-5 * np.abs(other).max())

@@ -8,10 +8,9 @@ import pytest
 from pendulum import pendulum
 
 from hybrid_jax import AbstractVectorField, Hybrid, Trajectories
-from hybrid_jax.integrate import RK4, along, rollout_batch
+from hybrid_jax.integrate import RK4, rollout_batch
 from hybrid_jax.networks.mlp import residual_network, zero_output
-from hybrid_jax.rollouts import rollout_minibatch
-from hybrid_jax.training.loss import REGULARISERS, cosine
+from hybrid_jax.training.loss import REGULARISERS, along, cosine, rollout_minibatch
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
 
 pytestmark = pytest.mark.usefixtures("double_precision")

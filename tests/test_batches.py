@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax.chunks import in_chunks
+from hybrid_jax.batches import in_chunks, solve
 from hybrid_jax.estimation.normal_equations import inverses
-from hybrid_jax.matrices import solve
 
 ROOTS = np.random.default_rng(0).normal(size=(4, 3, 3)).astype(np.float32)
 POSITIVE, RIGHT = ROOTS @ ROOTS.swapaxes(1, 2) + np.eye(3, dtype=np.float32), np.ones((4, 3, 2), np.float32)

@@ -1,4 +1,4 @@
-"""Evaluate a function on many windows, a few at a time: memory does not grow with their number, and caches suffice."""
+"""Evaluate a function on many windows, a few at a time, and solve systems with small matrices one after the other."""
 
 from collections.abc import Callable
 from functools import partial
@@ -6,10 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 
 def in_chunks(function: Callable[[Any], Any], values: Any, size: int, distinct: Any = None) -> Any:
-    """Evaluate `function` on n stacked values, `size` at a time.
+    """Evaluate `function` on n stacked values, `size` at a time: memory does not grow with n, and caches suffice.
 
     Args:
         distinct: how many of the values are distinct, if the others repeat them in order; only these are evaluated. It
@@ -31,3 +32,13 @@ def in_chunks(function: Callable[[Any], Any], values: Any, size: int, distinct: 
     zeros = jax.tree.map(lambda leaf: jnp.zeros((n, *leaf.shape[1:]), leaf.dtype), shapes)
     found = jax.lax.fori_loop(0, -(-(n if distinct is None else distinct) // size), evaluate, zeros)
     return found if distinct is None else jax.tree.map(lambda leaf: leaf[jnp.arange(n) % distinct], found)
+
+
+@jax.custom_batching.sequential_vmap
+def solve(matrix: Float[Array, "n n"], right: Float[Array, " n *k"]) -> Float[Array, " n *k"]:
+    """matrix⁻¹ right for a positive definite matrix, by Cholesky, one after the other under `vmap`.
+
+    On a CPU, jaxlib distributes a batch of factorisations over the threads that run programs and waits for them in one
+    of these threads, so two batches at once, in one program or on two devices, can deadlock.
+    """
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right)
