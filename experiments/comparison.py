@@ -12,6 +12,7 @@ from experiments.external_force import sine_floor
 from experiments.paper.claims import COMPARISON
 from experiments.paper.conditions import augmentation, settings
 from experiments.paper.config import QUICK, SMOKE, TABLE_SIZES, Config, Encoding, Stopping, preset_like
+from experiments.paper.expert_augmentation import Augmentation
 from experiments.paper.figures import ranking
 from experiments.paper.lanes import Fit, fit_of, rows_of, save_models, source_of
 from experiments.paper.methods import PAST, Case, Method, adapted, source_only
@@ -24,7 +25,6 @@ from experiments.runner import command
 from experiments.runner.options import Target, distinct, factors
 from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages, stages_of
-from hybrid_jax.adaptation.expert_augmentation import Augmentation
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from experiments.paper.config import HELD_BACK, Config, Encoding, Stopping, column
+from experiments.paper.expert_augmentation import expert_augmented
 from experiments.runner.options import NotNegative
 from hybrid_jax import rotation
-from hybrid_jax.adaptation.expert_augmentation import expert_augmented
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, perturbed

@@ -11,12 +11,12 @@ import numpy as np
 
 from experiments.paper.conditions import settings
 from experiments.paper.config import Config
+from experiments.paper.expert_augmentation import prediction_mse
 from experiments.paper.lanes import MODELS, Fit, Lanes, lanes_of, source_of, theta_of
 from experiments.paper.study import SOLVED, solved
 from experiments.paper.study import adapted as trained
 from experiments.reporting import names
 from experiments.runner.stages import Stages
-from hybrid_jax.adaptation.expert_augmentation import prediction_mse
 from hybrid_jax.dynamics.composition import Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.io.datasets import Dataset
@@ -94,7 +94,6 @@ def _encoded(experts, windows: Trajectories, solver):
     past, _ = split(windows, PAST)
 
     def one(model):
-        typical = model.solve(None, past, past, None).field
-        return prediction_mse(model, windows, PAST, solver), physics_of(typical)
+        return prediction_mse(model, windows, PAST, solver), physics_of(model.typical(past))
 
     return jax.lax.map(one, experts)

@@ -10,11 +10,10 @@ write your own.
 
 from hybrid_jax.adaptation.adapting import METHODS, adapt
 from hybrid_jax.adaptation.auto import Auto
-from hybrid_jax.adaptation.expert_augmentation import Augmentation, ExpertAugmented, expert_augmented
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source
 from hybrid_jax.adaptation.plausible import Plausible
 from hybrid_jax.adaptation.pooling import pool
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 
-__all__ = ["METHODS", "Adaptation", "Augmentation", "Auto", "ExpertAugmented", "FineTune", "LeastSquares", "Method"]
-__all__ += ["Parameter", "Plausible", "Ridge", "Solution", "Source", "adapt", "expert_augmented", "pool"]
+__all__ = ["METHODS", "Adaptation", "Auto", "FineTune", "LeastSquares", "Method"]
+__all__ += ["Parameter", "Plausible", "Ridge", "Solution", "Source", "adapt", "pool"]

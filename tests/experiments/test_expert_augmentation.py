@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pendulum import LENGTH, pendulum, swings
 
-from hybrid_jax import Hybrid, Settings, adapt, fit, load, residual_network, rollout, save
-from hybrid_jax.adaptation.expert_augmentation import Augmentation, expert_augmented, prediction_mse
+from experiments.paper.expert_augmentation import Augmentation, expert_augmented, prediction_mse
+from hybrid_jax import Hybrid, Settings, fit, load, residual_network, rollout, save
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.trajectories import split
 
@@ -48,15 +48,10 @@ def lengths(field, windows):
 def test_what_is_read_moves_to_a_changed_vehicle_and_predicts_it(trained, factor):
     target = flights(200, seed=4, length=factor * LENGTH)
     assert np.median(lengths(trained, target)) == pytest.approx(factor * LENGTH, rel=0.1)
+    mean = np.exp(trained.typical(split(target, PAST)[0]).physics.log_length)
+    assert mean == pytest.approx(factor * LENGTH, rel=0.1)
     alone = rollout_mse(trained.expert.field, split(target, PAST)[1])
     assert prediction_mse(trained, target, PAST) < 0.5 * alone
-
-
-def test_it_is_a_method_of_adapt(trained):
-    target = flights(100, seed=5, length=0.7 * LENGTH)
-    result = adapt(trained.expert.field, target, method=trained)
-    found = np.exp(result.parameters["log_length"].value)
-    assert found == pytest.approx(0.7 * LENGTH, rel=0.1)
 
 
 def test_a_box_of_one_point_leaves_the_source_model():
@@ -86,5 +81,3 @@ def test_the_expert_stays_as_it_is_and_the_whole_survives_a_file(trained, tmp_pa
 def test_bad_input_is_refused():
     with pytest.raises(ValueError, match=r"train: windows of 12 intervals, more than past=12 expected"):
         Augmentation(12).prepare(WINDOWS, "train")
-    with pytest.raises(ValueError, match=r"box must be two factors, 0 < low <= high, got \(2.0, 0.5\)"):
-        expert(box=(2.0, 0.5))

@@ -5,7 +5,7 @@ It learns from rollouts of a source hybrid (the expert) with θ_p drawn from a b
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,17 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from hybrid_jax import checks
-from hybrid_jax.adaptation.methods import Solution
 from hybrid_jax.dynamics.base import AbstractVectorField, RunningStats
 from hybrid_jax.dynamics.composition import Frozen, Hybrid
 from hybrid_jax.estimation.least_squares import Solver, Theta, ravel_parameters
 from hybrid_jax.integrate import rollout
 from hybrid_jax.io.structure import portable
 from hybrid_jax.metrics import mse
-from hybrid_jax.runtime import entry
 from hybrid_jax.training.objective import Objective, Settings
-from hybrid_jax.training.stages import cut
 from hybrid_jax.trajectories import Trajectories, check, split
 
 RECORDED = -1  # the augmentation_seed of a recorded window
@@ -52,7 +48,7 @@ class Encoder(eqx.Module):
 
 @portable
 class ExpertAugmented(eqx.Module):
-    """A hybrid whose θ_p an encoder estimates from the past of each flight; also a method of `adapt`.
+    """A hybrid whose θ_p an encoder estimates from the past of each flight.
 
     Attributes:
         encoder: a network from the past of a flight to a place in the box.
@@ -63,79 +59,37 @@ class ExpertAugmented(eqx.Module):
     encoder: Encoder
     expert: Frozen
     box: tuple[float, float] = eqx.field(static=True)
-    uses_validation: ClassVar[bool] = False
 
-    def solve(
-        self, field: AbstractVectorField, train: Trajectories, validation: Trajectories, settings: Settings
-    ) -> Solution:
-        """Return the expert with the mean estimate of θ_p over the heads of the windows.
-
-        Args:
-            field: not used, as the expert is the source.
-            train: windows of the changed system, at least as long as the past that the encoder reads.
-            validation: not used.
-            settings: not used.
-        """
-        past = self.encoder.weights[0].shape[1] // (2 * train.x0.shape[-1] + train.u.shape[-1])
-        return Solution(self.with_parameters(_mean_over(self.estimate, cut(train, past))))
+    def typical(self, past: Trajectories) -> AbstractVectorField:
+        """Return the expert with the mean estimate of θ_p over windows."""
+        return self.with_parameters(_mean_over(self.estimate, past))
 
     def estimate(self, past: Trajectories) -> Theta:
-        """Estimate θ_p of one flight in the physics' own parametrisation; the estimate is always inside the box.
-
-        Args:
-            past: one window, as long as the windows that the encoder was built for.
-        """
+        """Estimate θ_p of one flight in the physics' own parametrisation; the estimate is always inside the box."""
         return self.inside(self.encoder(past))
 
     def inside(self, place: Theta) -> Theta:
-        """Return the parameters at a place in the box, uniform in the logarithm.
-
-        Args:
-            place: one number for each parameter (p,): −1 is the low end of the box, 1 its high end.
-        """
+        """Return the parameters at a place in the box, uniform in the logarithm: −1 is its low end, 1 its high end."""
         (low, high), (own, _) = np.log(self.box), ravel_parameters(self.expert.field)
         return own + (low + high) / 2 + (high - low) / 2 * place
 
     def with_parameters(self, parameters: Theta) -> AbstractVectorField:
-        """Return the expert with other parameters.
-
-        Args:
-            parameters: in the physics' own parametrisation (p,).
-        """
         return ravel_parameters(self.expert.field)[1](parameters)
 
     def predict(
         self, past: Trajectories, u: Float[Array | np.ndarray, "t m"], solver: Solver = None
     ) -> Float[Array, "t d"]:
-        """Predict the states after one past flight, under the inputs u.
-
-        Args:
-            past: one window, at whose end the prediction starts.
-            solver: integrates the expert over each sample interval, by default one step of RK4.
-        """
+        """Predict the states after one past flight, under the inputs u."""
         return rollout(self.with_parameters(self.estimate(past)), past.x[-1], u, past.dt, solver)
 
 
-@entry
 def expert_augmented(
     expert: Hybrid, past: Trajectories, key: PRNGKeyArray, *, box: tuple[float, float] = (0.5, 2.0), hidden: int = 128
 ) -> ExpertAugmented:
-    """Build an expert with an untrained encoder of two hidden layers.
+    """Build an expert, whose physics stores its parameters as logarithms, with an untrained encoder of two layers.
 
-    Args:
-        expert: a hybrid that was trained on the source. Its physics must store its parameters as logarithms.
-        past: windows of the source, as long as the encoder will read. They set the scale of its inputs.
-        box: the lowest and highest factor on each of the expert's parameters, 0 < low <= high.
-        hidden: number of units of each hidden layer of the encoder.
-
-    Raises:
-        ValueError: if the box is invalid, or past windows are malformed.
+    Past windows of the source are as long as the encoder will read, and set the scale of its inputs.
     """
-    if len(box) != 2 or not 0 < box[0] <= box[1] < np.inf:
-        raise ValueError(f"box must be two factors, 0 < low <= high, got {box}")
-    check(past, "past")
-    checks.count("hidden", hidden)
-    checks.key("key", key)
     inputs = jax.vmap(encoder_inputs)(past)
     sizes = (inputs.shape[1], hidden, hidden, ravel_parameters(expert)[0].size)
     keys = jax.random.split(key, len(sizes) - 1)
@@ -178,10 +132,6 @@ class Augmentation(Objective):
     past: int = 10
     seed: int = 0
 
-    def __post_init__(self):
-        checks.count("past", self.past)
-        checks.count("seed", self.seed, least=0)
-
     def prepare(self, windows: Trajectories, name: str) -> Labelled:
         check(windows, name)
         if windows.horizon <= self.past:
@@ -199,13 +149,7 @@ class Augmentation(Objective):
         return _mean_over(lambda one: self._errors(field, one, settings)[0], data)
 
     def augmented(self, field: ExpertAugmented, one: Labelled, settings: Settings) -> tuple[Trajectories, Theta]:
-        """Return one window, as recorded or as flown by the expert, and its θ_p.
-
-        Args:
-            field: provides the expert and the box for θ_p.
-            one: a window with its seed.
-            settings: their solver integrates the expert.
-        """
+        """Return one window, as recorded or as flown by the expert, and its θ_p."""
         own, _ = ravel_parameters(field.expert.field)
         key = jax.random.fold_in(jax.random.key(self.seed), one.augmentation_seed)
         drawn = field.inside(jax.random.uniform(key, own.shape, minval=-1.0, maxval=1.0))
@@ -222,7 +166,6 @@ class Augmentation(Objective):
 
 def prediction_mse(field: ExpertAugmented, windows: Trajectories, past: int, solver=None) -> Float[Array, ""]:
     """Average L_MSE of the prediction after the first `past` intervals over windows."""
-    check(windows, "windows")
     return _mean_over(lambda window: _window_mse(field, window, past, solver), windows)
 
 
