@@ -116,21 +116,13 @@ class Record:
 
 
 class Gridded(NamedTuple):
-    """A record on the solver's grid, with outputs at their own times.
+    """A record on the solver's grid, with outputs at their own times."""
 
-    Attributes:
-        start: time of the grid's first point [s].
-        u: the mean of the inputs over each interval.
-        y: the samples of each output.
-        index: the interval that contains each sample.
-        share: the position of each sample in its interval, from 0 to 1.
-    """
-
-    start: float
-    u: Float[np.ndarray, "t m"]
-    y: dict[str, Float[np.ndarray, "n k"]]
-    index: dict[str, Int[np.ndarray, " n"]]
-    share: dict[str, Float[np.ndarray, " n"]]
+    start: float  # time of the grid's first point [s]
+    u: Float[np.ndarray, "t m"]  # the mean of the inputs over each interval
+    y: dict[str, Float[np.ndarray, "n k"]]  # the samples of each output
+    index: dict[str, Int[np.ndarray, " n"]]  # the interval that contains each sample
+    share: dict[str, Float[np.ndarray, " n"]]  # the position of each sample in its interval, from 0 to 1
 
 
 def on_grid(

@@ -16,15 +16,11 @@ MOTION = slice(VELOCITY.start, BODY_RATES.stop)
 
 
 class Watched(eqx.Module):
-    """State of an `Observer`.
+    """State of an `Observer`."""
 
-    Attributes:
-        disturbance: acceleration [m/s², world] and angular acceleration [rad/s², body] beyond the model.
-        x: the last sample.
-    """
-
+    # Acceleration [m/s², world] and angular acceleration [rad/s², body] beyond the model.
     disturbance: Float[Array, "*n 6"]
-    x: State
+    x: State  # the last sample
 
 
 class Observer(AbstractEstimator):

@@ -25,29 +25,17 @@ Move = tuple[Float[Array, " p"], Float[Array, ""]]  # a step, and by how much it
 
 
 class State(NamedTuple):
-    """The best point so far, and the next one to try.
+    """The best point so far, and the next one to try."""
 
-    Attributes:
-        best: results at the best point, including the point itself.
-        cost: the sum of squares there.
-        tried: the point to try.
-        expected: expected decrease of the cost at that point.
-        last: whether this decrease is below rounding.
-        damping: relative to the diagonal of JᵀJ.
-        steps: points that were tried.
-        slow: how many steps in a row lowered the cost by less than the tolerance.
-        converged: whether the last step was tried, or `SLOW` were slow.
-    """
-
-    best: PyTree
-    cost: Float[Array, ""]
-    tried: PyTree
-    expected: Float[Array, ""]
-    last: Bool[Array, ""]
-    damping: Float[Array, ""]
-    steps: Int[Array, ""]
-    slow: Int[Array, ""]
-    converged: Bool[Array, ""]
+    best: PyTree  # results at the best point, including the point itself
+    cost: Float[Array, ""]  # the sum of squares there
+    tried: PyTree  # the point to try
+    expected: Float[Array, ""]  # expected decrease of the cost at that point
+    last: Bool[Array, ""]  # whether this decrease is below rounding
+    damping: Float[Array, ""]  # relative to the diagonal of JᵀJ
+    steps: Int[Array, ""]  # points that were tried
+    slow: Int[Array, ""]  # how many steps in a row lowered the cost by less than the tolerance
+    converged: Bool[Array, ""]  # whether the last step was tried, or `SLOW` were slow
 
     @property
     def goes_on(self) -> Bool[Array, ""]:
@@ -106,15 +94,11 @@ def minimise(
     tolerance: float = 0.0,
     loop=jax.lax.while_loop,
 ) -> State:
-    """Try points until one is the last.
+    """Try points, at most `max_steps`, until one is the last.
 
-    Args:
-        evaluate: from a point and the previous state, the cost and other results there.
-        aim: from these results and the damping, the next point, the expected decrease, and the least useful one.
-        state: `begin`.
-        max_steps: points that are tried at most.
-        tolerance: see `judged`.
-        loop: `jax.lax.while_loop` in a compiled program, `in_python` outside.
+    `evaluate` gives, from a point and the previous state, the cost and other results there; `aim`, from these results
+    and the damping, the next point, the expected decrease, and the least useful one. `loop` is `in_python` outside of
+    compiled programs.
     """
 
     def step(state: State) -> State:
@@ -133,12 +117,8 @@ def corrected(
 ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
     """Return the better of a point and that point with a second-order correction, and its cost.
 
-    In curved valleys this follows the bend, as geodesic acceleration does (Transtrum and Sethna 2012).
-
-    Args:
-        cost_and_errors: at a point.
-        correction: a step against what the linear model missed in the errors at a point.
-        tried: the point.
+    `correction` is a step against what the linear model missed in the errors at a point. In curved valleys this follows
+    the bend, as geodesic acceleration does (Transtrum and Sethna 2012).
     """
 
     def attempt(carry, _):

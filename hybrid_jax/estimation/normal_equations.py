@@ -23,16 +23,11 @@ class NormalEquations(NamedTuple):
     """The normal equations of q numbers from each of n pieces, with J the Jacobian of their errors r.
 
     Pieces are windows or records; the numbers are θ_p, or all learned numbers followed by each piece's own unknowns.
-
-    Attributes:
-        gram: JᵀJ.
-        score: Jᵀr.
-        square: rᵀr.
     """
 
-    gram: Float[Array, "*n q q"]
-    score: Float[Array, "*n q"]
-    square: Float[Array, "*n"]
+    gram: Float[Array, "*n q q"]  # JᵀJ
+    score: Float[Array, "*n q"]  # Jᵀr
+    square: Float[Array, "*n"]  # rᵀr
 
     @staticmethod
     def of_errors(jacobian: Float[Array, "s q"], r: Float[Array, " s"], robust: float = np.inf) -> "NormalEquations":
@@ -81,17 +76,11 @@ def has_effect(equations: NormalEquations, windows: Trajectories, scale: Scale) 
 
 
 class Inverse(NamedTuple):
-    """The pseudo-inverse of JᵀJ: zero along directions that change no prediction by more than rounding.
+    """The pseudo-inverse of JᵀJ: zero along directions that change no prediction by more than rounding."""
 
-    Attributes:
-        matrix: the pseudo-inverse.
-        told: the identifiable parameters, with no part in such a direction.
-        rank: number of directions of θ_p that change a prediction by more.
-    """
-
-    matrix: Float[Array, "*n p p"]
-    told: Bool[Array, "*n p"]
-    rank: Int[Array, "*n"]
+    matrix: Float[Array, "*n p p"]  # the pseudo-inverse
+    told: Bool[Array, "*n p"]  # the identifiable parameters, with no part in such a direction
+    rank: Int[Array, "*n"]  # number of directions of θ_p that change a prediction by more
 
 
 def inverse(gram: Float[Array, "p p"]) -> Inverse:

@@ -47,23 +47,16 @@ class Search(NamedTuple):
     """The unknowns of a model and records, and their cost.
 
     The state at each node is `centres` plus an unknown tangent vector of the field's state space.
-
-    Attributes:
-        problem: the comparison and its weights.
-        centres: linearisation points of the states at the nodes, the expected start of each record first.
-        deviations: prior standard deviations of θ from its start (p); infinite if free.
-        theta: its start (p).
-        segments: the records cut; one node each, or one for a record in a simulation.
-        spread: prior standard deviations of each record's start from its centre.
-        off: standard deviation of the gap between a segment's end and the next node (e); None in a simulation.
     """
 
-    problem: Problem
+    problem: Problem  # the comparison and its weights
+    # Linearisation points of the states at the nodes, the expected start of each record first.
     centres: Float[Array, "r s d"]
-    deviations: Float[np.ndarray, " p"]
-    theta: Float[np.ndarray, " p"]
-    segments: Segments
-    spread: Float[Array | np.ndarray, "#r e"]
+    deviations: Float[np.ndarray, " p"]  # prior standard deviations of θ from its start (p); infinite if free
+    theta: Float[np.ndarray, " p"]  # its start (p)
+    segments: Segments  # the records cut; one node each, or one for a record in a simulation
+    spread: Float[Array | np.ndarray, "#r e"]  # prior standard deviations of each record's start from its centre
+    # Standard deviation of the gap between a segment's end and the next node (e); None in a simulation.
     off: Float[np.ndarray, " e"] | None = None
 
     @property

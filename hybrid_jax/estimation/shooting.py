@@ -25,25 +25,17 @@ Model = Any  # a `StateSpaceModel`, or what has its methods
 
 
 class Segments(NamedTuple):
-    """r records of s segments of t intervals, padded where a record is shorter.
+    """r records of s segments of t intervals, padded where a record is shorter."""
 
-    Attributes:
-        u: mean inputs over each interval, preceded by the earlier intervals that the model needs.
-        valid: which intervals are within the record.
-        y: the samples of each output, 0 if missing.
-        there: which samples exist.
-        index: the interval of the segment that contains each sample.
-        share: position in it, from 0 to 1; None if all samples are at the ends of intervals.
-        whitening: of all errors of a segment, by default none.
-    """
-
+    # Mean inputs over each interval, preceded by the earlier intervals that the model needs.
     u: Float[Array | np.ndarray, "*r s a+t m"]
-    valid: Bool[Array | np.ndarray, "*r s t"]
-    y: dict[str, Float[Array | np.ndarray, "*r s n k"]]
-    there: dict[str, Bool[Array | np.ndarray, "*r s n"]]
-    index: dict[str, Int[Array | np.ndarray, "*r s n"]]
+    valid: Bool[Array | np.ndarray, "*r s t"]  # which intervals are within the record
+    y: dict[str, Float[Array | np.ndarray, "*r s n k"]]  # the samples of each output, 0 if missing
+    there: dict[str, Bool[Array | np.ndarray, "*r s n"]]  # which samples exist
+    index: dict[str, Int[Array | np.ndarray, "*r s n"]]  # the interval of the segment that contains each sample
+    # Position in it, from 0 to 1; None if all samples are at the ends of intervals.
     share: dict[str, Float[Array | np.ndarray, "*r s n"]] | None
-    whitening: Float[Array | np.ndarray, "*r s e e"] | None = None
+    whitening: Float[Array | np.ndarray, "*r s e e"] | None = None  # of all errors of a segment, by default none
 
 
 def cut(records: list[Gridded], steps: int) -> Segments:
@@ -84,23 +76,15 @@ def _cut(record: Gridded, steps: int, most: int) -> Segments:
 
 
 class Problem(eqx.Module):
-    """The comparison of a model with measurements, and the weights of errors.
+    """The comparison of a model with measurements, and the weights of errors."""
 
-    Attributes:
-        model: its learned numbers are the start of the search.
-        scale: the size of an error that counts as 1, of each output (k).
-        robust: an error of more than so many times its scale counts linearly, not as a square (Huber 1964).
-        dt: length of an interval [s].
-        solver: integrates the field over an interval.
-        substeps: steps of the solver in each interval.
-    """
-
-    model: Model
-    scale: dict[str, Float[Array, " k"]]
+    model: Model  # its learned numbers are the start of the search
+    scale: dict[str, Float[Array, " k"]]  # the size of an error that counts as 1, of each output (k)
+    # An error of more than so many times its scale counts linearly, not as a square (Huber 1964).
     robust: float = eqx.field(static=True)
-    dt: float = eqx.field(static=True)
-    solver: Solver = eqx.field(static=True)
-    substeps: int = eqx.field(static=True)
+    dt: float = eqx.field(static=True)  # length of an interval [s]
+    solver: Solver = eqx.field(static=True)  # integrates the field over an interval
+    substeps: int = eqx.field(static=True)  # steps of the solver in each interval
 
 
 def states_of(problem: Problem, model: Model, x0: Float[Array, " d"], segment: Segments):

@@ -25,21 +25,15 @@ MOST = 32  # states: with more, for example on a grid, the measured start is use
 
 
 class Starts(NamedTuple):
-    """Estimates of each window's start.
+    """Estimates of each window's start."""
 
-    Attributes:
-        x0: the smoothed start.
-        jump: measured minus smoothed start, over scale.
-        effect: derivative of each state of the window with respect to the start, both over scale.
-        inverse: inverse of the start's normal equations.
-        trust: weight of a measured start's square relative to a prediction's; the measured start is used if the field's
-            errors are larger than the measurements', for example after a large change.
-    """
-
-    x0: Float[Array, "*n d"]
-    jump: Float[Array, "*n d"]
+    x0: Float[Array, "*n d"]  # the smoothed start
+    jump: Float[Array, "*n d"]  # measured minus smoothed start, over scale
+    # Derivative of each state of the window with respect to the start, both over scale.
     effect: Float[Array, "*n t d d"]
-    inverse: Float[Array, "*n d d"]
+    inverse: Float[Array, "*n d d"]  # inverse of the start's normal equations
+    # Weight of a measured start's square relative to a prediction's; the measured start is used if the field's errors
+    # are larger than the measurements', for example after a large change.
     trust: Float[Array, "*n"]
 
 

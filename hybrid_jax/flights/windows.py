@@ -142,12 +142,7 @@ def require_common_interval(logs: Sequence[FlightLog]) -> float:
 
 
 def sequences(logs: Sequence[FlightLog], steps: int) -> list[Trajectories]:
-    """Return each part of the logs without gaps as one window, if it has more than `steps` intervals.
-
-    Args:
-        logs: evenly sampled flights.
-        steps: the fewest intervals of a part, less one.
-    """
+    """Return each part of evenly sampled logs without gaps as one window, if it has more than `steps` intervals."""
     parts = [(log, part) for log in logs for part in even_segments(log) if part.stop - part.start > steps]
     found = [windows_of(log.x[p], log.u[p][:-1], log.dt, steps=p.stop - p.start - 1) for log, p in parts]
     return [jax.tree.map(lambda leaf: leaf.astype(np.float32), each) for each in found]

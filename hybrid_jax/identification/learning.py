@@ -66,11 +66,8 @@ class Learned(NamedTuple):
 def learnable(model: VehicleModel, seconds: float, window: float, moves: bool = True) -> tuple[VehicleModel, str]:
     """Leave out of the parameters that are learned by default those that the logs do not determine; say which.
 
-    Args:
-        model: is returned as it is if its file, or the user, named parameters.
-        seconds: of flight in all logs.
-        window: length of a window [s].
-        moves: whether the logs have a velocity.
+    `seconds` are those of flight in all logs, `window` is the length of one [s], and `moves` whether logs have a
+    velocity. A model is returned as it is if its file, or the user, named parameters.
     """
     if model.learn != LEARN:
         return model, ""

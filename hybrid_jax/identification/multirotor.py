@@ -33,17 +33,11 @@ class Settled(Quantity):
 
 
 class Multirotor(eqx.Module):
-    """A body, its rotors' speeds if they lag, and a constant disturbance of v̇ and ω̇, as a `StateSpaceModel`.
+    """A body, its rotors' speeds if they lag, and a constant disturbance of v̇ and ω̇, as a `StateSpaceModel`."""
 
-    Attributes:
-        field: with the disturbance as a hidden part.
-        axes: the measured axes of each compared quantity.
-        ahead: intervals of inputs before a window, from which rotor speeds follow.
-    """
-
-    field: Any
-    axes: dict[str, tuple[int, ...]] = eqx.field(static=True)
-    ahead: int = eqx.field(static=True)
+    field: Any  # with the disturbance as a hidden part
+    axes: dict[str, tuple[int, ...]] = eqx.field(static=True)  # the measured axes of each compared quantity
+    ahead: int = eqx.field(static=True)  # intervals of inputs before a window, from which rotor speeds follow
 
     @property
     def rotor_states(self) -> int:

@@ -59,18 +59,12 @@ class Layout:
 
 
 class Windows(NamedTuple):
-    """n windows of t intervals.
+    """n windows of t intervals."""
 
-    Attributes:
-        segments: their inputs and measurements, one segment each.
-        centres: estimate of each initial state, without rotor speeds (n, 19).
-        spread: standard deviations of its error (n, 18); 0 if exact.
-        between: intervals between samples of slow commands, from the first of a window's inputs on [s] (n, i, 2).
-    """
-
-    segments: Segments
-    centres: Float[np.ndarray, "n d"]
-    spread: Float[np.ndarray, "n e"]
+    segments: Segments  # their inputs and measurements, one segment each
+    centres: Float[np.ndarray, "n d"]  # estimate of each initial state, without rotor speeds (n, 19)
+    spread: Float[np.ndarray, "n e"]  # standard deviations of its error (n, 18); 0 if exact
+    # Intervals between samples of slow commands, from the first of a window's inputs on [s] (n, i, 2).
     between: Float[np.ndarray, "n i 2"]
 
 

@@ -82,19 +82,13 @@ def _address(item: Any) -> str:
 
 
 class Structure:
-    """The structure of a field; ValueError, with its path, if a part cannot be saved.
-
-    Attributes:
-        tree: the structure as JSON values.
-        static_arrays: arrays in static fields, by path; the others are leaves of the field.
-        problem: why `decode` cannot rebuild the field; None if it can.
-    """
+    """The structure of a field; ValueError, with its path, if a part cannot be saved."""
 
     def __init__(self, field: eqx.Module):
         if not isinstance(field, eqx.Module):
             raise ValueError(f"field must be an Equinox module, got {short_repr(field)}")
-        self.static_arrays: dict[str, Any] = {}
-        self.problem: str | None = None
+        self.static_arrays: dict[str, Any] = {}  # by path; the other arrays are leaves of the field
+        self.problem: str | None = None  # why `decode` cannot rebuild the field
         try:
             self.tree = self._encode(field, "field", static=False)
         except RecursionError as error:

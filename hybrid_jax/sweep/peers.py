@@ -21,14 +21,12 @@ class Peers:
     """Heartbeats between process 0 and all others; process 0 announces who is lost.
 
     JAX itself aborts if a peer does not join, and waits forever for one that was stopped.
-
-    Attributes:
-        lost: which process is lost and how, once there is one.
     """
 
     def __init__(self, coordinator: str, processes: int, process: int, timeout: float):
         host, _, port = coordinator.rpartition(":")
-        self.lost, self._timeout, until = "", timeout, time.monotonic() + timeout
+        self.lost = ""  # which process is lost and how, once there is one
+        self._timeout, until = timeout, time.monotonic() + timeout
         self._links = (
             self._gather(int(port), processes, until) if process == 0 else self._join(host, int(port), process)
         )
