@@ -18,7 +18,7 @@ import hybrid_jax as hj
 from benchmarks.timing import Findings, Ratio, agree, compiled, compiled_with_memory, in_turns, run, table
 from hybrid_jax.dynamics.base import ravel_learned, trainable
 from hybrid_jax.training.fitting import gradient_step, make_run_config, start
-from hybrid_jax.training.sensitivities import with_sensitivities
+from hybrid_jax.training.gauss_newton import with_sensitivities
 
 DT, SUBSTEPS, RATE = 0.1, 2, 1e-3
 # Sums over 25 intervals of 2048 states in another order, in float32.

@@ -14,8 +14,8 @@ from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
 from experiments.runner.options import CountFromZero, check_numbers
 from experiments.runner.progress import Line
-from hybrid_jax.io.archive import digest
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
+from hybrid_jax.io.files import digest
 from hybrid_jax.rotation import tilt
 from hybrid_jax.sim.domain import DOMAINS, Domain
 from hybrid_jax.sim.flight import SplitSpec, configuration, make_dataset

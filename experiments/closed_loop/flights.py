@@ -22,7 +22,7 @@ from experiments.runner.stages import Found, Stages
 from hybrid_jax import control
 from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.io.archive import Arrays
+from hybrid_jax.io.files import Arrays
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, Domain
 from hybrid_jax.sweep.lanes import LaneMap, count, lane
 from hybrid_jax.vehicle import POSITION, STATE_SIZE

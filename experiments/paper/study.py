@@ -21,8 +21,8 @@ from experiments.reporting.results import Results
 from experiments.runner.stages import Stage, Stages, stages_of
 from hybrid_jax.adaptation import METHODS, LeastSquares, Method
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.io.archive import Arrays
 from hybrid_jax.io.datasets import ARRAYS, Dataset
+from hybrid_jax.io.files import Arrays
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain

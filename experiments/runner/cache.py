@@ -11,9 +11,8 @@ from typing import Any
 
 from experiments.runner.run_record import backup_path
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive
 from hybrid_jax.io.datasets import Dataset, content_hash, versions
-from hybrid_jax.io.files import json_value
+from hybrid_jax.io.files import Arrays, digest, json_value, load_archive, named_leaves, save_archive
 from hybrid_jax.io.structure import Structure
 from hybrid_jax.training.fitting import FitState, RunConfig
 from hybrid_jax.training.objective import Settings, TrajectoryLoss

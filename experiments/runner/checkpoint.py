@@ -10,8 +10,8 @@ from typing import Any, Self
 import numpy as np
 
 from experiments.runner.run_record import PACKAGES, backup_path
-from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archive
 from hybrid_jax.io.datasets import versions
+from hybrid_jax.io.files import Arrays, load_archive, named_leaves, save_archive
 from hybrid_jax.sweep import hosts
 from hybrid_jax.training.fitting import FitState
 

@@ -20,8 +20,8 @@ from experiments.runner.checkpoint import Autosave, Checkpoints, DeferredSignals
 from experiments.runner.options import Run
 from experiments.runner.progress import Line, clock
 from experiments.runner.run_record import PACKAGES, require_same
-from hybrid_jax.io.archive import Arrays, named_leaves, with_leaves
 from hybrid_jax.io.datasets import Dataset, versions
+from hybrid_jax.io.files import Arrays, named_leaves, with_leaves
 from hybrid_jax.runtime import cores
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.training import Progress, sweep

@@ -19,8 +19,7 @@ from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import Recording, Signal, unit_of
-from hybrid_jax.identification.estimates import estimate
-from hybrid_jax.identification.vehicle_text import vehicle_text
+from hybrid_jax.identification.estimates import estimate, vehicle_text
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.vehicle import Vehicle
 

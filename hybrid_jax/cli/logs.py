@@ -35,7 +35,7 @@ from hybrid_jax.flights.log import FlightLog, unevenness
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.windows import require_length
 from hybrid_jax.identification.learning import STEPS
-from hybrid_jax.io.archive import digest
+from hybrid_jax.io.files import digest
 from hybrid_jax.io.models import Model
 from hybrid_jax.trajectories import WARN, shares_outside
 from hybrid_jax.vehicle import Vehicle

@@ -5,9 +5,8 @@ from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, tra
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.composition import Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, with_disturbance
-from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.dynamics.grids import Diffusion, Grid, check_grid, diffusion
-from hybrid_jax.dynamics.hidden import Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
+from hybrid_jax.dynamics.hidden import DisturbanceModel, Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import Terms

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space
-from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
+from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.estimation.least_squares import Solver
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.trajectories import Trajectories, windows_of

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
-from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
+from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.integrate import Derivative, check_field, rk4_step
 from hybrid_jax.networks import smoothed
 from hybrid_jax.vehicle import STATE_SIZE, Vehicle

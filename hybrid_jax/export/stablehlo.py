@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.export.program import program_of, sizes_of
-from hybrid_jax.io.archive import load_archive, save_archive
+from hybrid_jax.io.files import load_archive, save_archive
 from hybrid_jax.runtime import entry
 
 FORMAT = "hybrid_jax program 1"

@@ -6,15 +6,19 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
+from hybrid_jax import rotation
 from hybrid_jax.dynamics.actuators import Actuated, held_means
-from hybrid_jax.dynamics.measurement import difference, measure
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.state_space import Quantity
-from hybrid_jax.vehicle import STATE_SIZE, VELOCITY
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
 PUSHED = tuple(range(VELOCITY.start, STATE_SIZE))  # the states that a constant disturbance acts on
 TANGENT = RIGID_BODY_SPACE.tangent_size
+STATES = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "rates": BODY_RATES}
+MEASURED = (*STATES, "body_velocity", "specific_force", "rotor_speed")
 
 
 @dataclass(frozen=True)
@@ -70,3 +74,21 @@ class Multirotor(eqx.Module):
 
     def error(self, name, predicted, y):
         return -difference(name, y, predicted)
+
+
+def measure(
+    quantity: str, field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], gravity: float = 9.81
+) -> Float[Array, " k"]:
+    """h(x, u) of one of `MEASURED`, with `flights.recording.AXES`; the specific force is Rᵀ (v̇ + g e_z) [m/s²]."""
+    if quantity in STATES:
+        return x[STATES[quantity]]
+    if quantity == "rotor_speed":
+        return field.speeds(x, u)  # pyright: ignore[reportAttributeAccessIssue]
+    vector = x[VELOCITY] if quantity == "body_velocity" else field(x, u)[VELOCITY].at[2].add(gravity)
+    return rotation.rotate(rotation.conjugate(rotation.normalise(x[QUATERNION])), vector)
+
+
+def difference(quantity: str, y: Float[Array | np.ndarray, " k"], predicted: Float[Array, " k"]) -> Float[Array, " e"]:
+    """y minus its prediction; for attitudes, the rotation vector between them [rad, body frame] (3)."""
+    y = jnp.asarray(y)
+    return rotation.attitude_error(predicted, y) if quantity == "attitude" else y - predicted

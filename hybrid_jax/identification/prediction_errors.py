@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from hybrid_jax import trajectories
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
+from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.estimation import observe
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import flight_errors

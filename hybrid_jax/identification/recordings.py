@@ -10,13 +10,13 @@ import scipy
 from jaxtyping import Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.measurement import MEASURED
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.shooting import Segments
 from hybrid_jax.flights.attitude import interpolate, quaternion_of, rotation_of
 from hybrid_jax.flights.checks.airborne import airborne
 from hybrid_jax.flights.recording import AXES, Recording, Signal
 from hybrid_jax.identification import slow_commands
+from hybrid_jax.identification.multirotor import MEASURED
 from hybrid_jax.records import integral
 from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 

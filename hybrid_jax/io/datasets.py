@@ -13,7 +13,7 @@ import numpy as np
 
 from hybrid_jax.checks import first_line
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
-from hybrid_jax.io.archive import digest, encode, load_archive, save_archive
+from hybrid_jax.io.files import digest, encode, load_archive, save_archive
 from hybrid_jax.trajectories import Trajectories, check
 
 FORMAT = "hybrid_jax dataset 1"

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.integrate import checked, rollout, rollout_batch
-from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archive, to_numpy, with_leaves
+from hybrid_jax.io.files import Arrays, load_archive, named_leaves, save_archive, to_numpy, with_leaves
 from hybrid_jax.io.structure import Structure, decode, static_values
 
 FORMAT = "hybrid_jax model 2"

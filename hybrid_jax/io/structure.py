@@ -22,7 +22,7 @@ from jaxtyping import AbstractArray, jaxtyped
 
 from hybrid_jax import dynamics, networks  # noqa: F401  a file may name their classes
 from hybrid_jax.checks import short_repr
-from hybrid_jax.io.archive import Arrays, array_type, from_numpy
+from hybrid_jax.io.files import Arrays, array_type, from_numpy
 from hybrid_jax.networks import views  # noqa: F401
 
 _ACTIVATIONS = """celu elu gelu glu hard_sigmoid hard_silu hard_swish hard_tanh identity leaky_relu log1mexp log_sigmoid

@@ -1,11 +1,12 @@
 """Damped Gauss–Newton for all parameters of a field, network and physics, to a precision that Adam does not reach.
 
-A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the column norms of J (`sensitivities`), in
+A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the column norms of J, in
 double precision: squaring J in float32 would lose the least sensitive directions.
 """
 
 from collections.abc import Callable
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_learned
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, check_windows, ravel_learned
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, in_python, minimise, move_of_equations
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
@@ -22,7 +23,6 @@ from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 from hybrid_jax.training.driver import ready
 from hybrid_jax.training.loss import correlation_rows
-from hybrid_jax.training.sensitivities import with_sensitivities
 from hybrid_jax.trajectories import Trajectories, errors_of, overflows
 
 MOST = 1000  # parameters: the cost of a step grows with their square
@@ -206,3 +206,27 @@ def _normal_equations(
         columns, r = (np.asarray(part, float) for part in problem.linearised(theta, windows[index]))
         gram, score = gram + columns @ columns.T, score + columns @ r
     return gram / len(windows), score / len(windows)
+
+
+def with_sensitivities(
+    field: AbstractVectorField, x0: Float[Array, " d"], u: Float[Array, "t m"], dt: float, solver: Solver
+) -> tuple[Float[Array, "t d"], Float[Array, "t d p"]]:
+    """The states of `integrate`, and their derivatives with respect to each learned number, in the order of leaves.
+
+    The derivative of an explicit Runge–Kutta method is the same method on ẋ = f(x, θ), Ṡ = ∂f/∂x S + ∂f/∂θ: internal
+    numerical differentiation (Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", 1981).
+    Values shared by all parameters, for example slopes of a network at each point of a grid, are computed once.
+    """
+    theta, at = ravel_learned(field)
+    if not isinstance(solver, RK4 | diffrax.AbstractERK):
+        states, push = jax.linearize(lambda theta: integrate(at(theta), x0, u, dt, solver), theta)
+        return states, jnp.moveaxis(jax.lax.map(push, jnp.eye(theta.size, dtype=theta.dtype)), 0, -1)
+
+    def slopes(both: Float[Array, "d 1+p"], held):
+        x, columns = both[:, 0], both[:, 1:]
+        value, moved = as_field(field).linearize(x, held, columns, jnp.zeros((len(held), theta.size), held.dtype))
+        return jnp.concatenate([value[:, None], moved + as_field(field).parameter_columns(x, held)], axis=1)
+
+    start = jnp.concatenate([x0[:, None], jnp.zeros((len(x0), theta.size), x0.dtype)], axis=1)
+    both = integrate(slopes, start, u, dt, solver)
+    return both[..., 0], both[..., 1:]

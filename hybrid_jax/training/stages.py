@@ -10,7 +10,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import trainable
-from hybrid_jax.io.archive import named_leaves
+from hybrid_jax.io.files import named_leaves
 from hybrid_jax.runtime import entry
 from hybrid_jax.training.driver import FitResult, Report, checked_arguments, drive, ready
 from hybrid_jax.training.fitting import FitState, Optimiser, make_run_config, start

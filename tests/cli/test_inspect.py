@@ -16,8 +16,7 @@ from hybrid_jax.cli.logs import FlightOptions, read_flights
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
-from hybrid_jax.identification.estimates import estimate
-from hybrid_jax.identification.vehicle_text import vehicle_text
+from hybrid_jax.identification.estimates import estimate, vehicle_text
 from hybrid_jax.vehicle import IRIS, load_vehicle
 
 MASS, ARM, LAG, INERTIA = 0.5, 0.12, 0.06, (2e-3, 2.4e-3)

@@ -7,7 +7,7 @@ from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
+from hybrid_jax.dynamics.hidden import DisturbanceModel
 
 DT, STEPS, BODY = 0.05, 10, hj.rigid_body(hj.IRIS)
 

@@ -24,8 +24,8 @@ from experiments.runner.cache import identity_of
 from experiments.runner.progress import Line
 from experiments.runner.run_record import OtherRun
 from experiments.runner.stages import Stage, Stages, rows_of
-from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.io.files import named_leaves
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.sweep.training import PROGRAMS, _block, evaluate, sweep
 from hybrid_jax.training.fitting import make_run_config, start

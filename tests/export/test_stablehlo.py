@@ -11,7 +11,7 @@ from fields import SIZES, body, field_of, samples, solved
 from hybrid_jax import rollout_batch, save
 from hybrid_jax.export import export_program, load_program
 from hybrid_jax.export.stablehlo import FORMAT
-from hybrid_jax.io.archive import save_archive
+from hybrid_jax.io.files import save_archive
 
 KINDS = ("rigid body", "multirotor, per rotor", "hybrid, norm batch", "residual from body_motion to motion", "hold")
 

@@ -21,9 +21,8 @@ from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import COLUMNS
-from hybrid_jax.io.archive import named_leaves, save_archive
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
-from hybrid_jax.io.files import json_text, read_json, write_atomic
+from hybrid_jax.io.files import json_text, named_leaves, read_json, save_archive, write_atomic
 from hybrid_jax.io.models import FORMAT as MODEL
 from hybrid_jax.vehicle import IRIS
 

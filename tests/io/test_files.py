@@ -21,9 +21,8 @@ from hybrid_jax import IRIS, Hybrid, load, residual_network, rollout_batch, save
 from hybrid_jax.dynamics.rigid_body import perturbed
 from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.io import models
-from hybrid_jax.io.archive import save_archive, to_numpy
 from hybrid_jax.io.datasets import Dataset, content_hash, load_dataset, save_dataset
-from hybrid_jax.io.files import read_json, write_atomic
+from hybrid_jax.io.files import read_json, save_archive, to_numpy, write_atomic
 from hybrid_jax.io.structure import Structure
 from hybrid_jax.networks.mlp import InputScaling
 

@@ -35,7 +35,7 @@ from pendulum import DAMPING, pendulum, swings
 from rich.console import Console
 from experiments.runner import progress
 from experiments.runner.stages import Stages
-from hybrid_jax.io.archive import digest, named_leaves
+from hybrid_jax.io.files import digest, named_leaves
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.training.objective import Settings

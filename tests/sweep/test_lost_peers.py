@@ -6,15 +6,15 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from hybrid_jax.sweep import peers
-from hybrid_jax.sweep.peers import PeerLost, Peers
+from hybrid_jax.sweep import hosts
+from hybrid_jax.sweep.hosts import PeerLost, Peers
 
 
 @pytest.fixture(autouse=True)
 def _fast(monkeypatch):
-    monkeypatch.setattr(peers, "BEAT", 0.05)
-    monkeypatch.setattr(peers, "GRACE", 0.2)
-    monkeypatch.setattr(peers.atexit, "register", lambda *_: None)  # the process would not end with the tests' code
+    monkeypatch.setattr(hosts, "BEAT", 0.05)
+    monkeypatch.setattr(hosts, "GRACE", 0.2)
+    monkeypatch.setattr(hosts.atexit, "register", lambda *_: None)  # the process would not end with the tests' code
 
 
 def meet(*processes, of=3, timeout=1.0):

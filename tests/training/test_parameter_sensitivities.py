@@ -15,7 +15,7 @@ from experiments.reaction_diffusion.systems import Conversion, gray_scott
 from hybrid_jax.dynamics.base import as_field, ravel_learned
 from hybrid_jax.integrate import RK4, integrate
 from hybrid_jax.networks.grids import GridNetwork
-from hybrid_jax.training.sensitivities import with_sensitivities
+from hybrid_jax.training.gauss_newton import with_sensitivities
 
 KEY = jax.random.key(0)
 GRID = hj.Grid((4, 5), 0.3, 2)
