@@ -42,9 +42,9 @@ class AbstractInferenceOnly(eqx.Module):
     """A module that training neither changes nor evaluates in training mode."""
 
 
-def over_samples(function, axis: int = -1):
-    """`function` on all samples of a minibatch, which lie along `axis` of its arguments and its result."""
-    return jax.vmap(function, in_axes=axis, out_axes=axis, axis_name=SAMPLES)
+def over_samples(function):
+    """`function` on all samples of a minibatch, which lie along the last axis of its arguments and its result."""
+    return jax.vmap(function, in_axes=-1, out_axes=-1, axis_name=SAMPLES)
 
 
 def expand_trailing(values: Float[Array, " r"], rows: Float[Array, " _ *b"]) -> Float[Array, " r *b"]:

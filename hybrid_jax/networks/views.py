@@ -17,17 +17,14 @@ from hybrid_jax.vehicle import BODY_RATES, IRIS, POSITION, QUATERNION, STATE_SIZ
 
 # Name → how many numbers the network reads besides u (and one of each rotor near the ground), or returns.
 INPUTS = {"all": STATE_SIZE, "no_xy": STATE_SIZE - 2, "no_xy_yaw": 10, "near_ground": 10, "body": 10, "body_motion": 9}
-OUTPUTS = {"all": STATE_SIZE, "accelerations": 6, "rotors": 6, "motion": 12}
+OUTPUTS = {"all": STATE_SIZE, "accelerations": 6, "rotors": 6}
 FROM_THE_BODY = ("body", "body_motion")
-GO_WITH = {"motion": FROM_THE_BODY}  # outputs → the inputs that they go with, where these are not all
 
 
 def _check(inputs: str, outputs: str, vehicle: Vehicle) -> None:
     for name, value, known in (("inputs", inputs, INPUTS), ("outputs", outputs, OUTPUTS)):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
-    if inputs not in (needed := GO_WITH.get(outputs, tuple(INPUTS))):
-        raise ValueError(f"outputs {outputs!r} needs inputs of {' or '.join(needed)}, got {inputs!r}")
     checks.instance("vehicle", vehicle, Vehicle)
     if inputs == "near_ground":
         checks.positive("vehicle.rotor_radius", vehicle.rotor_radius)
@@ -36,7 +33,7 @@ def _check(inputs: str, outputs: str, vehicle: Vehicle) -> None:
 class View(AbstractWrapper):
     """The field inside reads some features of a multirotor's state and returns some derivatives.
 
-    Other derivatives are zero: the physics ṗ = v and q̇ = ½ q ⊗ [0, ω] is exact, unless the state is an estimate.
+    Other derivatives are zero: the physics ṗ = v and q̇ = ½ q ⊗ [0, ω] is exact.
     In the body frame it returns ṗ, v̇ and the quaternion r of q̇ = q ⊗ r, which makes it equivariant to yaw and to
     translation in x and y.
     """
@@ -63,10 +60,7 @@ class View(AbstractWrapper):
 
     def write(self, x, inside):
         zeros = jnp.zeros((STATE_SIZE - len(inside), *inside.shape[1:]), inside.dtype)
-        if self.outputs == "motion":  # r = ½ [0, δω], so that |q| stays 1
-            inside = jnp.concatenate([inside[:3], zeros, inside[3:6] / 2, inside[6:]])
-        else:
-            inside = jnp.concatenate([zeros, inside]) if len(zeros) else inside
+        inside = jnp.concatenate([zeros, inside]) if len(zeros) else inside
         if self.inputs not in FROM_THE_BODY:
             return inside
         q = x[QUATERNION]
@@ -96,8 +90,7 @@ def multirotor_network(
             and Bennett 1955); "body", p_z, the direction of gravity and Rᵀv [m/s] in the body frame, and ω;
             "body_motion", Rᵀv, ω and Rᵀe_z, without the altitude, for flight away from the ground.
         outputs: "all" 13 derivatives; "accelerations", v̇ and ω̇; "rotors", these and the thrust of each rotor by a
-            second network (`RotorThrust`), initially zero; "motion", corrections of ṗ, of the body rates in q̇, of v̇
-            and of ω̇, in the body frame.
+            second network (`RotorThrust`), initially zero.
         hidden: number of hidden units of each network.
         norm: see `residual_network`.
         activation: see `residual_network`.
@@ -105,7 +98,7 @@ def multirotor_network(
         linear: add a linear skip connection (`LinearSkip`); the output is then initially zero.
 
     Raises:
-        ValueError: if a name is unknown, outputs do not go with inputs (see `GO_WITH`), or there is no rotor radius.
+        ValueError: if a name is unknown, or there is no rotor radius.
     """
     _check(inputs, outputs, vehicle)
     rotors, writes = vehicle.rotors, OUTPUTS[outputs]

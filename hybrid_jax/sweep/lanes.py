@@ -82,7 +82,6 @@ class LaneMap:
 
     Args:
         width: lanes in a chunk. Default: 1 on a CPU; elsewhere 0, an even share of the lanes for each device.
-        devices: where chunks run, ordered by process; by default all devices of all processes.
         min_capacity: the smallest number of lanes to compile for, so that smaller calls share the program. Ignored if
             the width is 0.
         compiler: options of XLA.
@@ -92,11 +91,10 @@ class LaneMap:
         self,
         function: Callable,
         width: int | None = None,
-        devices: Sequence | None = None,
         min_capacity: int = 0,
         compiler: dict[str, bool | int] | None = None,
     ):
-        self.devices = sorted(jax.devices(), key=lambda d: d.process_index) if devices is None else list(devices)
+        self.devices = sorted(jax.devices(), key=lambda d: d.process_index)
         self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width
         self._min_capacity = min_capacity
         mesh = Mesh(np.array(self.devices), (AXIS,))

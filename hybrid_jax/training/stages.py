@@ -72,7 +72,6 @@ def cut(windows: Trajectories, steps: int | None) -> Trajectories:
     """The first `steps` intervals of each window, or all; ValueError if there are fewer."""
     if steps is None:
         return windows
-    checks.count("steps", steps)
     if steps > windows.horizon:
         raise ValueError(f"steps must be at most the {windows.horizon} intervals of the windows, got {steps}")
     return Trajectories(windows.x0, windows.u[..., :steps, :], windows.x[..., :steps, :], windows.dt)
