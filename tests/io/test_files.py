@@ -29,26 +29,22 @@ from hybrid_jax.networks.mlp import InputScaling
 KEY = jax.random.key(0)
 PHYSICS = perturbed(IRIS, KEY)
 NETWORK = residual_network(13, 4, KEY, hidden=6, scaling=InputScaling(IRIS.hover_speed, 65.6))
-FIELDS = {"physics": PHYSICS, "network": NETWORK, "hybrid": Hybrid(PHYSICS, NETWORK)}
-_direct = eqx.filter_jit(rollout_batch)
 
 
 def refused(path):
     return refusal(lambda: load(path), path)
 
 
-@pytest.mark.parametrize("name", FIELDS)
-def test_a_loaded_model_is_the_saved_one(name, tmp_path):
-    save(tmp_path / "model.npz", FIELDS[name], {"seed": 3, "test_mse": 0.5})
+def test_a_loaded_model_predicts_as_the_saved_one_and_says_what_it_is(tmp_path):
+    field, about = Hybrid(PHYSICS, NETWORK), {"seed": 3, "test_mse": 0.5}
+    save(tmp_path / "model.npz", field, about)
     model = load(tmp_path / "model.npz")
-    assert eqx.tree_equal(model.field, FIELDS[name])
-    assert type(model.field) is type(FIELDS[name])
-    assert model.about == {"seed": 3, "test_mse": 0.5}
+    assert model.about == about
     rng = np.random.default_rng(0)
     x0, u = np.zeros((3, 13), np.float32), np.asarray(rng.uniform(500, 800, (3, 5, 4)), np.float32)
     x0[:, 3], x0[:, 7:] = 1, rng.normal(size=(3, 6))
     predicted = model.predict(x0, u, 0.01)
-    np.testing.assert_array_equal(predicted, _direct(FIELDS[name], x0, u, 0.01))
+    np.testing.assert_array_equal(predicted, rollout_batch(field, x0, u, 0.01))
     # A single window sums in another order.
     np.testing.assert_allclose(model.predict(x0[1], u[1], 0.01), predicted[1], rtol=1e-4, atol=1e-5)
 
