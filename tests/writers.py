@@ -9,6 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS
+from hybrid_jax.flights.checks.consistency import FAILS
 from hybrid_jax.vehicle import QUATERNION
 
 STATES = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "stateEstimate.vx", "stateEstimate.vy"]
@@ -272,3 +273,8 @@ def table_of(columns, motors="rpm"):
     names = [name.removeprefix(f"{motors}_") for name in columns]
     rows = [";".join(map(repr, row)) for row in np.column_stack(list(columns.values())).tolist()]
     return "\n".join([";".join(names), *rows])
+
+
+def failures(checks, name):
+    """Each failed check as one line."""
+    return [f"{name}: {check.name}: {check.suggestion}" for check in checks if check.verdict == FAILS]

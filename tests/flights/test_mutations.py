@@ -10,14 +10,14 @@ import jax
 import numpy as np
 import pytest
 from surface import outcome, refusal
-from writers import bag, blackbox, crazyflie, escs, ulog
+from writers import bag, blackbox, crazyflie, escs, failures, ulog
 
 import hybrid_jax as hj
 from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.export import Program, export_program, load_program
 from hybrid_jax.flights.checks.consistency import check_log
-from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import COLUMNS

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from surface import refusal
-from writers import MOTORS, STATES, bag, crazyflie, usd
+from writers import MOTORS, STATES, bag, crazyflie, failures, usd
 
 from hybrid_jax.flights import load_logs
-from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.formats.column_map import SCALES, of_unit
 from hybrid_jax.flights.formats.raw import Samples, record

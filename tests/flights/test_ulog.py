@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from surface import refusal
-from writers import OUTPUTS, PX4_STATES, START, commands, escs, message, outputs, stamped, ulog
+from writers import OUTPUTS, PX4_STATES, START, commands, escs, failures, message, outputs, stamped, ulog
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS
-from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import to_flight, what_to_log
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.ulog import SOURCES

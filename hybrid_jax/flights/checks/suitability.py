@@ -1,10 +1,8 @@
 """Check the raw signals of a recording: are they complete, of the expected vehicle, and fast enough?"""
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from hybrid_jax.flights.checks.consistency import CLOCK, FAILS, LONGEST_INTERVAL, UNKNOWN, Check, judged
+from hybrid_jax.flights.checks.consistency import CLOCK, LONGEST_INTERVAL, UNKNOWN, Check, judged
 from hybrid_jax.flights.conversion import missing_states, motors_of, what_to_log, without_common_time
 from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
 from hybrid_jax.vehicle import MOST_ROTORS, Vehicle
@@ -44,11 +42,6 @@ def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: fl
         _clock(recording),
         _limits(recording, vehicle),
     ]
-
-
-def failures(checks: Sequence[Check], name: str) -> list[str]:
-    """Format each failed check as one line."""
-    return [f"{name}: {check.name}: {check.suggestion}" for check in checks if check.verdict == FAILS]
 
 
 def _airframe(recording: Recording) -> Check:
