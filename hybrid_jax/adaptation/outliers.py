@@ -12,14 +12,10 @@ ROUGH = 0.3  # of the largest error in the window: less is a smooth error
 
 
 def outliers(errors: Float[np.ndarray, "n t d"], windows: Trajectories) -> Bool[np.ndarray, " n"]:
-    """Return which windows contain an outlier, also as their first state.
+    """Return which windows contain an outlier, also as their first state; errors are measured minus predicted states.
 
     There, differences of successive errors are much larger than usual (Hampel 1974), and nearly as large as the errors
     themselves and as the same differences of the predicted states, so that no motion explains them.
-
-    Args:
-        errors: measured minus predicted states of each window; NaN if not measured.
-        windows: these windows.
     """
     if len(errors) < 1 or errors.shape[1] < ORDER:
         return np.zeros(len(errors), bool)

@@ -70,17 +70,13 @@ def combined(
 
 
 def satterthwaite(variances: Float[np.ndarray, "c p"], degrees: Float[np.ndarray, " c"]) -> Float[np.ndarray, " p"]:
-    """Compute the effective degrees of freedom of a sum of c independent estimates of variance.
+    """Compute the effective degrees of freedom of a sum of c independent estimates of variance; ∞ for a known one.
 
     An estimate v of a variance σ² with ν degrees of freedom is σ² χ²_ν / ν: its mean is σ², its variance 2 σ⁴ / ν. The
     sum Σ v_i thus has the mean Σ σ_i² and the variance Σ 2 σ_i⁴ / ν_i. Student's quantile is right for a multiple of
     χ²_ν with these two moments, that is for ν = (Σ v_i)² / Σ (v_i² / ν_i), with v_i in place of σ_i² (Satterthwaite,
     Biometrics Bulletin 1946; Welch, Biometrika 1947; ISO/IEC Guide 98-3, GUM, Sec. G.4.1). It is between the smallest
     ν_i and Σ ν_i.
-
-    Args:
-        variances: of each component, for each of p parameters.
-        degrees: of freedom of each component; ∞ for a variance that is known.
     """
     total = np.sum(variances, axis=0)
     shares = np.divide(variances, total, out=np.ones_like(variances), where=np.isfinite(total) & (total > 0))

@@ -24,17 +24,11 @@ Update = Callable[[AbstractVectorField, Trajectories, Penalty, Solver], Abstract
 
 
 class RidgeFit(NamedTuple):
-    """The result of `fit_ridge`.
+    """The result of `fit_ridge`."""
 
-    Attributes:
-        field: at the chosen penalty.
-        penalty: the chosen penalty, which should not be an end of the grid.
-        mse: the validation loss at this penalty.
-    """
-
-    field: AbstractVectorField
-    penalty: Float[Array, ""]
-    mse: Float[Array, ""]
+    field: AbstractVectorField  # at the chosen penalty
+    penalty: Float[Array, ""]  # the chosen penalty, which should not be an end of the grid
+    mse: Float[Array, ""]  # the validation loss at this penalty
 
 
 def last_layer(
