@@ -8,7 +8,7 @@ from hybrid_jax import checks, kernels
 from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, continuous
 from hybrid_jax.integrate import LONG, RK4, Solver, rollout_batch
-from hybrid_jax.runtime import entry
+from hybrid_jax.runtime import FAST_COMPILE, entry, jit_by_size
 from hybrid_jax.trajectories import Trajectories, check, errors_of
 
 CHUNK = 1000  # windows predicted at once
@@ -25,6 +25,16 @@ def predict(
     by_kernels = np.ndim(u) == 3 and np.shape(u)[1] <= LONG  # they do not project, see `integrate.projection`
     states = kernels.predicted(field, x0, u, dt, RK4() if solver is None else solver) if by_kernels else None
     return rollout_batch(field, x0, u, dt, solver) if states is None else states
+
+
+@jit_by_size(FAST_COMPILE)
+def errors_in(windows: Trajectories, field: AbstractVectorField, solver: Solver | None) -> Float[Array, "n t d"]:
+    """Return x − x̂ of many windows, NaN where nothing was measured."""
+
+    def errors(part: Trajectories):
+        return jnp.asarray(part.x) - predict(field, part.x0, part.u, part.dt, solver)
+
+    return in_chunks(errors, windows, CHUNK)
 
 
 def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:

@@ -5,12 +5,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
@@ -22,7 +20,6 @@ from hybrid_jax.adaptation.plausible import groups_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, correlated, longest_chain, overlap
-from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
@@ -32,14 +29,14 @@ from hybrid_jax.dynamics.disturbance import (
     without_zeros,
 )
 from hybrid_jax.dynamics.rigid_body import uncorrected
-from hybrid_jax.estimation.least_squares import Solver, check_steps
+from hybrid_jax.estimation.least_squares import discretisation, warn_of_steps
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters, sandwich
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
-from hybrid_jax.metrics import CHUNK, predict
+from hybrid_jax.metrics import errors_in
 from hybrid_jax.networks.standardise import motion_of
-from hybrid_jax.runtime import FAST_COMPILE, entry, jit_by_size, keep_programs, load_lapack
+from hybrid_jax.runtime import entry, keep_programs, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
@@ -126,7 +123,7 @@ def adapt(
         warnings.warn(OVERLAP, stacklevel=3)
     keep_programs("adapt", windows.x.shape)
     with solver_errors(solver):
-        given, errors = len(windows), np.asarray(_errors(field, windows, compact(solver)))
+        given, errors = len(windows), np.asarray(errors_in(windows, field, compact(solver)))
     good = ~outliers(errors, windows)
     if good.sum() >= max(FEWEST, given / 2):
         windows, errors = (windows, errors) if good.all() else (windows[good], errors[good])
@@ -149,11 +146,12 @@ def adapt(
     adapted = solution.field
     if disturbance_of(field) is None:
         adapted = uncorrected(without_zeros(adapted))  # what windows need
-    if exact and isinstance(solver, diffrax.AbstractImplicitSolver):  # others cost no step more
-        check_steps(adapted, train, solver, scale_of(settings.objective, windows.x0.shape[-1]))
+    status = Status(int(solution.status))
+    if exact and status != Status.DIVERGED:
+        scale = scale_of(settings.objective, windows.x0.shape[-1])
+        warn_of_steps(discretisation(adapted, windows, solver, scale))
     space, found = state_space(field, windows.x0.shape[-1]), disturbance_of(adapted)
     choice = {} if solution.choice is None else _chosen(solution.choice, train, space)
-    status = Status(int(solution.status))
     without = None if exact else NOT_LEAST_SQUARES
     without = NOT_FINITE if status == Status.DIVERGED else without
     ranges = [] if learned_from is None else [features_of(w, space) for w in (learned_from, windows)]
@@ -162,7 +160,7 @@ def adapt(
         method=name,
         disturbance=None if found is None else np.asarray(found.vector(windows.x0.shape[-1])),
         mse_before=_mse(errors, windows),
-        mse_after=_mse(_errors(adapted, windows, compact(settings.solver)), windows),
+        mse_after=_mse(errors_in(windows, adapted, compact(settings.solver)), windows),
         windows=len(windows),
         steps=int(solution.steps),
         status=status,
@@ -173,14 +171,6 @@ def adapt(
         **choice,
         **_parameters(field, adapted, train, settings, level, without, solution.choice),
     )
-
-
-@jit_by_size(FAST_COMPILE)
-def _errors(field: AbstractVectorField, windows: Trajectories, solver: Solver) -> Float[Array, "n t d"]:
-    def errors(part: Trajectories):
-        return jnp.asarray(part.x) - predict(field, part.x0, part.u, part.dt, solver)
-
-    return in_chunks(errors, windows, CHUNK)
 
 
 def _mse(errors, windows: Trajectories) -> float:

@@ -15,7 +15,7 @@ from hybrid_jax.adaptation import ridge
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Frozen, Hybrid
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
-from hybrid_jax.estimation.least_squares import Scale, fit_least_squares, ravel_parameters
+from hybrid_jax.estimation.least_squares import Scale, fit_free, ravel_parameters
 from hybrid_jax.estimation.uncertainty import check_determined, select_disturbance
 from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.status import Status
@@ -109,7 +109,7 @@ class LeastSquares(Method):
         if self.disturbance == "auto" and n > ravel_parameters(larger)[0].size:  # else there are too few to decide
             found = select_disturbance(field, train, indices=indices, **options).fit
         else:
-            found = fit_least_squares(start, train, **options)
+            found = fit_free(sized(start, d), train, **options)
         return Solution(found.field, found.steps, found.status)
 
 

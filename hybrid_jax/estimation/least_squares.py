@@ -21,6 +21,7 @@ from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, corrected, judged, minimise, move_of_rows
 from hybrid_jax.implicit_solvers import solver_errors, unsolved
 from hybrid_jax.integrate import compact, rollout
+from hybrid_jax.metrics import errors_in
 from hybrid_jax.runtime import entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories, errors_of
@@ -45,8 +46,8 @@ class LeastSquaresFit(eqx.Module):
         mse: L_MSE on the windows, with errors divided by `scale`.
         steps: the number of evaluations of the residuals and their Jacobian.
         status: how the fit ended.
-        discretisation: by how many standard errors half the solver's step would change a parameter at most; -1 if this
-            was not computed.
+        discretisation: by how many standard errors half the solver's step would change a parameter at most; 0 if
+            surely by less than 0.5, and -1 under `jit`, where this is not computed.
     """
 
     field: AbstractVectorField
@@ -91,46 +92,45 @@ def fit_least_squares(
     checks.count("max_steps", max_steps)
     keep_programs("fit_least_squares", windows.x.shape)
     with solver_errors(solver):
-        found = _fit_and_compare(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
-    if not checks.is_traced(found.discretisation):
+        found = fit_free(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
+        if checks.is_traced(found.mse):
+            return found
         if isinstance(solver, diffrax.AbstractImplicitSolver) and found.status == Status.DIVERGED:
             raise unsolved(solver)
-        warn_of_steps(float(found.discretisation), REMEDY)
-    return found
+        moved = discretisation(found.field, windows, solver, scale)
+    warn_of_steps(moved)
+    return replace(found, discretisation=jnp.array(moved))
 
 
-def check_steps(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> None:
-    warn_of_steps(float(_fit_and_compare(field, windows, solver, 1, scale).discretisation), REMEDY)
+def warn_of_steps(moved: float, remedy: str = REMEDY) -> None:
+    if moved > COARSE:
+        said = f"half the solver's step would move a parameter by {moved:.2g} standard errors: give {remedy}"
+        warnings.warn(said, stacklevel=4)
 
 
-def warn_of_steps(discretisation: float, remedy: str) -> None:
-    moved = f"half the solver's step would move a parameter by {discretisation:.2g} standard errors"
-    if discretisation > COARSE:
-        warnings.warn(f"{moved}: give {remedy}", stacklevel=4)
+def discretisation(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> float:
+    """Return that of a fit at a field; no parameter moves by more standard errors than all predictions together."""
+    n = len(windows)
+    some = windows if n <= MANY else windows[np.linspace(0, n - 1, CHUNK).astype(int)]
+    fine = replace(some, x=np.repeat(some.x, 2, axis=1), u=np.repeat(some.u, 2, axis=1), dt=some.dt / 2)
+    errors, halved = (np.asarray(errors_in(each, field, compact(solver))) for each in (some, fine))
+    measured, parts = ~np.isnan(some.x), (halved[:, 1::2] - errors, errors, some.x - some.x0[:, None])
+    change, errors, moved = (np.where(measured, each / (1 if scale is None else scale), 0) for each in parts)
+    noise = (np.linalg.norm(errors) + FINE * np.linalg.norm(moved)) / (measured.sum() * n / len(some)) ** 0.5
+    if np.linalg.norm(change) <= COARSE * noise:
+        return 0.0
+    return float(_standard_errors(field, some, solver, scale, change)) / noise
 
 
 @jit_by_size()
-def _fit_and_compare(field: AbstractVectorField, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale):
-    """Run `fit_free` and compute `discretisation` by a Gauss–Newton step to the predictions with half the step."""
-    fit, jacobian, errors = fit_and_linearise(field, windows, solver, max_steps, scale)
-    n = len(windows)
-    if n > MANY:  # some suffice for a parameter's change; its standard error needs all
-        windows = windows[np.linspace(0, n - 1, CHUNK).astype(int)]
-        theta, unravel = ravel_parameters(fit.field)
-        jacobian, errors = _linearised(lambda at, w: prediction_errors(unravel(at), w, solver, scale), theta, windows)
-
-    def halved(window: Trajectories):
-        fine = replace(window, x=jnp.repeat(window.x, 2, axis=0), u=jnp.repeat(window.u, 2, axis=0), dt=window.dt / 2)
-        return prediction_errors(fit.field, fine, solver, scale)[1::2]
-
-    jacobian, change = jacobian.reshape(errors.size, -1), (jax.vmap(halved)(windows) - errors).ravel()
-    moved = (windows.x - windows.x0[:, None]) / (1 if scale is None else scale)
-    noise = jnp.sqrt(jnp.sum(errors**2) / jnp.sum(~jnp.isnan(moved))) + FINE * jnp.sqrt(jnp.nanmean(moved**2))
-    unit = _nonzero(jnp.linalg.norm(jacobian, axis=0))
-    inverse = jnp.linalg.pinv((jacobian / unit).T @ (jacobian / unit), hermitian=True)
-    steps = inverse @ ((jacobian / unit).T @ change) / _nonzero(jnp.sqrt(jnp.diagonal(inverse)))
-    more = (n / len(windows)) ** 0.5
-    return replace(fit, discretisation=more * jnp.max(jnp.abs(steps)) / _nonzero(noise))
+def _standard_errors(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, change):
+    """Compute by how many standard errors, in noise of 1, a change of the predictions moves a parameter at most."""
+    theta, unravel = ravel_parameters(field)
+    jacobian, _ = _linearised(lambda at, w: prediction_errors(unravel(at), w, solver, scale), theta, windows)
+    jacobian = jacobian.reshape(-1, theta.size)
+    jacobian = jacobian / _nonzero(jnp.linalg.norm(jacobian, axis=0))
+    inverse = jnp.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+    return jnp.max(jnp.abs(inverse @ jacobian.T @ change.ravel()) / _nonzero(jnp.sqrt(jnp.diagonal(inverse))))
 
 
 def _linearised(errors: Callable[[Theta, Trajectories], Array], theta: Theta, windows: Trajectories):

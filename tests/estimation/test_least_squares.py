@@ -11,7 +11,16 @@ import pytest
 from pendulum import LENGTH, pendulum, swings
 from pushes import Push, pushes
 
-from hybrid_jax import Hybrid, Settings, Trajectories, adapt, covariance_of, fit_least_squares, residual_network
+from hybrid_jax import (
+    Hybrid,
+    LeastSquares,
+    Settings,
+    Trajectories,
+    adapt,
+    covariance_of,
+    fit_least_squares,
+    residual_network,
+)
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.estimation import least_squares, levenberg_marquardt
@@ -89,13 +98,18 @@ def test_a_step_that_biases_a_parameter_is_said(substeps, biased):
     x0, u = random.normal(size=(400, 1)), np.repeat(random.normal(size=(400, 5, 1)), 2, axis=1)
     x = np.asarray(rollout_batch(truth, x0, u, 0.01, RK4(substeps=8)))
     windows = Trajectories(x0, u, x + 2e-3 * random.normal(size=x.shape), 0.01)
+    solver = RK4(substeps=substeps)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        found = fit_least_squares(Coil(jnp.log(0.03)), windows, solver=RK4(substeps=substeps))
-    error = np.asarray(jnp.sqrt(covariance_of(found.field, windows, solver=RK4(substeps=substeps))))[0, 0]
+        found = fit_least_squares(Coil(jnp.log(0.03)), windows, solver=solver)
+    error = np.asarray(jnp.sqrt(covariance_of(found.field, windows, solver=solver)))[0, 0]
     off = abs(float(found.field.log_inductance) - np.log(0.015)) / error
     assert (off > 4) == biased == bool(said)
     assert float(found.discretisation) == pytest.approx(off, rel=0.5) if biased else found.discretisation < 0.1
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        adapt(found.field, windows, method=LeastSquares(disturbance=False), settings=Settings(solver=solver))
+    assert biased == any("half the solver's step" in str(each.message) and each.filename == __file__ for each in said)
 
 
 @pytest.mark.parametrize(
