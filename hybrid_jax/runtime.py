@@ -1,6 +1,7 @@
 """Process-wide JAX set-up: one device per CPU core, XLA options, compilation cache and precision."""
 
 import contextlib
+import errno
 import os
 import platform
 import tempfile
@@ -52,23 +53,23 @@ def configure(folder: Path | None = None) -> None:
 
     Args:
         folder: folder for compiled programs, by default `programs` in the user's cache folder for hybrid_jax.
-            JAX_COMPILATION_CACHE_DIR takes precedence. Old programs are deleted only in the default folder.
+            JAX_COMPILATION_CACHE_DIR takes precedence. Whoever can write into a folder that you name can run code as
+            you. Old programs are deleted only in the default folder.
 
     Warns if JAX has already started: its devices and XLA options stay as they are, and the rest is set.
 
     Raises:
-        ValueError: if the folder cannot be written.
+        ValueError: if the folder cannot be written or, by default, if others can write it.
     """
-    default = Path(platformdirs.user_cache_dir("hybrid_jax")) / "programs"
-    programs = Path(os.environ.get(PROGRAMS) or folder or default)
+    programs = Path(os.environ.get(PROGRAMS) or folder or _cache() / "programs")
     try:
+        if programs == _cache() / "programs":
+            _delete_stale(private_folder("programs"))
         programs.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=programs):
             pass
-        if programs == default:
-            _delete_stale(programs)
     except OSError as error:
-        raise ValueError(f"{programs}: cannot be written: {error.strerror}; set {PROGRAMS}") from error
+        raise ValueError(f"{programs}: cannot be used: {error.strerror}; {PROGRAMS} can name another") from error
     if EXTRA not in (flags := os.environ.get(FLAGS, "")):
         os.environ[FLAGS] = f"{flags} {WHOLE_LOOPS}".strip()
     try:
@@ -87,6 +88,21 @@ def configure(folder: Path | None = None) -> None:
     # A GPU's default rounds the factors of a product to 10 bits, an error of 0.6 % in a gradient. No effect on a CPU.
     jax.config.update("jax_default_matmul_precision", "float32")
     load_lapack()
+
+
+def _cache() -> Path:
+    return Path(platformdirs.user_cache_dir("hybrid_jax"))
+
+
+def private_folder(name: str) -> Path:
+    """Make a folder for code in the user's cache folder; PermissionError if others own it or can write it."""
+    folder = _cache() / name
+    for each in (folder.parent, folder):
+        each.mkdir(0o700, parents=True, exist_ok=True)
+        about = each.stat()
+        if hasattr(os, "getuid") and (about.st_uid != os.getuid() or about.st_mode & 0o022):
+            raise PermissionError(errno.EPERM, f"others can write {each}, which holds code; delete it")
+    return folder
 
 
 @cache

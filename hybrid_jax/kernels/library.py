@@ -10,7 +10,6 @@ import ctypes
 import hashlib
 import os
 import shutil
-import stat
 import subprocess
 import tempfile
 import threading
@@ -20,11 +19,10 @@ from functools import cache
 from pathlib import Path
 
 import jax
-import platformdirs
 
 from hybrid_jax import runtime
 
-SWITCH = "HYBRID_JAX_NATIVE"
+SWITCH, FOLDER = "HYBRID_JAX_NATIVE", "kernels"
 SOURCES = Path(__file__).parent / "cpp"
 # Errors and exceptions of the square root are not asked for: without them several are taken at once.
 OPTIONS = ["-std=c++17", "-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w", "-shared"]
@@ -58,9 +56,9 @@ def obstacle() -> str | None:
     if not _compiler():
         return "there is no g++"
     try:
-        _folder()
-    except (OSError, Unusable) as error:
-        return str(error) if isinstance(error, Unusable) else f"they could not be kept: {error}"
+        runtime.private_folder(FOLDER)
+    except OSError as error:
+        return f"they could not be kept: {error}"
     return None
 
 
@@ -105,21 +103,9 @@ def _digest(source: str) -> str:
     return hashlib.sha256("".join([*parts, repr(made_by)]).encode()).hexdigest()[:16]
 
 
-def _folder() -> Path:
-    """Return the cache folder, which must not be accessible to others."""
-    folder = Path(platformdirs.user_cache_dir("hybrid_jax")) / "kernels"
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with contextlib.suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
-    about = folder.lstat()
-    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or stat.S_IMODE(about.st_mode) & 0o077:
-        raise Unusable(f"{folder} must be a folder of this user with mode 0700")
-    return folder
-
-
 def _checked_library(source: str) -> Path:
     """Return the library's file, compiled if it is missing or corrupt."""
-    library = _folder() / f"{_digest(source)}.so"
+    library = runtime.private_folder(FOLDER) / f"{_digest(source)}.so"
     if not _is_whole(library):
         _compile(library, source)
     library.touch()  # it was used

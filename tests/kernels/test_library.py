@@ -46,7 +46,7 @@ def cache(tmp_path, monkeypatch):
             file.write(CONTENT)
 
     monkeypatch.setattr(library, "_run_compiler", compiled)
-    return library._folder(), written
+    return runtime.private_folder(library.FOLDER), written
 
 
 def checked():
@@ -116,14 +116,22 @@ def test_libraries_that_nobody_used_are_deleted_when_another_is_compiled(cache):
     assert checked().stat().st_mtime > LONG_AGO + 3600  # what is loaded counts as used
 
 
-def test_a_folder_of_others_is_not_used(cache):
-    folder, _ = cache
-    folder.chmod(0o770)
-    with pytest.raises(library.Unusable, match="0700"):
-        checked()
-    folder.rmdir()
-    folder.symlink_to(folder.parent)
-    with pytest.raises(library.Unusable, match="0700"):
+def test_what_others_can_write_is_neither_made_nor_used(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv(runtime.PROGRAMS)
+    before = os.umask(0)
+    try:
+        folders = [runtime.private_folder(name) for name in (library.FOLDER, "programs")]
+    finally:
+        os.umask(before)
+    assert {each.stat().st_mode & 0o777 for each in (*folders, tmp_path / "cache" / "hybrid_jax")} == {0o700}
+    for wrong, use in zip((*folders, folders[0].parent), (checked, runtime.configure, checked), strict=True):
+        wrong.chmod(0o770)
+        with pytest.raises((OSError, ValueError), match=f"others can write {wrong}, which holds code; delete it"):
+            use()
+        wrong.chmod(0o700)
+    monkeypatch.setattr(os, "getuid", lambda: 1 + folders[0].stat().st_uid)
+    with pytest.raises(PermissionError, match="others can write"):
         checked()
 
 
