@@ -18,6 +18,7 @@ from hybrid_jax.control.sensitivities import advance, lagged_speeds
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.rotation import heading, normalise
+from hybrid_jax.runtime import entry
 from hybrid_jax.vehicle import POSITION, QUATERNION, Input, State
 
 Plant = Callable[[State, Input, Scalar], State]  # the state one period after time t [s], u held
@@ -177,6 +178,7 @@ class Loop(NamedTuple):
         return Moment(x, seen, speeds, sent[1:], plan, estimator.update(now.estimate, seen, mean), key), u
 
 
+@entry
 def fly(
     plant: Plant,
     model: AbstractVectorField,

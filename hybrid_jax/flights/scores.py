@@ -12,6 +12,7 @@ from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.runtime import entry
 from hybrid_jax.trajectories import Trajectories, check
 from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
@@ -42,6 +43,7 @@ def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"
     return FlightErrors(*(jnp.linalg.norm(part, axis=-1) for part in parts))
 
 
+@entry
 def flight_errors(field: AbstractVectorField, windows: Trajectories) -> FlightErrors:
     """Predict each window with a field in inference mode, and return the errors at the end of each interval.
 

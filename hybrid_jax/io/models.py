@@ -18,6 +18,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.integrate import checked, rollout, rollout_batch
 from hybrid_jax.io.files import Arrays, load_archive, named_leaves, save_archive, to_numpy, with_leaves
 from hybrid_jax.io.structure import Structure, decode, static_values
+from hybrid_jax.runtime import entry
 
 FORMAT = "hybrid_jax model 2"
 
@@ -34,6 +35,7 @@ class Model:
     field: AbstractVectorField
     about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
+    @entry
     def predict(
         self, x0: Float[Array | np.ndarray, "*n d"], u: Float[Array | np.ndarray, "*n t m"], dt: float
     ) -> Float[Array, "*n t d"]:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.io.datasets import Dataset, versions
-from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
+from hybrid_jax.runtime import FASTEST_COMPILE, entry, jit_with
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import CHUNK, Domain, Quadrotor
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
@@ -152,6 +152,7 @@ class SplitSpec:
             raise ValueError(f"steps must be at most {round(SECONDS / DT)}, a whole flight, got {self.steps}")
 
 
+@entry
 def make_dataset(
     domain: Domain, splits: Mapping[str, SplitSpec], seed: int, progress: Callable[[float], None] = lambda share: None
 ) -> Dataset:
