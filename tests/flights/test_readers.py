@@ -13,6 +13,7 @@ from writers import MOTORS, STATES, bag, crazyflie, failures, usd
 from hybrid_jax.flights import load_logs
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import to_flight
+from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.column_map import SCALES, of_unit
 from hybrid_jax.flights.formats.raw import Samples, record
 from hybrid_jax.flights.load import find_logs, read_recording
@@ -240,6 +241,15 @@ def test_pipes_links_and_bombs_neither_hang_nor_fill_the_memory(tmp_path):
     for name in ("pipe.ulg", "nowhere.csv", "loop.csv", "zeros.ulg.gz"):
         refusal(lambda name=name: read_recording(tmp_path / name), name)
     refusal(lambda: read_recording(tmp_path / "zeros.ulg.gz"), "unpacks to over 16 MiB")
+
+
+@pytest.mark.parametrize("plugin", ["ROS1", "MCAP"])
+def test_messages_of_a_bag_are_limited_as_a_packed_log_is(flight, tmp_path, monkeypatch, plugin):
+    path = bag(tmp_path / "run", flight[:60], plugin)
+    for name, limit in (("RATIO", 0.1), ("SMALL", 0)):
+        read_recording(path, topics={"motors": "/rotors:data:rpm"})
+        monkeypatch.setattr(raw, name, limit)
+    refusal(lambda: read_recording(path), path, "unpacks to over 0 MiB")
 
 
 def test_a_folder_of_all_kinds_says_what_it_reads(flight, written, tmp_path):

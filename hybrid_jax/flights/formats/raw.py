@@ -34,7 +34,7 @@ HELD = 1.5  # rows in which a value stands, on average, from which on slow sampl
 REGULAR = 0.9  # share of the values that must stand in as many rows, or one more or less
 OPTIONAL = ("voltage",)  # of which any number of samples may be left out
 AS_TOLD = ("command", "voltage")  # quantities that may well keep a value
-RATIO, MOST, SMALL = 100, 2**31, 2**24  # bytes that a gzip file may hold: for each of its own, at most, at least
+RATIO, MOST, SMALL = 100, 2**31, 2**24  # bytes that a packed log may hold: for each of its own, at most, at least
 
 
 class Samples(NamedTuple):
@@ -48,23 +48,31 @@ class Samples(NamedTuple):
 Parts = tuple[Mapping[str, Samples], float, Sequence[str], Mapping[str, str]]  # what readers give to `record`
 
 
-class _Unpacked(io.RawIOBase):
+class Unpacked:
+    """Counts bytes that a log, a file or a folder, unpacks to; ValueError for more than a log may have."""
+
+    def __init__(self, path: Path):
+        files = path.rglob("*") if path.is_dir() else [path]
+        self.most = self.left = min(max(RATIO * sum(each.stat().st_size for each in files), SMALL), MOST)
+
+    def count(self, size: int) -> int:
+        self.left -= size
+        if self.left < 0:
+            raise ValueError(f"unpacks to over {self.most / 2**20:.0f} MiB, as no log does; unpack it first")
+        return size
+
+
+class _Gzip(io.RawIOBase):
     """Bytes of a gzip file, up to the size that a log may have."""
 
     def __init__(self, path: Path, packed: IO[bytes]):
-        self.path, self.file = path, gzip.GzipFile(fileobj=packed)
-        self.most = self.left = min(max(RATIO * path.stat().st_size, SMALL), MOST)
+        self.file, self.unpacked = gzip.GzipFile(fileobj=packed), Unpacked(path)
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer) -> int:
-        count = self.file.readinto1(buffer)
-        self.left -= count
-        if self.left < 0:
-            most = f"{self.most / 2**20:.0f} MiB"
-            raise ValueError(f"unpacks to over {most}, as no log does; unpack it first")
-        return count
+        return self.unpacked.count(self.file.readinto1(buffer))
 
 
 @contextlib.contextmanager
@@ -77,7 +85,7 @@ def readable(path: str | Path, unpack: bool = True) -> Iterator[IO[bytes]]:
         with path.open("rb") as plain:
             packed = unpack and plain.read(2) == GZIP
             plain.seek(0)
-            yield io.BufferedReader(_Unpacked(path, plain)) if packed else plain
+            yield io.BufferedReader(_Gzip(path, plain)) if packed else plain
     except FileNotFoundError as error:
         raise ValueError("no such file") from error
     except (EOFError, zlib.error) as error:

@@ -17,7 +17,7 @@ import numpy as np
 
 from hybrid_jax.flights.attitude import rotation_of
 from hybrid_jax.flights.formats.column_map import SCALES, SHARES, of_unit
-from hybrid_jax.flights.formats.raw import Parts, Samples
+from hybrid_jax.flights.formats.raw import Parts, Samples, Unpacked
 from hybrid_jax.flights.formats.ulog import TOPICS, motors, states
 from hybrid_jax.flights.log import unlike_one
 from hybrid_jax.flights.recording import AXES
@@ -101,7 +101,9 @@ def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, t
             }
             wanted = [each for each in bag.connections if each.topic in names]
             messages: Messages = {each.topic: [] for each in wanted}
+            unpacked = Unpacked(Path(path))
             for each, at, content in bag.messages(wanted) if wanted else ():
+                unpacked.count(len(content))
                 messages[each.topic].append((at, bag.deserialize(content, each.msgtype)))
     except ValueError:
         raise
