@@ -140,12 +140,14 @@ def split_lists(arguments: Sequence[str], known: Mapping[str, str]) -> list[str]
 @contextlib.contextmanager
 def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
     """On invalid input or a signal, end the process with one line on stderr and an exit code."""
-    for stream in (sys.stdout, sys.stderr):
+    for name in ("stderr", "stdout"):
+        stream = getattr(sys, name) or open(os.devnull, "w")  # noqa: SIM115  None where it is closed
+        if stream is getattr(sys, f"__{name}__"):
+            binary = io.BufferedWriter(_Output(program, stream.fileno()))
+            stream = io.TextIOWrapper(binary, stream.encoding, line_buffering=True)
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a letter ends no run
-    if sys.stdout is sys.__stdout__:
-        binary = io.BufferedWriter(_Output(program))
-        sys.stdout = io.TextIOWrapper(binary, sys.stdout.encoding, "replace", line_buffering=True)
+        setattr(sys, name, stream)
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
@@ -160,23 +162,29 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
     else:
         return
     for line in lines:
-        print(f"{program}: {line}", file=sys.stderr)
+        print(f"{program}:", "\n".join(map(printable, line.split("\n"))), file=sys.stderr)
     sys.exit(code)
 
 
-class _Output(io.FileIO):
-    """Standard output that ignores being full or closed, for example by `| head -1`; files are still written."""
+def printable(text: str) -> str:
+    """Escape characters that a terminal might act on, for example in the name of a file."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
-    def __init__(self, program: str):
-        super().__init__(sys.stdout.fileno(), "w", closefd=False)
+
+class _Output(io.FileIO):
+    """Standard output or error that may be full or closed, for example by `| head -1`: files are still written."""
+
+    def __init__(self, program: str, number: int):
+        super().__init__(number, "w", closefd=False)
         self.program = program
 
     def write(self, text, /) -> int:
         try:
             return super().write(text)
         except OSError as error:
-            print(f"{self.program}: standard output: {error.strerror}; what is left is not shown", file=sys.stderr)
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            if sys.stdout.fileno() == self.fileno():
+                print(f"{self.program}: standard output: {error.strerror}; what is left is not shown", file=sys.stderr)
             return memoryview(text).nbytes
 
 

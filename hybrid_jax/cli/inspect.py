@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 from hybrid_jax import checks
 from hybrid_jax.cli import page
-from hybrid_jax.cli.command import BAD_INPUT, in_flags
-from hybrid_jax.cli.logs import LogOptions, Looked, content_of, grouped, look, paths_of, printable
+from hybrid_jax.cli.command import BAD_INPUT, in_flags, printable
+from hybrid_jax.cli.logs import LogOptions, Looked, content_of, grouped, look, paths_of
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
 from hybrid_jax.flights.load import read_recording

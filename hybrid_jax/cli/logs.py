@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from hybrid_jax.cli.command import ChecksFailed, in_flags, step
+from hybrid_jax.cli.command import ChecksFailed, in_flags, printable, step
 from hybrid_jax.cli.help import RARE
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
@@ -145,11 +145,6 @@ def paths_of(folder: Path) -> tuple[list[Path], list[str]]:
     if not paths:
         raise ValueError(f"{folder}: contains no logs{', only ' * bool(left)}{'; '.join(left[:5])}")
     return paths, left
-
-
-def printable(text: str) -> str:
-    """Escape characters of a text that may not be printable, for example in a file name."""
-    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
 def recordings_of(folder: Path, options: LogOptions) -> tuple[dict[str, Recording], dict[str, str], list[str]]:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
+from hybrid_jax.cli.command import printable
 from hybrid_jax.io.files import json_text, json_value, write_atomic
 
 WIDTH = 80  # columns
@@ -74,6 +75,7 @@ def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
 
 def say(line: str) -> None:
     """Print a line, on a terminal in whole words of `WIDTH` columns."""
+    line = printable(line)
     print(textwrap.fill(line, WIDTH, subsequent_indent="  ") if sys.stdout.isatty() else line)
 
 

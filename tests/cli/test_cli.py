@@ -1,8 +1,11 @@
 """The console script as a user meets it: help, refusals, verbs on logs that tests write, and pages in a browser."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from unittest import mock
 
@@ -40,7 +43,7 @@ def test_help_of_a_verb_has_at_most_twenty_lines_and_a_dozen_options(called, ver
     [
         (["fitt"], "hybrid-jax fitt: no such verb; did you mean fit?; see hybrid-jax --help"),
         (["check", "--otu", "x"], "Unrecognized options: --otu; did you mean --out?"),  # besides, arguments are missing
-        (["inspect", "none"], "hybrid-jax inspect: none: no such file or folder"),
+        (["inspect", "no\x1b[31mne"], r"hybrid-jax inspect: no\x1b[31mne: no such file or folder"),
         (["fit", "none", "-o", "m.npz", "--vehicle", "none.toml"], "none.toml: not a readable TOML file"),
         (["fit", "flights", "-o", "flights"], "--output flights: is a folder; name a file in it"),
         (["fit", "flights"], "an argument is missing; usage: hybrid-jax fit BEFORE --output PATH [OPTIONS]"),
@@ -65,6 +68,27 @@ def test_bad_input_ends_in_one_line(tmp_path, monkeypatch, called, arguments, wo
     assert code == BAD_INPUT
     assert words in said.splitlines()[-1]
     assert not [*tmp_path.glob("runs/*/*"), *tmp_path.glob("board/*")]
+
+
+PRINTS = """
+import sys
+from hybrid_jax.cli.command import exit_codes
+with exit_codes("hybrid-jax", "inspect", "interrupted"):
+    for _ in range(9999):
+        print("0.1 ± 0.01")
+        print("½", file=sys.stderr)
+    open(sys.argv[1], "x").close()
+"""
+
+
+@pytest.mark.parametrize("where", ["| head -1", "2>&1 | head -1", "> /dev/full 2>&1", ">&- 2>&-"])
+def test_output_that_cannot_be_written_or_shown_ends_no_run(where, tmp_path):
+    command = f'"$0" -c "$1" "$2" {where}; exit ${{PIPESTATUS[0]}}'
+    run = ["bash", "-c", command, sys.executable, PRINTS, str(tmp_path / "file")]
+    done = subprocess.run(run, cwd=ROOT, env=os.environ | {"PYTHONIOENCODING": "ascii"}, capture_output=True)
+    assert done.returncode == 0, done.stderr[-300:]
+    assert (tmp_path / "file").exists()
+    assert done.stdout in (b"", b"0.1 ? 0.01\n", b"?\n")
 
 
 def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_changed(tmp_path, monkeypatch, called):
