@@ -13,15 +13,24 @@ from experiments.paper.regret import AUTO, of_each_case, over, regret
 from experiments.reporting.names import label
 from experiments.reporting.results import Results
 from experiments.reporting.tables import measured
+from hybrid_jax.identification.prediction_errors import UNITS
 
 DOCS, README = ROOT / "docs", ROOT / "README.md"
 REFERENCE = DOCS / "reference"
+OF_REPORTS = README, *sorted((DOCS / "results").glob("*.md")), DOCS / "notes/public_logs.md"
 FROM_COMMANDS = re.compile(r"python -m |hybrid-jax \w+|experiments\.|benchmarks|tests/")
 DECIMAL = re.compile(r"(?<![\w.])\d+\.\d+(?!\.?\d)")
 NOT_MEASURED = {"2.785", "0.1", "3.11"}  # where RK4 stops being stable; seconds of a window; a version
 PAPER = {"inertia": "param_shift", "wind": "external_force"}
 METHODS = (("hybrid", "fine_tuned"), ("hybrid", "target_only"), ("no_physics", "fine_tuned"))
 METHODS += (("constant_disturbance", "fine_tuned"),)
+REAL = {  # the models of the tables of real flights
+    "adapted, with its past": "adapted",
+    "physics adapted from nominal, without a past": "scratch",
+    "rigid body and a linear residual": "linear_residual",
+    "constant state": "hold",
+    "thrust, rates frozen": "thrust",
+}
 # Of the table of ten methods: the report of each column, and the model of each line.
 PROTOCOLS = ("random-1000-noise0", "contiguous-own-noise1")
 COMPARED = {
@@ -100,6 +109,15 @@ def test_intervals():
     assert shares == (2756, "98%", "92%")
 
 
+@pytest.mark.parametrize(("page", "horizon"), [("results/real_flights", "50"), ("notes/public_logs", "10")])
+def test_real_flights(page, horizon):
+    shown, rows = lines(f"docs/{page}.md"), committed("real_flight/payload").where(seed=0)
+    for name, model in REAL.items():
+        own = rows.where(model=model)
+        found = [np.sqrt(np.mean(own.numbers(f"scores.{horizon}.{quantity}") ** 2)) for quantity in UNITS]
+        assert [float(cell.strip("*")) for cell in shown[name]] == pytest.approx(found, rel=0.02), name
+
+
 def test_flying():
     rows = committed("closed_loop").where(domain="external_force", observer=False, distance=0.0)
     for line, reference in {"hover": "hover", "figure-8, 3.5 m/s": "figure_eight", "low pass": "low_pass"}.items():
@@ -155,7 +173,7 @@ def decimals(page, linked):
             yield from set(DECIMAL.findall(prose)) - known
 
 
-@pytest.mark.parametrize("page", [README, *sorted((DOCS / "results").glob("*.md"))], ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", OF_REPORTS, ids=lambda page: page.stem)
 def test_results_link_the_report_of_each_number(page):
     assert {*decimals(page, linked=True)} - said() - NOT_MEASURED == set()
 
