@@ -64,18 +64,27 @@ def test_what_belongs_to_an_item_is_indented_by_four(page):
     assert re.findall(r"\n\n {1,3}[^ \n].*|\n\n {4}[^`\n]*\n(?: {4}.*\n)*(?:-|\d+\.) .*", page.read_text()) == []
 
 
-@pytest.mark.parametrize("notebook", sorted(DOCS.glob("tutorials/*.ipynb")), ids=lambda path: path.stem)
+NOTEBOOKS = sorted(DOCS.glob("tutorials/*.ipynb"))
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_exercise_has_an_answer(notebook):
     text = notebook.read_text()
     assert text.count("## Exercise") == text.count("<summary>Answer") == 1
+
+
+def test_the_menu_has_some_thirty_entries():
+    _, menu = (ROOT / "mkdocs.yml").read_text().split("\nnav:\n")
+    assert 25 <= len(re.findall(r"\.\w+$", menu, flags=re.MULTILINE)) <= 32
 
 
 FOLDER = DOCS / "examples"
 PROGRAMS = sorted(FOLDER.glob("*.py"))
 
 
-def test_the_gallery_shows_all_programs():
+def test_the_gallery_shows_all_programs_and_notebooks():
     page = (FOLDER / "index.md").read_text()
+    assert {*re.findall(r"\(\.\./(tutorials/\w+\.ipynb)\)", page)} == {f"tutorials/{path.name}" for path in NOTEBOOKS}
     names = {path.stem for path in PROGRAMS}
     assert len(names) == 12
     assert {*re.findall(r"\]\((\w+)\.png\)", page)} == {*re.findall(r'--8<-- "docs/examples/(\w+)\.py"', page)} == names
