@@ -92,7 +92,7 @@ def test_ten_methods(line):
     for i, (domain, name) in enumerate((d, p) for d in ("parameter_shift", "external_force") for p in PROTOCOLS):
         rows = committed("comparison" if name == PROTOCOLS[0] else f"comparison/{name}").where(domain=domain)
         mean = 1000 * rows.where(model=model, mode=mode).spread("test_mse").mean
-        assert float(lines("docs/results/paper.md")[line][i].strip("✗* ")) == pytest.approx(mean, rel=0.05)
+        assert float(lines("docs/notes/findings.md")[line][i].strip("✗* ")) == pytest.approx(mean, rel=0.05)
 
 
 def test_intervals():

@@ -78,6 +78,12 @@ def test_the_menu_has_some_thirty_entries():
     assert 25 <= len(re.findall(r"\.\w+$", menu, flags=re.MULTILINE)) <= 32
 
 
+@pytest.mark.parametrize("page", written("results"), ids=lambda page: page.stem)
+def test_a_summary_of_results_is_one_screen_with_one_figure(page):
+    text = page.read_text()
+    assert (len(text.splitlines()) <= 46, text.count("![")) == (True, 1)
+
+
 FOLDER = DOCS / "examples"
 PROGRAMS = sorted(FOLDER.glob("*.py"))
 
