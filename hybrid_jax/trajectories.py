@@ -52,7 +52,7 @@ class Trajectories(eqx.Module):
         """The windows at an index, a slice or an array of indices, which may be traced; IndexError out of range."""
         # JAX would clamp the index, and a loop over the windows would not end.
         if isinstance(index, int | np.integer) and not -len(self) <= index < len(self):
-            raise IndexError(f"window {index} of {len(self)}")
+            raise IndexError(f"index {index} is out of range, as there are {len(self)} windows")
         return jax.tree.map(lambda leaf: leaf[index], self)
 
 

@@ -116,7 +116,7 @@ def adapt(
     exact, size = getattr(method, "has_intervals", False), _size(field)
     if exact and size > NAMED:
         physics = type(physics_of(field)).__name__
-        raise ValueError(f"field: {physics} has {size} parameters, no named physics to fit; use method='fine_tune'")
+        raise ValueError(f"field: {physics} has {size} unnamed parameters, too many to fit; use method='fine_tune'")
     if (reason := check_savable(field)) is not None:
         warnings.warn(reason, stacklevel=3)
     if overlap(windows):

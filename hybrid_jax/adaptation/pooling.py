@@ -33,7 +33,7 @@ def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parame
     check_level(level)
     results = checks.list_of("results", results, Adaptation)
     if len(results) < SOURCES:
-        raise ValueError(f"results must be of at least {SOURCES} sources, got {len(results)}")
+        raise ValueError(f"results must come from at least {SOURCES} source models, got {len(results)}")
     for i, result in enumerate(results):
         if result.covariance is None:
             raise ValueError(f"results[{i}] has no intervals: {result.without_intervals}")

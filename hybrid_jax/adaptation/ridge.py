@@ -78,7 +78,7 @@ def fit_ridge(
     check(train, "train")
     check(validation, "validation")
     if not penalties:
-        raise ValueError("penalties must be some positive numbers, got none")
+        raise ValueError("penalties must contain a positive number at least, got none")
     for penalty in penalties:
         checks.positive("penalties", penalty, "positive finite numbers")
     settings, grid = Settings() if settings is None else settings, jnp.asarray(penalties, float)

@@ -91,7 +91,7 @@ def run(options: Options) -> int:
     if len(flights.logs) < 2:
         raise ValueError(f"{options.before}: has one flight; you need at least two, because one is held out")
     if flights.still and not options.anyway:
-        raise ValueError(f"{options.before}: no flight excites anything: fly manoeuvres, or go on with --anyway")
+        raise ValueError(f"{options.before}: no flight excites a parameter: fly manoeuvres, or continue with --anyway")
     model, left = learnable(model, flights.seconds, STEPS * dt)
     with step(f"learning from {len(flights.logs)} flights") as told:
         found = learn(model, flights.logs, options.seed)

@@ -126,7 +126,7 @@ def write_vehicle(
 ) -> None:
     """Write a vehicle file estimated from the logs of a folder."""
     write_atomic(path, vehicle_text(estimate(trusted(logs)), folder.resolve().stem, mass, arm))
-    print(f"{path}: written; read its comments before it is used")
+    print(f"{path}: written; you should read its comments before you use it")
 
 
 def trusted(logs: Sequence[Looked]) -> list[Recording]:

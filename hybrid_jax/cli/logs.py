@@ -257,7 +257,7 @@ def known_of(path: Path, model: Model) -> Known:
     """Convert a model from a file; raise ValueError if `fit` or `adapt` did not write it."""
     vehicle = vehicle_in(model.field)
     if "identified" in model.about:
-        raise ValueError(f"{path}: was identified without states, which replay draws; hybrid-jax check predicts logs")
+        raise ValueError(f"{path}: was identified without the states that replay draws; use hybrid-jax check")
     if vehicle is None or not {"dt", "steps", "learned_from", "motion", "windows"} <= model.about.keys():
         raise ValueError(f"{path}: is not a model written by hybrid-jax fit or adapt")
     return Known(model.field, vehicle, model.about, model.about["dt"], model.about["steps"])

@@ -215,7 +215,7 @@ def fly(
     checks.not_negative("bandwidth", bandwidth)
     hardware = Hardware() if hardware is None else hardware
     if key is None and any(hardware.noise):
-        raise ValueError("key must be a random key, as the hardware has noise")
+        raise ValueError("key must be a random key, because the hardware has noise")
     x0, reference, plan = checked_states("x0", x0, reference, controller.begin())
     periods = len(reference) - 1 - controller.steps * controller.stride
     if periods < 1:

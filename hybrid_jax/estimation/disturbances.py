@@ -128,7 +128,7 @@ def _parts(field: AbstractVectorField, sequences: Sequence[Trajectories], steps:
         found = [piece[i : i + 1] for one in found for piece in [_cut(one, pieces)] for i in range(len(piece))]
     shortest = min((one.horizon for one in found), default=0)
     if shortest < 2 * steps:
-        raise ValueError(f"sequences: each needs {2 * steps} intervals at least, one has {shortest}")
+        raise ValueError(f"sequences: each needs at least {2 * steps} intervals, but one has {shortest}")
     return found
 
 

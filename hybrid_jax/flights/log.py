@@ -63,7 +63,7 @@ class FlightLog:
             ValueError: if the log has fewer than two samples.
         """
         if len(self) < 2:
-            raise ValueError(f"{self.name}: {len(self)} samples have no interval")
+            raise ValueError(f"{self.name}: has {len(self)} samples; at least two are needed for an interval")
         return round(float(np.median(np.diff(self.t))), 9)
 
 

@@ -162,7 +162,7 @@ def _lag(model: VehicleModel, logs: Sequence[FlightLog]) -> float:
 
     found = {lag: off for lag in TIME_CONSTANTS if np.isfinite(off := error(lag))}
     if not found:
-        raise ValueError("no time constant of the rotors has a finite error, so none can be chosen")
+        raise ValueError("predictions diverge with every time constant of the rotors; check their speeds")
     return min(found, key=lambda lag: found[lag])
 
 

@@ -130,7 +130,7 @@ def named_priors(
         checks.not_negative(group if group == DISTURBANCE else f"prior of {name}", scale)
         found.append(float(scale))
     if not any(found):
-        raise ValueError("prior must be positive for a parameter at least, got 0 for all")
+        raise ValueError("prior must be positive for at least one parameter, got 0 for all")
     return names, tuple(found)
 
 

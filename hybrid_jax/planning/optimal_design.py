@@ -244,7 +244,7 @@ def _begun(search: _Search, starts: int, key: PRNGKeyArray) -> Starts:
     uses = np.asarray(search.design.uses(*search.planned(rest))).max(axis=0, initial=0.0)
     for name, use in zip(search.design.names, uses, strict=True):
         if not use <= SPARE:
-            raise ValueError(f"bounds: {name} leaves its limits even at rest, with inputs in the middle of theirs")
+            raise ValueError(f"bounds: {name} leaves its limits even at rest, with mid-range inputs; widen its limits")
     draws = jax.random.normal(key, (starts, *search.design.shape))
     return jax.lax.map(search.kept, draws / math.sqrt(search.design.harmonics))
 

@@ -196,7 +196,7 @@ def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[T
         whole = round(SECONDS / DT) // spec.steps  # windows of a flight of which none is dropped
         parts += [part[:each] for part in found if len(part) == whole] if spec.flights else found
         if not parts:
-            raise ValueError(f"domain {domain.name}: none of {tally['flights']} flights stayed in bounds")
+            raise ValueError(f"domain {domain.name}: none of {tally['flights']} flights stayed in bounds; weaken it")
     if spec.flights:
         return concatenate(parts[: spec.flights]), tally
     windows = concatenate(parts)

@@ -173,7 +173,7 @@ WIDE = replace(swings(40), u=np.zeros((40, 8, 2), np.float32))
         (pendulum(), {"method": "theta_only"}, "field must be a Hybrid where its residual is frozen, got Pendulum"),
         (pendulum(), {"learned_from": WIDE}, "^learned_from: inputs of 1 numbers expected, as in the other .* got 2"),
         (Nothing(), {}, "field: its physics, Nothing, has no parameter to fit"),
-        (Weights(jnp.zeros(60)), {}, "field: Weights has 60 parameters, no named physics to fit; use"),
+        (Weights(jnp.zeros(60)), {}, "field: Weights has 60 unnamed parameters, too many to fit; use"),
         (Weights(jnp.zeros(45)), {"method": "least_squares"}, "40 are too few for the 45 parameters of Weights"),
     ],
 )

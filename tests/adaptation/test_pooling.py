@@ -43,7 +43,7 @@ class Bias(hj.AbstractVectorField):
 
 def test_two_sources_or_one_without_intervals_are_refused():
     results = [hj.adapt(pendulum(), swings(40), method="theta_least_squares")] * 3
-    refusal(lambda: hj.pool(results[:2]), "results must be of at least 3 sources, got 2")
+    refusal(lambda: hj.pool(results[:2]), "results must come from at least 3 source models, got 2")
     refusal(lambda: hj.pool(results[0]), "results must be a list of Adaptation, got Adaptation")
     tuned = hj.adapt(pendulum(), swings(40), method=hj.FineTune(max_epochs=1))
     with pytest.raises(ValueError, match=r"results\[2\] has no intervals: they are valid for least squares only"):

@@ -174,7 +174,7 @@ def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
     [
         ({"prior": {"frition": 0.1}}, "prior: frition: must be among friction, idle"),
         ({"prior": {"friction": 0.1}}, "prior: idle must be given, 0 if it should stay constant"),
-        ({"prior": 0.0}, "prior must be positive for a parameter at least, got 0 for all"),
+        ({"prior": 0.0}, "prior must be positive for at least one parameter, got 0 for all"),
         ({"disturbance": 1.0}, "indices must say"),
         ({"disturbance": (1.0, 1.0), "indices": (0,)}, "disturbance must be one number, or one for each of 1 dist"),
         ({"noise": 0.0}, "noise must be"),

@@ -39,7 +39,7 @@ class Cleaning:
         checks.not_negative("longest_gap", self.longest_gap)
         checks.number("delay", self.delay)
         if self.longest_gap and self.resample is None:
-            raise ValueError("longest_gap needs resample")
+            raise ValueError("longest_gap bridges gaps only with resample; give both")
 
 
 def clean(log: FlightLog, cleaning: Cleaning) -> tuple[FlightLog, list[str]]:
@@ -78,7 +78,7 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
             x[:, QUATERNION] = interpolate_attitude(t, piece.t, piece.x[:, QUATERNION])
             parts.append((t, x, mean_of_held(t, piece.t, piece.u)))
     if not parts:
-        raise ValueError(f"no segment without gaps is as long as dt = {dt} s")
+        raise ValueError(f"no segment without gaps is as long as dt = {dt} s; use a smaller dt or a longest_gap")
     # Without last samples of segments that would make a gap too short to be recognised as one.
     ends = [following[0][0] - GAP * dt for following in parts[1:]] + [np.inf]
     parts = [[each[part[0] < end] for each in part] for part, end in zip(parts, ends, strict=True)]
@@ -105,7 +105,7 @@ def delay(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
             at = np.append(piece.t[inside], piece.t[inside][-1] + log.dt) - lag
             parts.append((piece.t[inside], piece.x[inside], mean_of_held(at, piece.t, piece.u)[:-1]))
     if not parts:
-        raise ValueError(f"no segment without gaps is longer than the lag of {lag} s")
+        raise ValueError(f"no segment without gaps is longer than the lag of {lag} s; leave the file out")
     t, x, u = map(np.concatenate, zip(*parts, strict=True))
     return FlightLog(t, x, u, log.name), f"motors shifted by {1000 * lag:.1f} ms, {len(log) - len(t)} samples cut"
 
