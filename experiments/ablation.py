@@ -43,6 +43,16 @@ NOTES = [
     "Seconds are those that the stages of a value took when they ran; a stage shared by several values counts in each.",
     "Off: mean of the recovered parameter over the true one, less 1.",
 ]
+TITLES = {  # of the figure of each choice
+    "residual": "What the network reads → adds to",
+    "weight": "Weight of the regulariser",
+    "form": "Form of the regulariser",
+    "norm": "Normalisation in the network",
+    "start": "Initial θ_p",
+    "source": "Data before the change",
+    "noise": "Sensor noise",
+    "solver": "Integrator",
+}
 LITTLE = 0.05  # change of an error that counts as none
 Choice = Literal["residual", "weight", "form", "norm", "start", "source", "noise", "solver"]
 
@@ -136,7 +146,7 @@ def report(record: Mapping[str, Any]) -> Report:
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
     drawn = {}
     for choice, group in rows.group("choice").items():
-        title = f"{str(choice).capitalize()}: test error over 1 s after fine-tuning"
+        title = f"{TITLES[choice]}: error over 1 s after fine-tuning"
         figure = figures.ablation(group, title, {EXTERNAL_FORCE.name: FLOOR})
         drawn[choice] = figure, f"Test errors of all seeds, by {choice}"
     return drawn

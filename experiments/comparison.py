@@ -44,7 +44,7 @@ class ComparisonConfig(Config):
     sizes: Annotated[tuple[int, ...], Target] = (100,)
     """N, target trajectories to adapt to; rates and patience are those of the nearest size in the paper's table."""
     methods: tuple[Method, ...] = get_args(Method)
-    """Which methods to compare."""
+    """Methods to compare."""
     encoding: Encoding = field(default_factory=Encoding)
 
     def pooled(self) -> int:

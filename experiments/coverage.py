@@ -69,7 +69,7 @@ class CoverageConfig(OneFlight):
     clean: bool = True
     """Also adapt to the same flights without noise."""
     changes: tuple[Change, ...] = RIGHT
-    """Which changes; by default all that do not change the mass."""
+    """Changes of the vehicle; by default all that keep its mass."""
     repeats: Count = 100
     """Recordings of a known rigid body, each with its own fit."""
 

@@ -25,7 +25,7 @@ off centre, a side wind of 4 N with a sine of 1 N (experiment 2), one rotor 15 %
 controller sees samples with noise; its commands arrive 10 ms later, and the rotors follow with a lag of 30 ms, both of
 which it and all estimators predict. Everything but the change and the agent is the same, noise included.
 
-- **unadapted**: the rigid body of the data sheet with its drag
+- **not adapted**: the rigid body of the data sheet with its drag
 - **disturbance observer**: the same, with the constant acceleration that explains the last prediction errors
 - **L1 adaptive augmentation**: the same, with the thrust and torques that a predictor finds missing added to commands
 - **least squares after 10 s on the ground**: all parameters and a disturbance fitted to ten seconds of random flight

@@ -43,7 +43,7 @@ CHANGE_NAMES = {
     "nothing": "no change",
 }
 AGENTS = {
-    "unadapted": "unadapted",
+    "unadapted": "not adapted",
     "observer": "disturbance observer",
     "l1": "L1 adaptive augmentation",
     "least_squares": "least squares after 10 s on the ground",

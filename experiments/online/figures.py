@@ -12,7 +12,7 @@ from experiments.reporting.results import Results
 
 MARKS = {  # colour and marker of each agent
     "unadapted": (METHODS["not adapted"], "x"),
-    "l1": ("#56B4E9", "v"),
+    "l1": ("#8C510A", "v"),
     "observer": ("#E69F00", "s"),
     "least_squares": (METHODS["physics"], "^"),
     "online": (METHODS["adapted"], "o"),

@@ -144,7 +144,7 @@ class Config(Run):
     noise_on: Literal["all", "target"] = "all"
     """Flights with noise. all: before and after the change. target: only after it."""
     regulariser: RegulariserName = "trajectory_correlation"
-    """Penalty against f_d replacing f_p."""
+    """Penalty that keeps f_d from replacing f_p."""
     regulariser_weight: NotNegative = 1e-3
     """Weight λ of the penalty."""
     solver: SolverName = "rk4"
@@ -226,7 +226,7 @@ class AdaptationConfig(Config):
     target_only: bool = True
     """Train every model on the N target trajectories from scratch, too."""
     source_flights: Path | None = None
-    """A file of `python -m experiments.make_flights --domain source` ; by default flights are simulated and cached."""
+    """A file of `python -m experiments.make_flights --domain source`; by default flights are simulated and cached."""
     target_flights: Path | None = None
     """The same for the target, with the splits train, validation and test."""
 
@@ -253,7 +253,7 @@ class OneFlight(Config):
     noise_on: Literal["all", "target"] = "target"
     """Flights with noise. all: before and after the change. target: only after it."""
     changes: tuple[Change, ...] = CHANGED
-    """Which changes of the vehicle."""
+    """Changes of the vehicle."""
 
     def __post_init__(self):
         Config.__post_init__(self)

@@ -25,7 +25,7 @@ MARKERS = {FINE_TUNED: "o", TARGET_ONLY: "s", SOURCE_ONLY: ""}
 # What lies beyond these is marked at the edge of its panel, so that one failed run does not flatten the rest.
 LOWEST_RHO = -1.0
 DECADES = 6  # of error, from the smallest mean up
-HOME, FLOOR = "hybrid before the change", "no model can do better"  # errors on source flights, and of every model
+HOME = "hybrid before the change"  # the label of its error on source flights
 
 
 class _Curve(NamedTuple):
@@ -71,9 +71,9 @@ def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     entries |= {label(mode): Line2D([], [], ls=DASHES[mode], marker=MARKERS[mode], **style) for mode in modes}
     # Lines of no model: words beside them would lie on other lines.
     others = {str(line.get_label()): line for line in left.get_lines()}
-    entries |= {name: others[name] for name in (HOME, FLOOR) if name in others}
+    entries |= {name: others[name] for name in (HOME, plots.FLOOR) if name in others}
     figure.suptitle(title)
-    about = {"loc": "outside lower center", "ncols": 4, "title": "mean and std over seeds"}
+    about = {"loc": "outside lower center", "ncols": 4, "title": "line: mean over seeds; band: standard deviation"}
     figure.legend(entries.values(), entries.keys(), **about)
     return figure
 
@@ -134,7 +134,7 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
     means = np.concatenate([curve.mean for curve in curves.values()])
     means = means[means > 1 / DRAWABLE]
     lowest, drawn = min(means, default=1.0), floor > 1 / DRAWABLE
-    axes.set(yscale="log", ylabel="mean squared error over 1 s (log; lower is better)")
+    axes.set(yscale="log", ylabel="mean squared error over 1 s, SI units (log; lower is better)")
     trained = {key: curve for key, curve in curves.items() if key[1] != SOURCE_ONLY}
     bottom = min(lowest, floor) / 2 if drawn else lowest / 2
     _draw(axes, trained, bottom, min(2 * max(means, default=1.0), lowest * 10.0**DECADES))
@@ -144,7 +144,7 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
             axes.axhspan(low[0], high[0], color=colour(model), alpha=0.12, linewidth=0)
             axes.axhline(curve.mean[0], color=colour(model), linestyle=":", label=label(model, mode))
     if drawn:
-        axes.axhline(floor, color="0.4", linestyle="-.", label=FLOOR)
+        axes.axhline(floor, color="0.4", linestyle="-.", label=plots.FLOOR)
     plots.tick_errors(axes.yaxis, *axes.get_ylim(), room=3.5)
 
 
@@ -178,4 +178,11 @@ def _draw(axes: Axes, curves: _Curves, bottom: float, top: float, lost_at_top: b
                 white = {"color": colour(model), "markerfacecolor": "white", "markersize": 6}
                 axes.plot(n, y, marker, clip_on=False, zorder=5, **white)
                 down = y == top
-                note(axes, words, (n, y), (5, -5 if down else 5), va="top" if down else "bottom", color=colour(model))
+                note(
+                    axes,
+                    words.replace("-", "−"),
+                    (n, y),
+                    (5, -5 if down else 5),
+                    va="top" if down else "bottom",
+                    color=colour(model),
+                )

@@ -44,7 +44,7 @@ def forecasts(rows: Results) -> Figure:
     axes.axvline(APHYNITY, color="0.4", linestyle=":", label="published: APHYNITY, 1600 trajectories")
     dots(axes, lines)
     axes.set_xlabel("mean squared error (log scale; lower is better)")
-    return legend_below(figure, "Forecasts of 2.5 s, learned from one trajectory")
+    return legend_below(figure, "Forecasts of 2.5 s, learned from one trajectory (dot: a seed; bar: median)")
 
 
 def _model(case: str) -> str:
@@ -74,6 +74,6 @@ def scores(rows: Results) -> Figure:
         panel.set(xscale="log", yscale="log", title=SHIFT_WORDS[shift], xlabel="target trajectories N")
         panel.set_xticks(sizes, [str(n) for n in sizes])
         panel.minorticks_off()
-    axes[0, 0].set_ylabel("mean squared error")
+    axes[0, 0].set_ylabel("mean squared error (log; lower is better)")
     tick_errors(axes[0, 0].yaxis, *axes[0, 0].get_ylim())
-    return legend_below(figure, meaning="line: median over seeds; dot: a seed; lower is better", columns=3)
+    return legend_below(figure, meaning="line: median over seeds; dot: a seed", columns=3)

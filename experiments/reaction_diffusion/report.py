@@ -38,7 +38,7 @@ WAYS = (
     (HYBRID, SOURCE_ONLY), (HYBRID, LEAST_SQUARES), (HYBRID, AUTO), (HYBRID, FINE_TUNED), (HYBRID, TARGET_ONLY),
     (NO_PHYSICS, SOURCE_ONLY), (NO_PHYSICS, FINE_TUNED), (NO_PHYSICS, TARGET_ONLY),
 )  # fmt: skip
-WORDS = {LEAST_SQUARES: "least squares on a, b"}
+WORDS = {LEAST_SQUARES: "least squares on a, b", AUTO: "hj.adapt"}
 SHIFT_WORDS = {"parameter_shift": "a × 2, b ÷ 2, k × 2", "new_term": "a new term, −0.5 u v"}
 
 

@@ -34,6 +34,7 @@ LABELS = names.LABELS | {
     names.PHYSICS_ONLY: "its physics, no network",
     names.LINEAR_RESIDUAL: "rigid body + linear residual",
 }
+TINTS = {LEARNED: METHODS["fine-tuned"], ADAPTED: METHODS["adapted"]}
 Cell = tuple[str, int]  # model, n_train
 HEAD = """\
 Flights held out are predicted open loop with the recorded motors, by models that the calls of `hybrid-jax fit` and
@@ -72,28 +73,28 @@ def report(record: Mapping[str, Any]) -> Report:
     tables += [by_flight_table(found, best, max(config["horizon"])), parameter_table(found)]
     head = f"{HEAD}\n\nFlights: {record['flown']}, in {len(record['folds'])} folds."
     tables = [table for table in tables if table.lines]
-    return Report(record, draw(rows), tables, conclusion(found, best, config["dt"]), claims, head)
+    return Report(record, draw(rows, config["dt"]), tables, conclusion(found, best, config["dt"]), claims, head)
 
 
-def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
-    return {"errors": (error_figure(rows), "RMSE on held-out flights; a dot is a flight, or a fold and seed")}
+def draw(rows: Results, dt: float) -> dict[str, tuple[Figure, str]]:
+    return {"errors": (error_figure(rows, dt), "RMSE on held-out flights; a dot is a flight, or a fold and seed")}
 
 
 @mpl.rc_context(STYLE)
-def error_figure(rows: Results) -> Figure:
+def error_figure(rows: Results, dt: float) -> Figure:
     """Draw the RMSE at the end of the longest prediction, a panel per quantity, of models adapted to most windows."""
     horizon, most = max(int(name) for name in rows[0]["scores"] if name.isdigit()), max(rows["n_train"])
     groups = rows.where(n_train=(0, most)).group("model")
     named = {LABELS[model]: own for model, own in groups.items()}
     figure, (panels,) = subplots((PAGE, 0.9 + 0.24 * len(named)), 1, len(UNITS), sharey=True)
     for axes, (quantity, unit) in zip(panels, UNITS.items(), strict=True):
-        tints = [plots.colour(model) if model != ADAPTED else METHODS["adapted"] for model in groups]
+        tints = [TINTS.get(model, plots.colour(model)) for model in groups]
         scores = [own.numbers(f"scores.{horizon}.{quantity}") for own in named.values()]
         dots(axes, [Line(*line) for line in zip(named, scores, tints, strict=True)])
         axes.set(title=quantity.replace("_", " "), xlabel=f"RMSE [{unit}]")
-    more = f", models adapted to {most} windows" * bool(most)
-    title = f"Held-out flights, after {horizon} intervals{more} (bar: median; log scales; lower is better)"
-    figure.suptitle(title)
+    more = f", adapted to {most} windows" * bool(most)
+    about = "dot: a flight; bar: median; log scales; lower is better"
+    figure.suptitle(f"Held-out flights after {horizon * dt:g} s{more} ({about})")
     return figure
 
 

@@ -45,7 +45,7 @@ PADDING = 1.15  # factor of room at either end of an axis of errors
 SMALL = 1e-4  # an axis that begins below it has powers of ten
 LONG_NUMBER = 0.05  # numbers up to this need room on an axis
 HALF_LINE = 0.3  # half the height of a line in a panel: of a mean's bar, and of the band of its seeds
-FLOOR_LABEL = "floor: error that no model here can see"
+FLOOR = "no model can do better"  # the label of the attainable error
 
 
 class Line(NamedTuple):
@@ -84,7 +84,7 @@ def legend_below(
     for axes in figure.axes:
         shown |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if title:
-        figure.suptitle(title)
+        figure.suptitle(typeset(title))
     figure.legend(shown.values(), map(typeset, shown), loc="outside lower center", ncols=columns, title=meaning or None)
     return figure
 
@@ -93,15 +93,15 @@ def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.
     """Draw the lines, the first on top, and the attainable error (`floor`), if it is not 0."""
     limits = _limits([line.errors for line in lines], floor)
     axes.set(xscale="log", xlim=limits, title=title)
-    axes.set_xlabel("test error $L^T_{MSE}$  (state in SI units, squared; log scale; lower is better)")
+    axes.set_xlabel("mean squared error, state in SI units (log scale; lower is better)")
     name_lines(axes, [line.name for line in lines])
-    tick_errors(axes.xaxis, *limits)
+    tick_errors(axes.xaxis, *limits, room=2.2)
     for y, line in enumerate(lines):
         mean = _draw_line(axes, y, line.errors, line.colour, limits)
         if line.marked and limits[0] < mean < limits[1]:
             axes.axvline(mean, color=line.colour, linestyle=":", linewidth=1, label=line.marked)
     if limits[0] < floor < limits[1]:
-        axes.axvline(floor, color="0.4", linestyle="-.", label=FLOOR_LABEL)
+        axes.axvline(floor, color="0.4", linestyle="-.", label=FLOOR)
 
 
 def error_legend(figure: Figure, title: str, failed: bool) -> Figure:
@@ -136,7 +136,7 @@ def name_lines(axes: Axes, names: Sequence[str]) -> None:
 
 def typeset(text: str) -> str:
     """Write the symbols of a label as mathematics."""
-    return re.sub(r"[θf]_[pd]", lambda found: f"${found[0].replace('θ', chr(92) + 'theta')}$", text)
+    return re.sub(r"[θfp]_[pdxy]", lambda found: f"${found[0].replace('θ', chr(92) + 'theta')}$", text)
 
 
 def note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[float, float], **style: Any) -> None:

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.claims import Claim, Part, Undecided, all_of
 from experiments.reporting.names import label
-from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, subplots
+from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, subplots, tick_errors
 from experiments.reporting.results import Results
 from experiments.reporting.tables import EMPTY, Table, tabulate
 from experiments.worlds.measures import EXPECTED as HORIZONS
@@ -110,7 +110,8 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
             ratio = own.numbers("ratio")
             y = np.full(len(ratio), names.index(tuple(case)))
             axes.plot(ratio, y, "o", ms=4, alpha=0.7, color=METHODS["adapted"], label="adapted, each flight")
-        axes.set(xscale="log", title=label(str(world)), xlabel="error / error of the source")
+        axes.set(xscale="log", title=label(str(world)), xlabel="error over the source's (log scale)")
+        tick_errors(axes.xaxis, *axes.get_xlim())
     name_lines(panels[0], [label(*case) for case in names])
     caption = "Error of the adapted model over the source's, by the change and the flight that it adapted to"
     title = "Is an adapted model ever worse than its source? (lower is better)"
