@@ -49,8 +49,9 @@ axes = plt.figure(figsize=(4.2, 3.2), layout="constrained").add_subplot(
 axes.plot(*noisy.T, ".", ms=1, color="0.6", label="samples")
 axes.plot(
     *hj.rollout(fitted.field, start, u[:500], 0.01).T,
-    color="#CC79A7",
+    color="#0072B2",
     label="fitted model, 5 s",
 )
+axes.set(xlabel="x", ylabel="y", zlabel="z")
 axes.legend(fontsize=7, frameon=False)
 plt.savefig("lorenz.png", dpi=100)
