@@ -134,7 +134,7 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
     means = np.concatenate([curve.mean for curve in curves.values()])
     means = means[means > 1 / DRAWABLE]
     lowest, drawn = min(means, default=1.0), floor > 1 / DRAWABLE
-    axes.set(yscale="log", ylabel="mean squared error over 1 s, SI units (log; lower is better)")
+    axes.set(yscale="log", ylabel="mean squared error over 1 s, SI units\n(log scale; lower is better)")
     trained = {key: curve for key, curve in curves.items() if key[1] != SOURCE_ONLY}
     bottom = min(lowest, floor) / 2 if drawn else lowest / 2
     _draw(axes, trained, bottom, min(2 * max(means, default=1.0), lowest * 10.0**DECADES))

@@ -74,6 +74,6 @@ def scores(rows: Results) -> Figure:
         panel.set(xscale="log", yscale="log", title=SHIFT_WORDS[shift], xlabel="target trajectories N")
         panel.set_xticks(sizes, [str(n) for n in sizes])
         panel.minorticks_off()
-    axes[0, 0].set_ylabel("mean squared error (log; lower is better)")
+    axes[0, 0].set_ylabel("mean squared error\n(log scale; lower is better)")
     tick_errors(axes[0, 0].yaxis, *axes[0, 0].get_ylim())
     return legend_below(figure, meaning="line: median over seeds; dot: a seed", columns=3)

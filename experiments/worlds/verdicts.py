@@ -111,7 +111,7 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
             y = np.full(len(ratio), names.index(tuple(case)))
             axes.plot(ratio, y, "o", ms=4, alpha=0.7, color=METHODS["adapted"], label="adapted, each flight")
         axes.set(xscale="log", title=label(str(world)), xlabel="error over the source's (log scale)")
-        tick_errors(axes.xaxis, *axes.get_xlim())
+        tick_errors(axes.xaxis, *axes.get_xlim(), room=2.2)
     name_lines(panels[0], [label(*case) for case in names])
     caption = "Error of the adapted model over the source's, by the change and the flight that it adapted to"
     title = "Is an adapted model ever worse than its source? (lower is better)"
