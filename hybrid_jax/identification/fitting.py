@@ -106,7 +106,7 @@ def identify(
         search, windows, root = _search(field, recordings, layout, measured, CANDIDATES * layout.most)
         moves, measurable = _moving(field, free, recordings)
         if (n := min(len(windows.centres), layout.most)) <= moves.sum():
-            raise ValueError(f"{recordings[0].name}: {n} windows are too few for {moves.sum()} parameters; record more")
+            raise ValueError(f"{recordings[0].name}: {n} windows for {moves.sum()} parameters are too few; record more")
         theta, own, p = jnp.asarray(search.theta), search.still, len(search.theta)
         if len(own) > layout.most:
             kept = _telling(search.equations(theta, own), p, layout.most, moves & measurable)

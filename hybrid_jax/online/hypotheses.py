@@ -39,7 +39,7 @@ class Hypothesis:
 
     def __post_init__(self):
         if not self.parameters and not self.together:
-            raise ValueError(f"hypothesis {self.name} must have at least one parameter")
+            raise ValueError(f"hypothesis {self.name}: parameters must contain at least one")
         for name, size in (*self.parameters.items(), *self.rates.items()):
             checks.positive(f"hypothesis {self.name}: {name}", size)
         if unknown := sorted(self.rates.keys() - self.parameters.keys()):
