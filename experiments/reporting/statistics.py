@@ -79,6 +79,28 @@ def mean_interval(values: Values, seeds: Labels, draws: Labels | None = None) ->
     return Estimate(mean, mean - half, mean + half)
 
 
+def share_interval(holds: Sequence[bool] | np.ndarray, seeds: Labels) -> Estimate:
+    """The share of runs in which something holds, with a confidence interval that is clustered by seed.
+
+    It is the exact interval (Clopper and Pearson 1934) of so many independent runs that the share would be known as
+    well (Korn and Graubard, "Confidence intervals for proportions with small expected number of positive counts
+    estimated from survey data", Survey Methodology 1998). Where all hold, or none, one run for each seed counts, since
+    nothing shows how alike its runs are; one seed bounds nothing.
+    """
+    array, of = np.asarray(holds, float), np.unique(seeds, return_inverse=True)[1].ravel()
+    n, clusters, share = len(array), len(set(of)), float(np.mean(array))
+    if clusters < 2:
+        return Estimate(share)
+    sums = np.bincount(of, array - share)
+    variance = sums @ sums * clusters / (clusters - 1) / n**2
+    fewer = np.square(np.divide(*scipy.special.stdtrit([n - 1, clusters - 1], (1 + LEVEL) / 2)))
+    count = float(clusters if share in (0, 1) else fewer * min(n, share * (1 - share) / variance if variance else n))
+    held, tail = share * count, (1 - LEVEL) / 2
+    low = scipy.special.betaincinv(held, count - held + 1, tail) if held else 0.0
+    high = scipy.special.betaincinv(held + 1, count - held, 1 - tail) if held < count else 1.0
+    return Estimate(share, float(low), float(high))
+
+
 def ratio_of_stds(first: Values, second: Values) -> Estimate:
     """The ratio of paired standard deviations, with the interval of Pitman and Morgan's test (1939)."""
     above, below = spread(first).std, spread(second).std

@@ -9,7 +9,7 @@ from reports import ERRORS, changed, make_rows, row
 
 from experiments.paper.lanes import BASELINES, DOMAINS, TAGS, by_domain, cells, gain, with_rho
 from experiments.reporting.results import Results
-from experiments.reporting.statistics import Estimate, mean_interval, ratio_of_stds, share_of_gap
+from experiments.reporting.statistics import Estimate, mean_interval, ratio_of_stds, share_interval, share_of_gap
 
 
 def test_rho_is_eq_9_of_the_seeds_own_source_only_error():
@@ -107,6 +107,29 @@ def test_coverage_of_mean_interval(draws, by_seed, by_draw):
     held = np.mean([interval.low <= 0.4 <= interval.high for interval in found])
     # The larger of the variances and the fewer clusters count: never too narrow by much, but too wide for one way.
     assert 0.93 <= held <= (1.0 if draws > 1 else 0.965)
+
+
+@pytest.mark.parametrize(("share", "alike"), [(0.95, 0.0), (0.95, 0.2), (0.8, 0.2)])
+def test_coverage_of_share_interval(share, alike):
+    """Runs of a seed hold with a probability of its own, of which `alike` is the correlation between them.
+
+    It is exact for neither: independent runs lose by the seeds' few degrees of freedom, alike ones by their skewness.
+    """
+    rng, seeds = np.random.default_rng(4), np.repeat(np.arange(16), 12)
+    if alike:
+        own = rng.beta(share * (1 / alike - 1), (1 - share) * (1 / alike - 1), (REPEATS, 16))
+    else:
+        own = np.full((REPEATS, 16), share)
+    found = [share_interval(rng.random(192) < each[seeds], seeds) for each in own]
+    assert 0.92 <= np.mean([one.low <= share <= one.high for one in found]) <= 0.99
+    deviation = np.sqrt(share * (1 - share) * (1 + 11 * alike) / 192)
+    assert np.mean([one.high - one.low for one in found]) < 5 * deviation
+
+
+def test_share_interval_of_few_seeds():
+    alone, same = share_interval([True, False], [0, 0]), share_interval([True] * 6, [0, 0, 1, 1, 2, 2])
+    assert (alone.value, alone.above(0)) == (0.5, None)
+    assert (same.low, same.high) == (pytest.approx(0.025 ** (1 / 3)), 1.0)
 
 
 def test_mean_interval_of_one_draw_is_the_paired_t_test():
