@@ -113,28 +113,37 @@ def weights_of(field: AbstractVectorField) -> tuple[Float[Array, " w"], Callable
     return ravel_learned(field.residual)
 
 
-def network_effect(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> Float[Array, ""]:
-    fields = field, without_network(field)
+def network_effect(
+    field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, starts: Starts | None = None
+) -> Float[Array, " d"]:
+    """Return the squared difference of predictions with and without the network, over windows, of each state."""
+    fields, (smooth, weigh) = (field, without_network(field)), from_starts(windows, starts)
 
-    def effect(part: Trajectories):
-        errors = [jax.vmap(lambda w, f=f: prediction_errors(f, w, solver, scale))(part) for f in fields]
-        return errors[0] - errors[1]
+    def errors(part: Trajectories):
+        return tuple(jax.vmap(lambda w, f=f: prediction_errors(f, w, solver, scale))(part) for f in fields)
 
-    return jnp.sum(jnp.square(in_chunks(effect, windows, CHUNK)))
+    there, without = map(weigh, in_chunks(errors, smooth, CHUNK))
+    return jnp.sum(jnp.square(there - without), axis=(0, 1))
 
 
-def taken_by_network(effect: Float[Array, ""], equations: NormalEquations) -> Float[Array, " p"]:
+def taken_by_network(
+    effect: Float[Array, " d"], equations: NormalEquations, of_states: Float[Array, "d p p"]
+) -> Float[Array, " p"]:
     """Compute the variance of each parameter from an effect that physics lacks, of the size of the network's.
 
-    An effect b in place of the network's moves a fit by H⁻¹ Jᵀ b, H = JᵀJ: parameter j by at most ‖b‖ (H⁻¹)_jj^½, by
-    the inequality of Cauchy and Schwarz. Within these bounds any bias is as probable as another, so that the variance
-    is a third of their square (ISO/IEC Guide 98-3, GUM, Sec. 4.3.7).
+    An effect b in place of the network's moves a fit by H⁻¹ Jᵀ b, H = JᵀJ: parameter j by at most
+    Σ_s ‖b_s‖ (H⁻¹ J_sᵀ J_s H⁻¹)_jj^½ over states s, by the inequality of Cauchy and Schwarz. Within these bounds any
+    bias is as probable as another, so that the variance is a third of their square (ISO/IEC Guide 98-3, GUM, Sec.
+    4.3.7).
 
     Args:
-        effect: ‖b‖², the squared difference of predictions with and without the network, summed over the windows.
+        effect: ‖b_s‖², see `network_effect`.
         equations: of the same windows and the fitted parameters.
+        of_states: J_sᵀ J_s, of these and others.
     """
-    return effect / 3 * jnp.diagonal(inverse(jnp.sum(equations.gram, axis=0)).matrix)
+    found = inverse(jnp.sum(equations.gram, axis=0)).matrix
+    moved = jnp.sqrt(jnp.maximum(jnp.einsum("pq,sqr,rp->sp", found, of_states, found), 0.0))
+    return jnp.square(jnp.sqrt(effect) @ moved) / 3
 
 
 def without_network(field: AbstractVectorField) -> AbstractVectorField:

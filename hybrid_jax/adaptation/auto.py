@@ -89,7 +89,7 @@ class Choice(NamedTuple):
         inherited: covariance at the chosen parameters from errors of those that the source keeps (p, p).
         degrees: degrees of freedom of `inherited`.
         absorbed: variance from what the network may have taken from each parameter, see `taken_by_network` (p,).
-        vague: parameters of which that is a large part of the plausible change (p,).
+        vague: of a rigid body, parameters of which that is a large part of the plausible change (p,).
     """
 
     names: tuple[str, ...]
@@ -199,7 +199,7 @@ def _judge(
     free, nothing = np.stack([*free_parameters(larger).values()]), Unchanged(jnp.zeros_like(start), jnp.zeros(()))
     if source is not None:
         # Also if physics replaced the source: the effect is the difference of two models of it.
-        added = network_effect(field, train, solver, scale) if has_network(field) else 0.0
+        added = jnp.sum(network_effect(field, train, solver, scale)) if has_network(field) else 0.0
         nothing = unchanged(source.own, around, added, larger, learned_from, train)
     found = posterior(around, every, start, free, sizes, nothing.apparent)
     return found, nothing, jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
@@ -246,9 +246,11 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
     choice = Choice(*first, inherited, jnp.asarray(degrees), jnp.zeros_like(start), jnp.zeros(len(start), bool))
     adapted = candidate(extended(field, train.x0.shape[1]), choice, taken)
     if has_network(larger):
-        absorbed = taken_by_network(network_effect(adapted, train, solver, scale), equations)
-        size = jnp.where(jnp.isfinite(sizes), sizes, jnp.abs(found.theta))
-        choice = choice._replace(absorbed=absorbed, vague=jnp.sqrt(absorbed) > VAGUE * size)
+        effect = network_effect(adapted, train, solver, scale, starts)
+        absorbed = taken_by_network(effect, equations, found.of_states)
+        # Other systems' sizes are relative to the source's value, and change with the parametrisation.
+        plausible = sizes if "drag" in groups_of(names_of(larger)) else jnp.inf
+        choice = choice._replace(absorbed=absorbed, vague=jnp.sqrt(absorbed) > VAGUE * plausible)
     finite = (found.status == Status.OK) | ~jnp.isinf(ends).any()
     return Solution(adapted, found.steps, jnp.where(finite, found.status, Status.DIVERGED), choice)
 

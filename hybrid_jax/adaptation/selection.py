@@ -41,6 +41,7 @@ class Fit(NamedTuple):
     Attributes:
         theta: the p parameters, in the order of `ravel_parameters`.
         equations: of each window, there.
+        of_states: JᵀJ of the errors of each state, summed over windows.
         noise: variance of one error over scale, from differences of successive errors.
         seen: which parameters change the predictions by more than rounding.
         steps: evaluations of the Jacobian.
@@ -49,6 +50,7 @@ class Fit(NamedTuple):
 
     theta: Float[Array, " p"]
     equations: NormalEquations
+    of_states: Float[Array, "d p p"]
     noise: Float[Array, ""]
     seen: Bool[Array, " p"]
     steps: Int[Array, ""]
@@ -89,7 +91,8 @@ def fit_each(
         equations = jax.vmap(equations_of)(jacobian, r)
         seen = has_effect(equations, windows, scale)
         theta = ravel_parameters(found.field)[0]
-        fit = Fit(theta, masked(equations, seen), noise, seen, found.steps, found.status)
+        of_states = jnp.einsum("nsdp,nsdq->dpq", jacobian, jacobian)
+        fit = Fit(theta, masked(equations, seen), of_states, noise, seen, found.steps, found.status)
         return (jacobian, r, ~jnp.any(free)), fit  # where nothing is fitted, these are of the start
 
     shape = jax.eval_shape(weigh, smooth.x)

@@ -13,11 +13,12 @@ from pushes import Push, pushes
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation import FineTune, adapt
-from hybrid_jax.adaptation.anchored import fit_anchored, with_change
+from hybrid_jax.adaptation.anchored import fit_anchored, taken_by_network, with_change
 from hybrid_jax.adaptation.auto import CANDIDATES, extended, free_parameters
 from hybrid_jax.adaptation.selection import STRONG, alike, blocks_of, correlated, fit_each, posterior
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.normalisation import ChannelScaling
@@ -192,14 +193,33 @@ def learned(damping, share):
     return adapt(source, flown(after), learned_from=flown(before, seed=1))
 
 
-@pytest.mark.parametrize(("share", "widest"), [(0.0, 0.005), (1.5, 0.3), (5.0, np.nan)])
-def test_an_interval_is_as_wide_as_the_network_s_possible_share_and_without_limit_there_is_none(share, widest):
+@pytest.mark.parametrize(("share", "widest"), [(0.0, 0.005), (1.5, 0.3), (5.0, 1.5)])
+def test_an_interval_is_as_wide_as_the_network_s_possible_share(share, widest):
     found = learned(0.001, share)
     one = found.parameters["log_length"]
     assert found.changed == ("log_length",)
-    assert (one.effective is None) == one.has_interval == (share < 5)
-    assert one.effective or one.low < np.log(LENGTH) < one.high < one.low + widest
-    assert ("Effective, so without an interval: log_length" in found.report()) == (share == 5)
+    assert one.low < np.log(LENGTH) < one.high
+    assert share / 10 < one.high - one.low < widest
+
+
+def test_an_effect_on_one_state_says_nothing_of_a_parameter_that_another_determines():
+    """The bound is attained by the worst effect, and no other exceeds it; the first state has no part in gain 1."""
+    jacobian = np.random.default_rng(0).normal(size=(30, 5, 2, 2))
+    jacobian[:, :, 0, 1] = 0
+    of_states = np.einsum("ntsp,ntsq->spq", jacobian, jacobian)
+    gram, sizes = of_states.sum(axis=0), np.array([2.0, 0.5])
+    equations = NormalEquations(jnp.asarray(gram)[None], jnp.zeros((1, 2)), jnp.zeros(1))
+    moves = np.einsum("pq,ntsq->spnt", np.linalg.inv(gram), jacobian).reshape(2, 2, -1)  # by each error
+    worst = moves / np.linalg.norm(moves, axis=-1, keepdims=True)
+    most = np.einsum("s,spe,spe->p", sizes, worst, moves)
+    found = taken_by_network(jnp.square(sizes), equations, jnp.asarray(of_states))
+    np.testing.assert_allclose(np.sqrt(3 * np.asarray(found)), most, rtol=1e-4)
+    alone = taken_by_network(
+        jnp.array([4.0, 0.0]),
+        equations._replace(gram=jnp.diag(jnp.diag(equations.gram[0]))[None]),
+        jnp.asarray(of_states),
+    )
+    assert alone[1] == 0 < alone[0]
 
 
 def test_results_of_auto_are_pooled_with_what_the_networks_express():
