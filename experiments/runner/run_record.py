@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -11,9 +12,10 @@ from typing import Any
 from experiments.reporting.results import Results, leaves
 from experiments.runner.options import Run
 from hybrid_jax import kernels
+from hybrid_jax.checks import content_of, first_line
 from hybrid_jax.cli.command import ChecksFailed, Explained
 from hybrid_jax.io.datasets import versions
-from hybrid_jax.io.files import json_text, json_value, read_json, write_atomic
+from hybrid_jax.io.files import json_text, json_value, write_atomic
 from hybrid_jax.runtime import cores, hardware
 
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax")
@@ -57,9 +59,7 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
     if config.fresh:
         _move_aside(folder, say)
     known = path.exists()
-    found: Any = read_json(path) if known else {"state": None}
-    if known and not (isinstance(found, dict) and {"state", "started", *FIXED, *MACHINE} <= found.keys()):
-        raise ValueError(f"{path}: not the record of a run; --restart starts anew and moves it aside")
+    found: dict[str, Any] = record_in(path) if known else {"state": None}
     if found["state"] == "unfinished":
         begun = f"{folder}: holds an unfinished run, begun {found['started']}"
         if (kernels_then := found["machine"]["kernels"]) != "used":  # nor are they now, whatever the reason
@@ -82,6 +82,17 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
             path.unlink()
         raise
     write_atomic(path, json_text(record | {"state": "finished"}))
+
+
+def record_in(path: Path) -> dict[str, Any]:
+    """Return a run's record; ValueError of one line for any other file."""
+    try:
+        found = json.loads(content_of(path))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: truncated or not JSON: {first_line(error)}") from error
+    if not (isinstance(found, dict) and {"state", "started", *FIXED, *MACHINE} <= found.keys()):
+        raise ValueError(f"{path}: not the record of a run; --restart starts anew and moves it aside")
+    return found
 
 
 def describe(config: Run) -> dict[str, Any]:

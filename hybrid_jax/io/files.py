@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from hybrid_jax.checks import content_of, first_line
+from hybrid_jax.checks import first_line
 
 HEADER = "header.json"
 NUMERIC = {np.dtype(kind) for kind in "?bhilqBHILQefdFD"}
@@ -69,20 +69,6 @@ def json_value(value: Any) -> Any:
         case Sequence() if not isinstance(value, bytes):
             return [json_value(item) for item in value]
     raise ValueError(f"{value!r} of type {type(value).__name__} has no JSON form")
-
-
-def read_json(path: str | Path) -> Any:
-    """Read a JSON file; one-line ValueError if it cannot be read or is not JSON (NaN and Infinity are not)."""
-
-    def refuse(constant: str) -> None:
-        raise ValueError(f"{constant} is not JSON")
-
-    try:
-        return json.loads(content_of(path), parse_constant=refuse)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: truncated or not JSON: {first_line(error)}") from error
 
 
 def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> None:

@@ -14,6 +14,7 @@ from writers import bag, blackbox, crazyflie, escs, failures, ulog
 
 import hybrid_jax as hj
 from experiments.real_flight.simulated import vehicle_toml
+from experiments.runner.run_record import record_in
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.export import Program, export_program, load_program
 from hybrid_jax.flights.checks.consistency import check_log
@@ -22,7 +23,7 @@ from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import COLUMNS
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
-from hybrid_jax.io.files import json_text, named_leaves, read_json, save_archive, write_atomic
+from hybrid_jax.io.files import json_text, named_leaves, save_archive, write_atomic
 from hybrid_jax.io.models import FORMAT as MODEL
 from hybrid_jax.vehicle import IRIS
 
@@ -32,7 +33,7 @@ LOADERS = {
     "set.npz": load_dataset,
     "program.npz": load_program,
     "vehicle.toml": load_vehicle_model,
-    "report.json": read_json,
+    "run.json": record_in,
 }
 LIBRARY = {"flight.ulg": "pyulog", "flight.bbl": "orangebox", "flight.bag": "rosbags"}
 SECONDS, MEMORY = 10.0, 1 << 20  # of one file, s; kB
@@ -56,7 +57,8 @@ def wholes(flight, topics, tmp_path_factory):
     export_program(folder / "program.npz", model, state_size=13, input_size=4)
     windows = hj.Trajectories(few.x[:1], few.u[None, :5], few.x[None, 1:6], 0.01)
     save_dataset(folder / "set.npz", Dataset({"train": windows}, {"config": {"vehicle": "iris"}}))
-    write_atomic(folder / "report.json", json_text({"rows": [{"test_mse": 0.5, "seed": i} for i in range(9)]}))
+    parts = {"config": {"seeds": 3}, "versions": {}, "flights": {}, "machine": {"cores": 2}}
+    write_atomic(folder / "run.json", json_text(parts | {"state": "unfinished", "started": "2026-11-28"}))
     write_atomic(folder / "vehicle.toml", vehicle_toml(IRIS))
     return made | {name: (folder / name).read_bytes() for name in LOADERS}
 

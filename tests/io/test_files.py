@@ -17,12 +17,13 @@ from pendulum import pendulum, swings
 from surface import refusal
 
 import hybrid_jax as hj
+from experiments.runner.run_record import record_in
 from hybrid_jax import IRIS, Hybrid, load, residual_network, rollout_batch, save
 from hybrid_jax.dynamics.rigid_body import perturbed
 from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.io import models
 from hybrid_jax.io.datasets import Dataset, content_hash, load_dataset, save_dataset
-from hybrid_jax.io.files import read_json, save_archive, to_numpy, write_atomic
+from hybrid_jax.io.files import save_archive, to_numpy, write_atomic
 from hybrid_jax.io.structure import Structure
 from hybrid_jax.networks.mlp import InputScaling
 
@@ -80,7 +81,7 @@ def test_a_vehicle_in_a_file_is_checked(tmp_path):
     assert "mass must be a positive" in refused(tmp_path / "model.npz")
 
 
-@pytest.mark.parametrize("load", [hj.load, load_dataset, hj.load_vehicle, load_column_map, read_json])
+@pytest.mark.parametrize("load", [hj.load, load_dataset, hj.load_vehicle, load_column_map, record_in])
 def test_what_is_no_regular_file_is_refused_and_not_waited_for(load, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
