@@ -10,7 +10,7 @@ def main() -> None:
     """Print each program's command and purpose."""
     folder = Path(__file__).parent
     for path in sorted(folder.rglob("*.py")):
-        source, name = path.read_text(), ".".join(path.relative_to(folder).with_suffix("").parts)
+        source, name = path.read_text("utf-8"), ".".join(path.relative_to(folder).with_suffix("").parts)
         if RUN not in source or name == "__main__":
             continue
         said = ast.get_docstring(ast.parse(source)) or ""

@@ -23,7 +23,7 @@ def main() -> None:
         sys.exit((__doc__ or "").partition(": ")[2])
     flights, logs, out = (Path(each).resolve() for each in sys.argv[1:4])
     values = {"flights": flights, "maps": Path(__file__).parent / "identification", "learn": LEARN}
-    sets = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
+    sets = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
     print(HEADER)
     for name in sys.argv[4:] or sets:
         for folder in sets[name].keys() - {"typed"}:
@@ -46,7 +46,7 @@ def ran(folder: Path, given: list[str]) -> dict[str, Any]:
     done = subprocess.run(run, cwd=folder, capture_output=True, text=True)
     if done.returncode not in (0, 4):
         return {"answer": (done.stderr.strip().splitlines() or [""])[-1]}
-    return json.loads((folder / "runs" / given[0] / "report.json").read_text())
+    return json.loads((folder / "runs" / given[0] / "report.json").read_text("utf-8"))
 
 
 def shown(errors: list[list[float]]) -> str:

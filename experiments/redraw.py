@@ -39,7 +39,7 @@ REPORTS: Mapping[str, Callable[[Mapping[str, Any]], Report]] = {
 
 
 def report_of(folder: Path) -> Report:
-    record = json.loads((folder / JSON_NAME).read_text())
+    record = json.loads((folder / JSON_NAME).read_text("utf-8"))
     return REPORTS[record["experiment"]](record)
 
 
@@ -55,7 +55,7 @@ def main() -> None:
         report, folder = report_of(path.parent), path.parent
         save_figures(folder, report.figures)
         for name, text in written(folder, report).items():
-            (folder / name).write_text(text)
+            (folder / name).write_text(text, "utf-8")
         print(folder)
 
 

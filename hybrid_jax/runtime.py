@@ -61,15 +61,16 @@ def configure(folder: Path | None = None) -> None:
     Raises:
         ValueError: if the folder cannot be written or, by default, if others can write it.
     """
-    programs = Path(os.environ.get(PROGRAMS) or folder or _cache() / "programs")
+    given = os.environ.get(PROGRAMS) or folder
     try:
-        if programs == _cache() / "programs":
-            _delete_stale(private_folder("programs"))
+        programs = Path(given) if given else private_folder("programs")
         programs.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=programs):
-            pass
+        tempfile.TemporaryFile(dir=programs).close()
+        if not given:
+            _delete_stale(programs)
     except OSError as error:
-        raise ValueError(f"{programs}: cannot be used: {error.strerror}; {PROGRAMS} can name another") from error
+        where = given or platformdirs.user_cache_dir("hybrid_jax")
+        raise ValueError(f"{where}: cannot be used: {error.strerror}; {PROGRAMS} can name another folder") from error
     if EXTRA not in (flags := os.environ.get(FLAGS, "")):
         os.environ[FLAGS] = f"{flags} {WHOLE_LOOPS}".strip()
     try:
@@ -90,13 +91,9 @@ def configure(folder: Path | None = None) -> None:
     load_lapack()
 
 
-def _cache() -> Path:
-    return Path(platformdirs.user_cache_dir("hybrid_jax"))
-
-
 def private_folder(name: str) -> Path:
     """Make a folder for code in the user's cache folder; PermissionError if others own it or can write it."""
-    folder = _cache() / name
+    folder = Path(platformdirs.user_cache_dir("hybrid_jax")) / name
     for each in (folder.parent, folder):
         each.mkdir(0o700, parents=True, exist_ok=True)
         about = each.stat()

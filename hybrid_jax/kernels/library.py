@@ -98,9 +98,9 @@ def _compiler() -> str | None:
 def _digest(source: str) -> str:
     """Identify a source, the compiler and the machine."""
     compiler = Path(_compiler() or "").resolve()
-    parts = [source, *(path.read_text() for path in sorted(SOURCES.iterdir()))]
+    parts = [source.encode(), *(path.read_bytes() for path in sorted(SOURCES.iterdir()))]
     made_by = compiler, compiler.stat().st_mtime_ns, OPTIONS, jax.__version__, runtime.machine()[-2:]
-    return hashlib.sha256("".join([*parts, repr(made_by)]).encode()).hexdigest()[:16]
+    return hashlib.sha256(b"".join([*parts, repr(made_by).encode()])).hexdigest()[:16]
 
 
 def _checked_library(source: str) -> Path:
@@ -140,7 +140,7 @@ def _run_compiler(arguments: list[str]) -> None:
     inside, held = os.pipe()  # closed by the system when this process ends, also by SIGKILL
     try:
         watched, alone = ["sh", "-c", WATCHED, folder, *command], os.environ | {"TMPDIR": str(folder)}
-        options = {"capture_output": True, "text": True, "timeout": LONGEST, "start_new_session": True}
+        options = {"capture_output": True, "errors": "replace", "timeout": LONGEST, "start_new_session": True}
         subprocess.run(watched, check=True, stdin=inside, env=alone, **options)
     except subprocess.SubprocessError as error:
         said = [line for line in (getattr(error, "stderr", None) or "").splitlines() if "error" in line]
