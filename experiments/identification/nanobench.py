@@ -30,8 +30,7 @@ from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording
-from hybrid_jax.flights.scores import errors_between
-from hybrid_jax.flights.windows import cut_windows
+from hybrid_jax.flights.windows import cut_windows, errors_between
 from hybrid_jax.identification.fitting import identify
 from hybrid_jax.identification.log_checks import inputs_of
 from hybrid_jax.identification.recordings import Layout

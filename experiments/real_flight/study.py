@@ -14,9 +14,8 @@ from experiments.runner.cache import identity_of
 from experiments.runner.stages import Found, Stages, rows_of
 from hybrid_jax.adaptation import Adaptation, adapt
 from hybrid_jax.cli.logs import Flights
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.dynamics.base import AbstractVectorField, HoldState
+from hybrid_jax.dynamics.rigid_body import FrozenRates, rigid_body
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.checks.cleaning import lag_motors
 from hybrid_jax.flights.log import FlightLog, segments

@@ -103,6 +103,15 @@ class AbstractVectorField(eqx.Module):
         return {name: unit for units in inside for name, unit in units.items()}
 
 
+class HoldState(AbstractVectorField):
+    """A baseline with ẋ = 0: the state does not change."""
+
+    accepts_batch: ClassVar[bool] = True
+
+    def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
+        return jnp.zeros_like(x)
+
+
 class AbstractEstimator(eqx.Module):
     """An estimator between sensors and controller that learns while the system runs."""
 

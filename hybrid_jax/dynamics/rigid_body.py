@@ -1,4 +1,4 @@
-"""f_p: the Newton–Euler equations of a multirotor, by default with unknown Ix, Iy and k (paper, Eq. 10)."""
+"""f_p: the Newton–Euler equations of a multirotor, by default with unknown Ix, Iy and k (paper, Eq. 10); baselines."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,6 +14,7 @@ from hybrid_jax import checks, rotation
 from hybrid_jax.dynamics import equations
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import expand_trailing
+from hybrid_jax.dynamics.composition import AbstractWrapper
 from hybrid_jax.dynamics.terms import CORRECTIONS, LOGARITHMIC, Terms, check_names, nominal_values, shape_of, units_of
 from hybrid_jax.rotation import Rows
 from hybrid_jax.state_space import Attitude, Quantity, StateSpace
@@ -221,3 +222,24 @@ def _with_bodies(field: AbstractVectorField, change: Callable[[RigidBody], Rigid
 def nominal(vehicle: Vehicle) -> dict[str, float]:
     """The vehicle's own Ix, Iy [kg m²] and k [N/(rad/s)²]."""
     return {"Ix": vehicle.inertia[0], "Iy": vehicle.inertia[1], "k": vehicle.thrust_coefficient}
+
+
+class Kinematics(AbstractVectorField):
+    """ṗ = v and q̇ = ½ q ⊗ [0, ω] with v̇ = ω̇ = 0: exact kinematics without knowledge of forces."""
+
+    accepts_batch: ClassVar[bool] = True
+
+    @property
+    def state_space(self):
+        return RIGID_BODY_SPACE
+
+    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
+        accelerations = jnp.zeros((6, *x.shape[1:]), x.dtype)
+        return jnp.concatenate([x[VELOCITY], rotation.derivative(x[QUATERNION], x[BODY_RATES]), accelerations])
+
+
+class FrozenRates(AbstractWrapper):
+    """A baseline with ω̇ = 0: thrust accelerates the vehicle, and its body rates stay constant."""
+
+    def write(self, x, inside):
+        return inside.at[BODY_RATES].set(0.0)

@@ -15,8 +15,7 @@ from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import find_logs, load_log, load_logs, read_recording
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
-from hybrid_jax.flights.scores import FlightErrors, flight_errors
-from hybrid_jax.flights.windows import cut_windows, folds, hold_out, load_windows
+from hybrid_jax.flights.windows import FlightErrors, cut_windows, flight_errors, folds, hold_out, load_windows
 
 __all__ = ["Check", "Cleaning", "FlightErrors", "FlightLog", "Recording", "Signal"]
 __all__ += ["check_log", "check_recording", "clean", "cut_windows", "find_logs", "flight_errors", "folds", "hold_out"]

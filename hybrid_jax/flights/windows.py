@@ -1,21 +1,31 @@
-"""Split recorded logs by flight or manoeuvre and cut them into windows, which overlap and share wind and load."""
+"""Split logs by flight, cut them into windows, which overlap and share wind and load, and score predictions of them."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from hybrid_jax import checks
+from hybrid_jax import checks, rotation
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.flights.checks.cleaning import Cleaning, lag_motors
 from hybrid_jax.flights.checks.consistency import check_log
 from hybrid_jax.flights.load import Failed, load_logs, report
 from hybrid_jax.flights.log import FlightLog, even_segments, segments
-from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.runtime import entry
+from hybrid_jax.trajectories import Trajectories, check, concatenate, windows_of
+from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, Vehicle
 
+CHUNK = 500  # windows that are predicted at a time
 Split = tuple[list[FlightLog], list[FlightLog]]  # training, held out
+Errors = Float[Array | np.ndarray, "*n"]
 _SUFFIX = re.compile(r"(\.csv|\.csv\.gz|\.ulg|\.mcap|\.db3|\.bag|\.bbl|\.bfl|\.gz)$", re.IGNORECASE)
 _RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORECASE)
 
@@ -184,3 +194,53 @@ def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
             f"{max(longest, default=0)}: bridge gaps or use shorter windows"
         )
     return long
+
+
+class FlightErrors(NamedTuple):
+    """The sizes of the errors of predicted states, each (n, t) for n windows of t intervals.
+
+    Attributes:
+        position: norm of the error [m].
+        velocity: norm of the error [m/s].
+        rotation: angle from the predicted attitude to the true one [rad], 0 … π.
+        body_rates: norm of the error [rad/s].
+    """
+
+    position: Errors
+    velocity: Errors
+    rotation: Errors
+    body_rates: Errors
+
+
+def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"]) -> FlightErrors:
+    turns = jnp.vectorize(rotation.attitude_error, signature="(q),(q)->(v)")
+    parts = [predicted[..., part] - truth[..., part] for part in (POSITION, VELOCITY, BODY_RATES)]
+    parts.insert(2, turns(truth[..., QUATERNION], predicted[..., QUATERNION]))
+    return FlightErrors(*(jnp.linalg.norm(part, axis=-1) for part in parts))
+
+
+@entry
+def flight_errors(field: AbstractVectorField, windows: Trajectories) -> FlightErrors:
+    """Predict each window with a field in inference mode, and return the errors at the end of each interval.
+
+    Args:
+        field: the model.
+        windows: measured states and inputs; the first 13 numbers of a state are as in `hybrid_jax.vehicle`.
+
+    Raises:
+        ValueError: if the windows are malformed, or their states are not a multirotor's.
+    """
+    if check(windows, "windows").x.shape[-1] < STATE_SIZE:
+        raise ValueError(f"windows: states of {STATE_SIZE} expected, as in vehicle.py, got {windows.x.shape[-1]}")
+    RIGID_BODY_SPACE.check("windows: x0", windows.x0)
+    RIGID_BODY_SPACE.check("windows: x", windows.x)
+    # The last part is padded, so that all flights share one program.
+    parts = (np.arange(start, start + CHUNK) % len(windows) for start in range(0, len(windows), CHUNK))
+    found = [jax.device_get(_errors(field, windows[part])) for part in parts]
+    return FlightErrors(*(np.concatenate(arrays)[: len(windows)] for arrays in zip(*found, strict=True)))
+
+
+@eqx.filter_jit
+def _errors(field, windows: Trajectories) -> FlightErrors:
+    predicted = rollout_batch(field, windows.x0, windows.u, windows.dt)
+    return errors_between(*(each[..., :STATE_SIZE] for each in (predicted, jnp.asarray(windows.x))))

@@ -10,8 +10,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.estimation import observe
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.scores import flight_errors
-from hybrid_jax.flights.windows import cut_windows, sequences
+from hybrid_jax.flights.windows import cut_windows, flight_errors, sequences
 
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
 

@@ -9,7 +9,7 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.cli.export import TORQUE, Options, _filter
-from hybrid_jax.dynamics.baselines import Kinematics
+from hybrid_jax.dynamics.rigid_body import Kinematics
 from hybrid_jax.export import export_adaptation_c, load_program
 from hybrid_jax.networks.standardise import with_motion
 

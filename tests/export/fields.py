@@ -12,8 +12,8 @@ from choices import PAIRS
 from jaxtyping import Array, Float
 
 from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid
-from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body
+from hybrid_jax.dynamics.base import HoldState
+from hybrid_jax.dynamics.rigid_body import FrozenRates, RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, Terms
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
 from hybrid_jax.networks.views import multirotor_network

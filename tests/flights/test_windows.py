@@ -13,10 +13,10 @@ from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax import Trajectories, rigid_body, rotation
-from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
+from hybrid_jax.dynamics.base import HoldState
+from hybrid_jax.dynamics.rigid_body import FrozenRates
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.scores import errors_between, flight_errors
-from hybrid_jax.flights.windows import flight_of, folds, hold_out, manoeuvre_of
+from hybrid_jax.flights.windows import errors_between, flight_errors, flight_of, folds, hold_out, manoeuvre_of
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.vehicle import BODY_RATES, IRIS, POSITION, QUATERNION, VELOCITY
 
@@ -173,7 +173,7 @@ def test_exact_physics_has_no_error_and_chunks_do_not_matter(monkeypatch):
         assert error.shape == (7, 4)
         assert (error < 1e-5).all()
     whole = flight_errors(HoldState(), windows)
-    monkeypatch.setattr("hybrid_jax.flights.scores.CHUNK", 3)
+    monkeypatch.setattr("hybrid_jax.flights.windows.CHUNK", 3)
     np.testing.assert_allclose(np.stack(whole), np.stack(flight_errors(HoldState(), windows)), rtol=1e-6)
 
 

@@ -17,7 +17,7 @@ from pendulum import pendulum
 from systems import Dense
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.baselines import Kinematics
+from hybrid_jax.dynamics.rigid_body import Kinematics
 from hybrid_jax.io import structure
 from hybrid_jax.io.files import named_leaves, save_archive
 from hybrid_jax.io.models import FORMAT
