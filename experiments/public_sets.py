@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_jax.identification.prediction_errors import rmse
+from hybrid_jax.identification.learning import rmse
 
 LEARN = "Ix,Iy,Iz,k_rotors,rate_damping,drag,aerodynamic_moment"
 HEADER = "| set | hybrid-jax … | s, wall s | answer | RMSE after 0.1, 0.5 s; of frozen rates |\n|---|---|---|---|---|"

@@ -13,7 +13,7 @@ from experiments.paper.regret import AUTO, of_each_case, over, regret
 from experiments.reporting.names import label
 from experiments.reporting.results import Results
 from experiments.reporting.tables import measured
-from hybrid_jax.identification.prediction_errors import UNITS
+from hybrid_jax.identification.learning import UNITS
 
 DOCS, README = ROOT / "docs", ROOT / "README.md"
 REFERENCE = DOCS / "reference"

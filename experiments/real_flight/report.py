@@ -23,8 +23,7 @@ from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.flights.windows import flight_of
-from hybrid_jax.identification.learning import LEVEL, STEPS
-from hybrid_jax.identification.prediction_errors import UNITS
+from hybrid_jax.identification.learning import LEVEL, STEPS, UNITS
 
 NAME = "real_flight"
 LABELS = names.LABELS | {

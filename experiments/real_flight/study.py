@@ -20,8 +20,7 @@ from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.checks.cleaning import lag_motors
 from hybrid_jax.flights.log import FlightLog, segments
 from hybrid_jax.flights.windows import cut_windows, flight_of, folds, manoeuvre_of
-from hybrid_jax.identification.learning import STEPS, Learned, adapted, learn
-from hybrid_jax.identification.prediction_errors import UNITS, errors_of, rmse
+from hybrid_jax.identification.learning import STEPS, UNITS, Learned, adapted, errors_of, learn, rmse
 
 LEARNED, ADAPTED = "learned", "adapted"
 BASELINES = (names.HOLD, names.THRUST, names.LINEAR_RESIDUAL)

@@ -13,7 +13,7 @@ from hybrid_jax.cli.command import step
 from hybrid_jax.cli.logs import FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.rigid_body import FrozenRates, Kinematics, rigid_body
 from hybrid_jax.flights.windows import flight_of
-from hybrid_jax.identification.prediction_errors import UNITS, errors_of, ratio, rmse, rmse_by_flight
+from hybrid_jax.identification.learning import UNITS, errors_of, ratio, rmse, rmse_by_flight
 from hybrid_jax.io.models import load
 
 __all__ = ["Options", "run"]

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.cli.page import STYLE, Table
-from hybrid_jax.identification.prediction_errors import UNITS
+from hybrid_jax.identification.learning import UNITS
 
 BASELINE = (
     "RMSE is the root mean square of the error of predictions. Frozen rates are a baseline: the thrust of the motors "

@@ -19,8 +19,7 @@ from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.flights.conversion import DT, missing_states
 from hybrid_jax.flights.load import read_recording
-from hybrid_jax.identification.learning import CANDIDATES, FROZEN, PAST, STEPS, Learned, learn, learnable
-from hybrid_jax.identification.prediction_errors import UNITS, ratio
+from hybrid_jax.identification.learning import CANDIDATES, FROZEN, PAST, STEPS, UNITS, Learned, learn, learnable, ratio
 from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save

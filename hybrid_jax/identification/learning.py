@@ -1,4 +1,4 @@
-"""Learn a vehicle from flights, with physics only or with a network, and adapt it to flights after a change."""
+"""Learn a vehicle from flights, with physics only or with a network, adapt it after a change, and score predictions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,17 +17,17 @@ from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.dynamics.rigid_body import LEARNED, FrozenRates
 from hybrid_jax.dynamics.terms import OF_VELOCITY, shape_of
 from hybrid_jax.dynamics.vehicle_file import LAG, LEARN, VehicleModel
-from hybrid_jax.estimation import fit_disturbance
+from hybrid_jax.estimation import fit_disturbance, observe
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.windows import cut_windows, sequences
-from hybrid_jax.identification.prediction_errors import rmse_by_flight
+from hybrid_jax.flights.windows import cut_windows, flight_errors, sequences
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.training import Settings, fit, rates_by_group
 from hybrid_jax.training.channels import scaled_loss
-from hybrid_jax.trajectories import Trajectories, split
+from hybrid_jax.trajectories import Trajectories, concatenate, split, windows_of
 
+UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}  # of prediction errors
 STEPS = 10  # intervals of a window
 LEVEL = 0.8  # of the interval of the error on a new flight
 TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
@@ -207,3 +207,29 @@ def expected(logs: Float[np.ndarray, "flights ..."], level: float = LEVEL) -> Fl
         return np.stack([np.exp(middle), np.zeros_like(middle), np.full_like(middle, np.inf)])
     half = scipy.special.stdtrit(n - 1, (1 + level) / 2) * logs.std(axis=0, ddof=1) * (1 + 1 / n) ** 0.5
     return np.exp([middle, middle - half, middle + half])
+
+
+def rmse_by_flight(
+    field: AbstractVectorField, logs: Sequence[FlightLog], steps: int
+) -> Float[np.ndarray, "flights t 4"]:
+    """Compute the RMSE in UNITS on each flight at the end of each interval."""
+    return np.stack([rmse(errors_of(field, log, steps)) for log in logs])
+
+
+def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[np.ndarray, "n t 4"]:
+    """Compute the errors in UNITS for windows of a flight at the end of each interval."""
+    if isinstance(field, DisturbanceModel):  # which starts from what was seen before
+        parts = [(each, observe(field, each)[0]) for each in sequences([log], steps)]
+        cut = [windows_of(seen, np.asarray(each.u[0]), each.dt, steps=steps) for each, seen in parts]
+        windows = concatenate(cut)
+    else:
+        windows = cut_windows([log], steps, steps)
+    return np.stack(flight_errors(field, windows), axis=-1)
+
+
+def rmse(errors: Float[np.ndarray, "n t 4"]) -> Float[np.ndarray, "t 4"]:
+    return np.sqrt(np.mean(np.square(errors), axis=0))
+
+
+def ratio(errors: Float[np.ndarray, "*n 4"], others: Float[np.ndarray, "*n 4"]) -> float:
+    return float(np.exp(np.log(errors / others).mean()))

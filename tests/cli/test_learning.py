@@ -9,8 +9,7 @@ from recorded import LOGS
 import hybrid_jax as hj
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.vehicle_file import LEARN, VehicleModel
-from hybrid_jax.identification.learning import STEPS, choose, expected, learnable, with_past, without_past
-from hybrid_jax.identification.prediction_errors import errors_of
+from hybrid_jax.identification.learning import STEPS, choose, errors_of, expected, learnable, with_past, without_past
 from hybrid_jax.vehicle import IRIS
 
 BODY = hj.rigid_body(IRIS)

@@ -22,7 +22,7 @@ from experiments.runner.stages import Stages
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.windows import manoeuvre_of
-from hybrid_jax.identification.prediction_errors import UNITS
+from hybrid_jax.identification.learning import UNITS
 from hybrid_jax.vehicle import IRIS
 
 
