@@ -140,8 +140,9 @@ def typeset(text: str) -> str:
 
 
 def note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[float, float], **style: Any) -> None:
-    """Draw small words beside a point, also outside the axes; the offset is in points."""
-    axes.annotate(words, at, offset, textcoords="offset points", annotation_clip=False, **{"fontsize": 6, **style})
+    """Draw small words beside a point, also outside the axes, on white; the offset is in points."""
+    style = {"fontsize": 6, "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.4}} | style
+    axes.annotate(words, at, offset, textcoords="offset points", annotation_clip=False, **style)
 
 
 def tick_errors(axis: Axis, low: float, high: float, room: float = 0.0) -> None:

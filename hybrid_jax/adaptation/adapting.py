@@ -50,7 +50,7 @@ NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is 
 NOT_FINITE = "the fit diverged; check dt and all units"
 NOT_FITTED = "no parameter was fitted"
 NO_MOTION = "field: its training windows are unknown, so all its errors count as changes; pass learned_from="
-FEW = "windows: {} do not determine {} parameters; the others stay at the source's values"
+FEW = "windows: {} are too few to determine {} parameters; those that they do not determine keep the source's values"
 BY_NETWORK = "the network's effect is comparable to that of a plausible change; hj.pool of several sources helps"
 BY_ROTORS = "the rotors' efficiencies, which were fitted too, can have the same effect"
 OVERLAP = "windows overlap: left-out blocks share samples with the others, so the expected errors are too small"

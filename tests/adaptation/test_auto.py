@@ -229,7 +229,7 @@ def test_results_of_auto_are_pooled_with_what_the_networks_express():
 
 def test_one_window_warns_and_a_source_without_its_motion_says_how_to_add_it():
     with (
-        pytest.warns(UserWarning, match="windows: 1 do not determine 1 parameters"),
+        pytest.warns(UserWarning, match="windows: 1 are too few to determine 1 parameters"),
         pytest.warns(UserWarning, match="its training windows are unknown.*; pass learned_from="),
     ):
         assert adapt(hybrid(), flown(hybrid(), count=1)).chosen == "source"
