@@ -91,6 +91,11 @@ class AbstractVectorField(eqx.Module):
         return self.accepts_batch
 
     @property
+    def hidden(self) -> int:
+        """The number of states, behind all others, that are not measured; by default none."""
+        return 0
+
+    @property
     def state_space(self) -> StateSpace:
         """The state space; by default taken from the first field inside that has one, else empty."""
         spaces = (part.state_space for part in _fields_inside(self))
@@ -134,6 +139,14 @@ class AbstractEstimator(eqx.Module):
         Args:
             state: of the estimator, as returned by `begin` and `update`.
         """
+
+    def start(self, state: Any, x: Float[Array, " d"]) -> Float[Array, " d+h"]:
+        """Return the model's state at the last sample x; by default x, for a model without hidden states.
+
+        Args:
+            state: of the estimator, as returned by `begin` and `update`.
+        """
+        return x
 
     def command(self, state: Any, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " m"]:
         """Return the input to command if the controller requests u in the state x; by default u.

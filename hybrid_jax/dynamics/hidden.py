@@ -6,10 +6,11 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns, state_space
 
 Indices = tuple[int, ...]
 
@@ -166,9 +167,13 @@ class WithHidden(AbstractVectorField):
     field: AbstractVectorField
     parts: tuple[AbstractHidden, ...]
 
+    @property
+    def hidden(self) -> int:
+        """The number of states of the parts, which follow the states of the field."""
+        return sum(part.size for part in self.parts)
+
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        hidden = sum(part.size for part in self.parts)
-        d, own, slopes = len(x) - hidden, x[: len(x) - hidden], []
+        d, own, slopes = len(x) - self.hidden, x[: len(x) - self.hidden], []
         at, added = d, jnp.zeros(d)
         for part in self.parts:
             z = x[at : at + part.size]
@@ -195,8 +200,9 @@ class DisturbanceModel(AbstractVectorField):
     """A disturbance that is predicted from its past: ẋ = f(x, u) + D e, żᵢ = (e − zᵢ) / τᵢ, e = W (z₁, …, z_k, x, 1).
 
     The state is (x, z₁, …, z_k). e is the disturbance in the tangent space of x, D its effect on ẋ, and zᵢ is e after a
-    filter. While x is measured, e is the measured disturbance instead: see `hybrid_jax.estimation.observe`. This is an
-    innovations form of linear hidden dynamics (Ljung, System Identification, 1999, 4.3) with fixed poles.
+    filter. While x is measured, e is the measured disturbance instead: see `after`, and `hybrid_jax.estimation.observe`
+    for many samples. This is an innovations form of linear hidden dynamics (Ljung, System Identification, 1999, 4.3)
+    with fixed poles.
 
     Attributes:
         field: f, with d states and e numbers in their tangent space.
@@ -214,14 +220,14 @@ class DisturbanceModel(AbstractVectorField):
     states: tuple[int, ...] = eqx.field(static=True)
 
     @property
-    def filters(self) -> int:
+    def hidden(self) -> int:
         """The number of filter states, which follow the states of the field."""
         return len(self.time_constants) * len(self.weights)
 
     @property
     def state_space(self):
         own = state_space(self.field)
-        return own.padded(own.size + self.filters)
+        return own.padded(own.size + self.hidden)
 
     def disturbance(self, x: Float[Array, " d+f"]) -> Float[Array, " e"]:
         """Predict the disturbance e (e,) in a state, in the state's units per second.
@@ -229,13 +235,51 @@ class DisturbanceModel(AbstractVectorField):
         Args:
             x: the state of the field, followed by the states of the filters.
         """
-        d = len(x) - self.filters
+        d = len(x) - self.hidden
         return self.weights @ jnp.concatenate([x[d:], x[jnp.array(self.states, int)], jnp.ones(1, x.dtype)])
 
+    def shares(self, dt: float) -> Float[np.ndarray, " k"]:
+        """Return the share of a new error in each filter.
+
+        Args:
+            dt: the time after which [s].
+        """
+        return -np.expm1(-dt / np.array(self.time_constants))
+
+    def after(
+        self, x: Float[Array, " d+f"], predicted: Float[Array, " d"], measured: Float[Array, " d"], dt: float
+    ) -> Float[Array, " d+f"]:
+        """Return the state after a sample, which you carry to the next one; before the first, the filters are zero.
+
+        Args:
+            x: the state at the sample before.
+            predicted: what the field predicts for this sample from there (d,).
+            measured: the sample (d,).
+            dt: time between the two [s].
+        """
+        e = state_space(self.field, len(measured)).difference(measured, predicted) / dt
+        filtered = x[len(measured) :].reshape(-1, len(e))
+        filtered = filtered + jnp.asarray(self.shares(dt), e.dtype)[:, None] * (e - filtered)
+        return jnp.concatenate([measured, filtered.ravel()])
+
     def __call__(self, x: Float[Array, " d+f"], u: Float[Array, " m"]) -> Float[Array, " d+f"]:
-        own, filtered = x[: len(x) - self.filters], x[len(x) - self.filters :]
+        d, beyond = len(x) - self.hidden, self._beyond(x)
+        return jnp.concatenate([self.field(x[:d], u) + beyond[:d], beyond[d:]])
+
+    def linearize(self, x, u, dx, du):
+        d, (beyond, slopes) = len(x) - self.hidden, jvp_columns(self._beyond, (x,), (dx,))
+        value, columns = as_field(self.field).linearize(x[:d], u, dx[:d], du)
+        parts = (value, beyond), (columns, slopes)
+        return tuple(jnp.concatenate([own + more[:d], more[d:]]) for own, more in parts)
+
+    def fuse_for_inference(self):
+        return eqx.tree_at(lambda model: model.field, self, as_field(self.field).fuse_for_inference())
+
+    def _beyond(self, x: Float[Array, " d+f"]) -> Float[Array, " d+f"]:
+        """ẋ without the field's part."""
+        own, filtered = x[: len(x) - self.hidden], x[len(x) - self.hidden :]
         e = self.disturbance(x)
         retract = partial(state_space(self.field, len(own)).retract, own)
         _, effect = jax.jvp(retract, (jnp.zeros_like(e),), (e,))
         slopes = (e - filtered.reshape(-1, len(e))) / jnp.array(self.time_constants, x.dtype)[:, None]
-        return jnp.concatenate([self.field(own, u) + effect, slopes.ravel()])
+        return jnp.concatenate([effect, slopes.ravel()])

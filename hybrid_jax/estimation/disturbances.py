@@ -85,7 +85,7 @@ def observe(model: DisturbanceModel, past: Trajectories, solver: Solver = None) 
         solver: of diffrax, by default `RK4`.
     """
     errors = errors_after_one(model.field, past, solver)
-    shares = [-np.expm1(-past.dt / tau) for tau in model.time_constants]
+    shares = model.shares(past.dt)
     filtered = np.concatenate([scipy.signal.lfilter([a], [1, a - 1], errors, axis=1) for a in shares], axis=-1)
     x = np.concatenate([past.x0[:, None], past.x], axis=1)
     return np.concatenate([x, np.pad(filtered, ((0, 0), (1, 0), (0, 0)))], axis=-1).astype(x.dtype)
@@ -151,14 +151,14 @@ def _slopes(field, x, u) -> Float[Array, "n d d"]:
 
 
 def _features(model: DisturbanceModel, states: np.ndarray) -> Float[np.ndarray, "n f"]:
-    own, filtered = np.split(states, [states.shape[1] - model.filters], axis=1)
+    own, filtered = np.split(states, [states.shape[1] - model.hidden], axis=1)
     return np.concatenate([filtered, own[:, list(model.states)], np.ones((len(states), 1))], axis=1)
 
 
 def _sizes(model: DisturbanceModel, states: np.ndarray) -> Float[Array, " f"]:
     features, e = _features(model, states), len(model.weights)
     fastest = np.sqrt(np.mean(np.square(features[:, :e]), axis=0)) + 1e-12
-    varied = features[:, model.filters : -1].std(axis=0)
+    varied = features[:, model.hidden : -1].std(axis=0)
     sizes = [*[fastest] * len(model.time_constants), np.where(varied > 1e-9, varied, np.inf), [1.0]]
     return jnp.asarray(np.concatenate(sizes), model.weights.dtype)
 
@@ -191,7 +191,7 @@ def _scores(start: DisturbanceModel, weights, flights: Sequence, steps: int, sol
     cut = [windows_of(seen, np.asarray(one.u[0]), one.dt, steps=steps, stride=1) for seen, one in flights]
     x0, u, end = (np.concatenate(parts) for parts in zip(*((w.x0, w.u, w.x[:, -1]) for w in cut), strict=True))
     chosen = np.round(np.linspace(0, len(x0) - 1, WINDOWS)).astype(int)
-    dt, space = cut[0].dt, state_space(start.field, x0.shape[1] - start.filters)
+    dt, space = cut[0].dt, state_space(start.field, x0.shape[1] - start.hidden)
     windows = [part[chosen] for part in (x0, u, end)]
     found = [_squares(start, each, windows, dt, solver) for each in weights]
     sizes = np.cumsum([one.tangent_size for one in space.quantities])[:-1]
@@ -204,6 +204,6 @@ def _squares(model, weights, windows: Any, dt: float, solver: Solver) -> Float[A
     """Mean squared error at the end of windows, number by number."""
     x0, u, end = windows
     model = eqx.tree_at(lambda each: each.weights, model, weights)
-    d = x0.shape[-1] - model.filters
+    d = x0.shape[-1] - model.hidden
     reached = rollout_batch(model, x0, u, dt, solver)[:, -1, :d]
     return jnp.mean(jnp.square(jax.vmap(state_space(model.field, d).difference)(reached, end[:, :d])), axis=0)
