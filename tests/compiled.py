@@ -28,11 +28,11 @@ class Library:
         self._library, self._name, (self.d, self.m) = ctypes.CDLL(str(library)), source.stem, sizes
         self.dtype = np.dtype(np.float64 if double else np.float32)
 
-    def __call__(self, function, x, u):
+    def __call__(self, function, *given):
         """What NAME_function writes: a vector, and with Jacobians the matrices by x and by u."""
         shapes = [(self.d,)] + [(self.d, self.d), (self.d, self.m)] * function.endswith("jacobian")
         results = [np.full(shape, np.nan, self.dtype) for shape in shapes]
-        arguments = [np.ascontiguousarray(a, self.dtype) for a in (x, u)]
+        arguments = [np.ascontiguousarray(a, self.dtype) for a in given]
         getattr(self._library, f"{self._name}_{function}")(
             *(a.ctypes.data_as(ctypes.c_void_p) for a in (*arguments, *results))
         )

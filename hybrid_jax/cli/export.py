@@ -38,12 +38,17 @@ PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
 PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.md
 FORCE, TORQUE = 3.0, 5.0  # standard deviations of a disturbance: m/s² and rad/s²
 STATES = "x: position [m], quaternion w x y z, velocity [m/s], body rates [rad/s]; u: rotor speeds [rad/s]."
-WITHOUT = "The model is written without its past: in a program you would have to filter its errors yourself."
+PAST = (
+    "The model predicts its errors from those before. Behind its state are {} filtered errors: 0 at first, then what "
+    "`observe` returns after each sample, from the state before, u and the sample."
+)
 
 
 @dataclass(frozen=True)
 class Options:
     """Write a model's field ẋ = f(x, u), and a step x⁺ = F(x, u) of it, for other programs.
+
+    Of a model with a past also `observe`, which returns the state after each sample: you carry it.
 
     c: NAME.h and NAME.c in C99, for a flight controller, and if the physics has parameters NAME_adaptation.h and
     NAME_adaptation.c, a filter that adapts them in flight. casadi: field.casadi and step.casadi for
@@ -79,7 +84,7 @@ class Options:
 
 def run(options: Options) -> int:
     model = load(options.model)
-    field, dt = without_past(model.field), model.about.get("dt") if options.dt is None else options.dt
+    field, dt = model.field, model.about.get("dt") if options.dt is None else options.dt
     if dt is None:
         raise ValueError(f"--dt is needed: {options.model} does not say how long the steps of its flights were")
     checks.positive(f"{options.model}: dt" if options.dt is None else "--dt", dt, "a positive number of seconds")
@@ -90,28 +95,33 @@ def run(options: Options) -> int:
     d, m = sizes_of(field, options.state_size, options.input_size)
     sizes: dict[str, Any] = {"state_size": d, "input_size": m}
     own: dict[str, Any] = sizes | {"smooth": options.smooth}
-    said = [WITHOUT] * (field is not model.field)
-    adaptation = _filter(options, field, dt, d) if "c" in options.to else ""
+    alone, measured = without_past(field), d - field.hidden  # what the filter adapts
+    learned: dict[str, Any] = {"state_size": measured, "input_size": m}
+    programs = [("field", "f", None, {}), ("step", "F", dt, {})]
+    programs += [("observe", "F", dt, {"observe": True})] * (alone is not field)
+    said = [PAST.format(field.hidden)] * (alone is not field)
+    adaptation = _filter(options, alone, dt, measured) if "c" in options.to else ""
     written: list[Path] = []
     with step(f"writing {', '.join(options.to)}"):
         if "c" in options.to:
             written += export_c(options.output, field, dt, name=options.name, double=options.double, **own)
         if isinstance(adaptation, OnlineAdaptation):
             name = f"{options.name}_adaptation"
-            written += export_adaptation_c(options.output, adaptation, name=name, double=options.double, **sizes)
+            written += export_adaptation_c(options.output, adaptation, name=name, double=options.double, **learned)
             groups = ", ".join(dict.fromkeys(each.partition("[")[0] for each in adaptation.names))
-            said.append(f"{name} adapts {groups}, with a sample every {adaptation.dt:g} s.")
+            of = ", of the model without its past" * (alone is not field)
+            said.append(f"{name} adapts {groups}{of}, with a sample every {adaptation.dt:g} s.")
         elif adaptation:
             said.append(f"No filter is written: {adaptation}.")
-        for kind, length, letter in (("field", None, "f"), ("step", dt, "F")):
+        for kind, letter, length, more in programs:
             if "stablehlo" in options.to:
                 written.append(options.output / f"{kind}.npz")
-                export_program(written[-1], field, length, about=model.about, **own)
+                export_program(written[-1], field, length, about=model.about, **own, **more)
             if "casadi" in options.to:
                 written.append(options.output / f"{kind}.casadi")
-                casadi_function(field, length, name=letter, **own).save(str(written[-1]))
+                casadi_function(field, length, name=letter, **own, **more).save(str(written[-1]))
     if options.smooth is not None:
-        said.append(_change(field, options.smooth))
+        said.append(_change(alone, options.smooth))
     told = {"files": list(map(str, written)), "dt": dt}
     page.write(options.out, "export", _page(options, field, dt, written, said), told)
     return 0
@@ -120,7 +130,7 @@ def run(options: Options) -> int:
 def _page(
     options: Options, field: AbstractVectorField, dt: float, written: Sequence[Path], said: Sequence[str]
 ) -> page.Page:
-    rigid = state_space(field) == RIGID_BODY_SPACE and not isinstance(field, Actuated)
+    rigid = state_space(without_past(field)) == RIGID_BODY_SPACE and not isinstance(field, Actuated)
     rows = [(str(path), f"{path.stat().st_size / 1024:.0f} KB") for path in written]
     compiled = f"gcc -std=c99 -O2 -I{options.output} main.c {options.output / options.name}.c -lm"
     todo = [f"Compile it with yours: {compiled}. docs/howto/c.md has a program."] if "c" in options.to else []
@@ -140,7 +150,7 @@ def _response(field: AbstractVectorField, dt: float) -> list[tuple[str, Figure]]
     if (vehicle := vehicle_in(field)) is None or isinstance(field, Actuated):
         return []
     steps = max(2, round(RESPONSE / dt))
-    x = jnp.zeros((1, STATE_SIZE)).at[0, jnp.array([2, 3])].set(1.0)
+    x = jnp.zeros((1, STATE_SIZE + field.hidden)).at[0, jnp.array([2, 3])].set(1.0)
     u = jnp.full((1, steps, vehicle.rotors), vehicle.hover_speed).at[..., 0].multiply(FASTER)
     states = np.concatenate([x, rollout_batch(field, x, u, dt)[0]])
     figure = Figure(figsize=(6.0, 2.6), layout="constrained")

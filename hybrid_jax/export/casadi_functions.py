@@ -6,7 +6,7 @@ import jax
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.export.program import Size, program_of, sizes_of
+from hybrid_jax.export.program import OBSERVED, Size, program_of, sizes_of
 from hybrid_jax.runtime import entry
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ def casadi_function(
     input_size: Size = None,
     name: str = "f",
     smooth: float | None = None,
+    observe: bool = False,
 ) -> "casadi.Function":
     """Convert a field, or a step of it, to a CasADi function of x (d × 1) and u (m × 1), in double precision.
 
@@ -38,6 +39,8 @@ def casadi_function(
         name: name of the CasADi function.
         smooth: β of ½ (z + √(z² + 1/β²)), which replaces the ReLU of networks (see `smoothed`). You should set it for
             solvers that use second derivatives, for example IPOPT.
+        observe: make the function of x, u and `measured` that returns the state dt after x, where this sample was
+            measured. This is for a field from `fit_disturbance`, whose state you carry: at first its filters are zero.
 
     Raises:
         ValueError: if sizes are unknown, there are more than 512 states, the field does not accept such x and u, or
@@ -50,9 +53,9 @@ def casadi_function(
         from hybrid_jax.export.casadi_operations import evaluate
     except ImportError as error:
         raise ImportError("CasADi functions need casadi: pip install 'hybrid_jax[casadi]'") from error
-    if dt is not None:
+    if dt is not None or observe:
         checks.positive("dt", dt, "a positive number of seconds")
-    sizes = sizes_of(field, state_size, input_size)
+    sizes = sizes_of(field, state_size, input_size, observe)
     if sizes[0] > MOST_STATES:
         raise ValueError(
             f"state_size must be at most {MOST_STATES}, got {sizes[0]}: CasADi would write every number out, as of a "
@@ -60,9 +63,10 @@ def casadi_function(
         )
     if not isinstance(name, str) or not ca.Function.check_name(name):
         raise ValueError(f"name must be one that CasADi accepts for a function, got {checks.short_repr(name)}")
-    symbols = [ca.SX.sym("x", sizes[0]), ca.SX.sym("u", sizes[1])]
+    names = list(OBSERVED[: len(sizes)])
+    symbols = list(map(ca.SX.sym, names, sizes))
     # In double precision throughout, so that the constants of the physics are not rounded.
     with jax.enable_x64(True):
         likes = [jax.ShapeDtypeStruct((size,), float) for size in sizes]
         result = evaluate(jax.make_jaxpr(program_of(field, likes, dt, smooth))(*likes), symbols)
-    return ca.Function(name, symbols, [result], ["x", "u"], ["xdot" if dt is None else "xnext"])
+    return ca.Function(name, symbols, [result], names, ["xdot" if dt is None else "xnext"])

@@ -33,6 +33,7 @@ class Program:
         dt: length of a step [s]; None for a field.
         state_size: d.
         input_size: m.
+        measured_size: n, of a program that observes; else 0.
         batched: whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
         platforms: the platforms that can run it, for example "cpu".
         about: JSON values that describe the model.
@@ -41,27 +42,36 @@ class Program:
     dt: float | None
     state_size: int
     input_size: int
+    measured_size: int
     batched: bool
     platforms: tuple[str, ...]
     about: Mapping[str, Any]
-    _call: Callable[[Array, Array], Array] = field(repr=False)
+    _call: Callable[..., Array] = field(repr=False)
 
     def __call__(
-        self, x: Float[Array | np.ndarray, "*b d"], u: Float[Array | np.ndarray, "*b m"]
+        self,
+        x: Float[Array | np.ndarray, "*b d"],
+        u: Float[Array | np.ndarray, "*b m"],
+        measured: Float[Array | np.ndarray, "*b n"] | None = None,
     ) -> Float[Array, "*b d"]:
         """Return ẋ, or the state dt later with the input held, in single precision; ValueError for other arrays.
 
         Args:
             x: state (d,), or states (b, d).
             u: input (m,), or inputs (b, m).
+            measured: the sample dt later (n,), or (b, n), for a program that observes.
         """
-        x, u = (checks.floating(name, value).astype(jnp.float32) for name, value in (("x", x), ("u", u)))
-        batch = x.shape[:1] if self.batched else ()
-        if x.shape != (*batch, self.state_size) or u.shape != (*batch, self.input_size) or 0 in batch:
-            form = "x (b, {}) and u (b, {})" if self.batched else "x ({},) and u ({},)"
-            expected = form.format(self.state_size, self.input_size)
-            raise ValueError(f"{expected} expected, got shapes {x.shape} and {u.shape}")
-        return self._call(x, u)
+        sizes = {"x": self.state_size, "u": self.input_size}
+        sizes |= {"measured": self.measured_size} if self.measured_size else {}
+        given = [value for value in (x, u, measured) if value is not None]
+        arrays = [checks.floating(name, one).astype(jnp.float32) for name, one in zip(sizes, given, strict=False)]
+        batch = arrays[0].shape[:1] if self.batched else ()
+        shapes = [one.shape for one in arrays]
+        if len(given) > len(sizes) or shapes != [(*batch, size) for size in sizes.values()] or 0 in batch:
+            form = "{} (b, {})" if self.batched else "{} ({},)"
+            expected = " and ".join(form.format(*each) for each in sizes.items())
+            raise ValueError(f"{expected} expected, got shapes {' and '.join(map(str, shapes))}")
+        return self._call(*arrays)
 
 
 @entry
@@ -75,6 +85,7 @@ def export_program(
     batched: bool = False,
     platforms: tuple[str, ...] = ("cpu",),
     smooth: float | None = None,
+    observe: bool = False,
     about: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a field, or a step of it, in inference mode and single precision, to a file for `load_program`.
@@ -88,6 +99,7 @@ def export_program(
         batched: take x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
         platforms: the platforms to export for, a subset of PLATFORMS; each makes the file longer.
         smooth: see `casadi_function`.
+        observe: see `casadi_function`.
         about: JSON values to store with the program.
 
     Raises:
@@ -96,11 +108,11 @@ def export_program(
         ImportError: if flatbuffers is not installed (extra `export`).
         OSError: if the folder cannot be written.
     """
-    if dt is not None:
+    if dt is not None or observe:
         checks.positive("dt", dt, "a positive number of seconds")
-        dt = float(dt)
+        dt = float(dt)  # pyright: ignore[reportArgumentType]
     _need_flatbuffers()
-    sizes = sizes_of(field, state_size, input_size)
+    sizes = sizes_of(field, state_size, input_size, observe)
     if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
         known = ", ".join(PLATFORMS)
         raise ValueError(f"platforms must be a tuple of some of {known}, got {checks.short_repr(platforms)}")
@@ -133,10 +145,11 @@ def load_program(path: str | Path) -> Program:
         dt, about = metadata["dt"], dict(metadata["about"])
         if dt is not None:
             checks.positive("dt", dt)
-        batched, state_size, input_size = _sizes(exported)
+        batched, state_size, input_size, measured = _sizes(exported)
     except Exception as error:  # JAX's parser raises errors of any type
         raise ValueError(f"{path}: not a program of a field or a step: {checks.first_line(error)}") from error
-    return Program(dt, state_size, input_size, batched, exported.platforms, about, jax.jit(exported.call))
+    sizes = state_size, input_size, measured, batched
+    return Program(dt, *sizes, exported.platforms, about, jax.jit(exported.call))
 
 
 @contextmanager
@@ -157,17 +170,18 @@ def _check_calls(exported: jax.export.Exported) -> None:
             raise ValueError(f"field: its program calls {call or 'something'}, which is not an operation of StableHLO")
 
 
-def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int]:
-    (x, u), (result,) = exported.in_avals, exported.out_avals
-    batched, d, m = len(x.shape) == 2, x.shape[-1], u.shape[-1]
+def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int, int]:
+    (x, u, *rest), (result,) = exported.in_avals, exported.out_avals
+    batched, given = len(x.shape) == 2, (x, u, *rest[:1])
+    d, m, *n = (value.shape[-1] for value in given)
     batch = (BATCH,) if batched else ()
-    shapes = [tuple(map(str, value.shape)) for value in (x, u, result)]
-    fits = shapes == [(*batch, str(size)) for size in (d, m, d)]
-    single = all(value.dtype == np.float32 for value in (x, u, result))
-    trees = (exported.in_tree, exported.out_tree) == tuple(map(jax.tree.structure, (((0, 0), {}), 0)))
+    shapes = [tuple(map(str, value.shape)) for value in (*given, result)]
+    fits = shapes == [(*batch, str(size)) for size in (d, m, *n, d)]
+    single = all(value.dtype == np.float32 for value in (*given, result))
+    trees = (exported.in_tree, exported.out_tree) == tuple(map(jax.tree.structure, (((0,) * len(given), {}), 0)))
     if not (fits and single and trees):
         raise ValueError(f"the program maps {exported.in_avals} to {exported.out_avals}")
-    return batched, int(d), int(m)
+    return batched, int(d), int(m), int(n[0]) if n else 0
 
 
 def _need_flatbuffers() -> None:

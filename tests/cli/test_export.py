@@ -4,11 +4,13 @@ import json
 import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.cli.export import TORQUE, Options, _filter
+from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.dynamics.rigid_body import Kinematics
 from hybrid_jax.export import export_adaptation_c, load_program
 from hybrid_jax.networks.standardise import with_motion
@@ -35,6 +37,20 @@ def test_all_that_is_written_is_the_model(field, tmp_path, called):
     np.testing.assert_allclose(ca.Function.load(str(out / "step.casadi"))(X, U).full()[:, 0], predicted, atol=1e-5)
     derivative = ca.Function.load(str(out / "field.casadi"))(X, U).full()[:, 0]
     np.testing.assert_allclose(field(X, U), derivative, rtol=1e-5, atol=1e-4)
+
+
+def test_of_a_model_with_a_past_the_update_is_written_and_said(tmp_path, called):
+    model = DisturbanceModel(hj.rigid_body(hj.IRIS), jnp.eye(12, 13), jnp.ones(13), (0.1,), ())
+    hj.save(tmp_path / "model.npz", model, {"dt": 0.02})
+    _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--to", "c,stablehlo", "--out", tmp_path)
+    assert "Behind its state are 12 filtered errors: 0 at first" in said
+    assert "adapts Ix, Iy, k, disturbance, of the model without its past, with" in said
+    state = np.concatenate([X, np.zeros(12)])
+    seen = load_program(tmp_path / "observe.npz")(state, U, X)
+    np.testing.assert_allclose(
+        seen, model.after(state, hj.rollout(model.field, X, U[None], 0.02)[0], X, 0.02), atol=1e-3
+    )
+    assert "void model_observe(" in (tmp_path / "model.h").read_text()
 
 
 def test_the_filter_keeps_which_states_an_adapted_model_disturbs(tmp_path):

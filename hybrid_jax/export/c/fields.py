@@ -16,8 +16,9 @@ from hybrid_jax.codegen.operations import CTranslation, column
 from hybrid_jax.codegen.printer import CPrinter
 from hybrid_jax.codegen.translation import Entries
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
-from hybrid_jax.export.c.templates import HEADER, SOURCE
-from hybrid_jax.export.program import Size, prepared, sizes_of, vehicle_in
+from hybrid_jax.dynamics.hidden import DisturbanceModel
+from hybrid_jax.export.c.templates import HEADER, OBSERVE, PAST_HEADER, SOURCE
+from hybrid_jax.export.program import OBSERVED, Size, prepared, program_of, sizes_of, vehicle_in
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.runtime import entry
 from hybrid_jax.vehicle import STATE_NAMES
@@ -38,7 +39,8 @@ def export_c(
     """Write a field in inference mode as C99: ẋ = f(x, u), a step of RK4 over dt [s], and the Jacobians of both.
 
     NAME.c has NAME_derivative, NAME_step, NAME_derivative_jacobian and NAME_step_jacobian, and NAME.h describes their
-    arguments. They use only the stack, and you can call them from several threads.
+    arguments. They use only the stack, and you can call them from several threads. For a field from `fit_disturbance`
+    there is NAME_observe, too, which returns the state that you carry after each sample.
 
     Args:
         folder: where the files are written; it is created if it does not exist.
@@ -69,9 +71,14 @@ def export_c(
         values = body_of(fused, likes, tables, ("xdot",))
         directions = jnp.split(jnp.eye(d + m), [d])
         slopes = body_of(lambda x, u: as_field(fused).linearize(x, u, *directions), likes, tables, ("xdot", "jacobian"))
+        bodies, parts, header, source = {"values": values, "slopes": slopes}, {}, HEADER, SOURCE
+        if isinstance(field, DisturbanceModel):
+            header, source, parts = PAST_HEADER, SOURCE + OBSERVE, {"n": d - field.hidden, "hidden": field.hidden}
+            likes.append(jax.ShapeDtypeStruct((parts["n"],), float))
+            bodies["observe"] = body_of(program_of(field, likes, dt, smooth), likes, tables, ("next",), OBSERVED)
     about = _about(vehicle_in(field) is not None, smooth)
-    parts = {"d": d, "m": m, "dt": printer.number(float(dt)), "about": about}
-    return written(folder, name, HEADER, SOURCE, parts | printer.parts(tables, values=values, slopes=slopes))
+    parts |= {"d": d, "m": m, "dt": printer.number(float(dt)), "about": about}
+    return written(folder, name, header, source, parts | printer.parts(tables, **bodies))
 
 
 def check_name(name: str) -> None:

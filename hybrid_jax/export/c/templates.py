@@ -37,7 +37,7 @@ $tables
 $helpers
 """
 
-HEADER = _header(
+_MODEL = (
     """A model dx/dt = f(x, u), written by hybrid_jax.
 $about
 
@@ -59,6 +59,16 @@ void ${name}_derivative_jacobian(const $type x[$d], const $type u[$m], $type xdo
 /* As ${name}_step, with its Jacobians. */
 void ${name}_step_jacobian(const $type x[$d], const $type u[$m], $type next[$d],
                            $type dx[$d][$d], $type du[$d][$m]);""",
+)
+HEADER = _header(*_MODEL)
+PAST_HEADER = _header(
+    *_MODEL[:2],
+    _MODEL[2]
+    + """
+
+/* The state ${NAME}_DT after x with u held, where its first $n numbers were measured. The last $hidden are filtered
+   errors of the model: 0 at the first sample, and then what this function returns, which you carry on. */
+void ${name}_observe(const $type x[$d], const $type u[$m], const $type measured[$n], $type next[$d]);""",
 )
 
 SOURCE = (
@@ -148,6 +158,13 @@ void ${name}_step_jacobian(const real x[D], const real u[M], real next[D], real 
 }
 """
 )
+
+OBSERVE = """
+void ${name}_observe(const real x[D], const real u[M], const real measured[$n], real next[D]) {
+    (void)u;
+$observe
+}
+"""
 
 ADAPTATION_HEADER = _header(
     """A filter that adapts a model while it runs, written by hybrid_jax.
