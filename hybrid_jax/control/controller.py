@@ -54,13 +54,13 @@ _Start = tuple[State, Input]  # state and rotor speeds
 
 
 def checked_states(
-    name: str, x: State, reference: Float[Array, "n 13"], plan: Plan, steps: int | None = None
+    name: str, x: State, reference: Float[Array, "n 13"], plan: Plan, steps: int | None = None, hidden: int = 0
 ) -> tuple[State, Float[Array, "n 13"], Plan]:
     """Check x, a reference and the plan and convert them to one dtype, which a loop's carry must keep."""
     x, reference = checks.floating(name, x), checks.floating("reference", reference)
     fits = reference.ndim == 2 and reference.shape[1] == STATE_SIZE and steps in (None, len(reference))
-    if x.shape != (STATE_SIZE,) or not fits:
-        expected = f"{name} (13,) and reference ({steps or 'n'}, 13)"
+    if x.shape != (STATE_SIZE + hidden,) or not fits:
+        expected = f"{name} ({STATE_SIZE + hidden},) and reference ({steps or 'n'}, 13)"
         raise ValueError(f"{expected} expected, got {x.shape} and {reference.shape}")
     checks.unit_quaternions(name, x, QUATERNION)
     checks.unit_quaternions("reference", reference, QUATERNION)
@@ -165,6 +165,7 @@ class Controller:
         """Compute the rotor speeds [rad/s] to command for one period from state x, and the new plan.
 
         Args:
+            x: the state (13,), with the hidden states of the model behind it, if it has any.
             reference: the state to reach by the end of each interval (see `horizon`).
             plan: plan of the last call, or `begin()`.
             speeds: rotor speeds at state x [rad/s], by default the plan's commands; ignored without lag.
@@ -179,9 +180,9 @@ class Controller:
             raise ValueError(f"plan must be begin() or the plan of the last call, got {checks.short_repr(plan)}")
         if plan.variables.shape != (shape := (self.steps, self.vehicle.rotors)):
             raise ValueError(f"plan must have variables of shape {shape}, got {plan.variables.shape}")
-        x, reference, plan = checked_states("x", x, reference, plan, self.steps)
-        x = x.at[QUATERNION].set(canonicalize_quaternion(normalise(x[QUATERNION])))
         model = as_field(model).fuse_for_inference()
+        x, reference, plan = checked_states("x", x, reference, plan, self.steps, as_field(model).hidden)
+        x = x.at[QUATERNION].set(canonicalize_quaternion(normalise(x[QUATERNION])))
         start = x, (self.speeds(plan)[0] if speeds is None else speeds).astype(x.dtype)
         point = self._initial_guess(model, reference, start, plan)
 

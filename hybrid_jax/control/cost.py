@@ -50,7 +50,7 @@ class Weights:
 
 def deviations(weights: Weights, reference: State, x: State) -> Float[Array, "12"]:
     """Weight the deviations of a state from its reference: position, attitude, velocity, body rates."""
-    difference = x - reference
+    difference = x[: len(reference)] - reference  # a model may have hidden states behind these
     attitude = jnp.array([weights.tilt, weights.tilt, weights.yaw], x.dtype)
     attitude = attitude * attitude_error(reference[QUATERNION], x[QUATERNION])
     velocity, rates = weights.velocity * difference[VELOCITY], weights.body_rates * difference[BODY_RATES]

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller, Plan, checked_states
 from hybrid_jax.control.cost import Scalar, plan_cost
-from hybrid_jax.control.observer import Observer
+from hybrid_jax.control.observer import observer_of
 from hybrid_jax.control.sensitivities import advance, lagged_speeds
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import like
@@ -163,7 +163,7 @@ class Loop(NamedTuple):
             i: index of the period, from 0.
         """
         controller, estimator, period = self.controller, self.estimator, self.controller.period
-        model, x, speeds = estimator.model(now.estimate), now.seen, now.speeds
+        model, x, speeds = estimator.model(now.estimate), estimator.start(now.estimate, now.seen), now.speeds
         for command in now.sent:
             mean, speeds = lagged_speeds(speeds, command, self.hardware.rotor_lag, period)
             x = advance(model, x, estimator.effective(now.estimate, mean), period)
@@ -201,7 +201,8 @@ def fly(
         x0: true state at the start (13,).
         controller: plans at each period.
         plant: returns the state one period later.
-        model: prediction model of the controller and of the observer.
+        model: prediction model of the controller and of the observer. One from `fit_disturbance` observes its own
+            errors; another with hidden states needs an estimator.
         reference: one state per period (see `references.sample`).
         bandwidth: bandwidth of the disturbance observer [rad/s]; 0 for none.
         hardware: latency, rotor lag and noise, by default none. The controller should have the same `rotor_lag`.
@@ -220,7 +221,7 @@ def fly(
     periods = len(reference) - 1 - controller.steps * controller.stride
     if periods < 1:
         raise ValueError(f"reference must be longer than the horizon, got {len(reference)} samples")
-    estimator = Observer(model, bandwidth, controller.period) if estimator is None else estimator
+    estimator = observer_of(model, bandwidth, controller.period) if estimator is None else estimator
     loop = Loop(controller, hardware, estimator)
 
     def tick(now, i):

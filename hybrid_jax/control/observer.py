@@ -1,14 +1,16 @@
-"""A disturbance observer, which estimates a constant acceleration that the model does not include."""
+"""Observers of what a model does not include: a constant acceleration, or one predicted from past errors."""
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hybrid_jax import checks
 from hybrid_jax.control.cost import Scalar
 from hybrid_jax.control.sensitivities import advance
-from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField
+from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, as_field
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
+from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.rotation import canonicalize_quaternion
 from hybrid_jax.vehicle import BODY_RATES, QUATERNION, VELOCITY, State
 
@@ -50,3 +52,38 @@ class Observer(AbstractEstimator):
 
     def model(self, state):
         return Hybrid(self.field, ConstantDisturbance(state.disturbance))
+
+
+def observer_of(model: AbstractVectorField, bandwidth: Scalar | float, period: float) -> AbstractEstimator:
+    """The observer of a model; ValueError if it has hidden states that none estimates, or a second one is asked for."""
+    if not as_field(model).hidden:
+        return Observer(model, bandwidth, period)
+    if not isinstance(model, DisturbanceModel):
+        raise ValueError("model: nothing estimates its hidden states here; pass estimator=, or use fit_disturbance")
+    if checks.is_traced(bandwidth) or bandwidth:
+        raise ValueError("bandwidth must be 0, as the model itself observes its errors")
+    return PastObserver(model, period)
+
+
+class PastObserver(AbstractEstimator):
+    """Carry the state (x, z) of a model from `fit_disturbance`, whose filters z see the errors of its field.
+
+    Attributes:
+        field: the prediction model.
+        period: time between two samples [s].
+    """
+
+    field: DisturbanceModel
+    period: float = eqx.field(static=True)
+
+    def begin(self, x):
+        return jnp.concatenate([x, jnp.zeros(self.field.hidden, x.dtype)])
+
+    def update(self, state, x, u):
+        return self.field.after(state, advance(self.field.field, state[: len(x)], u, self.period), x, self.period)
+
+    def model(self, state):
+        return self.field
+
+    def start(self, state, x):
+        return state

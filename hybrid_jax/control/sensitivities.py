@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns
 from hybrid_jax.integrate import RK4, Derivative, rk4_step, traced_once
 from hybrid_jax.rotation import normalise
-from hybrid_jax.vehicle import QUATERNION, STATE_SIZE, Input, State
+from hybrid_jax.vehicle import QUATERNION, Input, State
 
 
 def lagged_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple[Input, Input]:
@@ -109,7 +109,7 @@ def condensed(
     model, x: Float[Array, "t 13"], before: Input, commands: Float[Array, "t 4"], lag: float, dt: float
 ) -> Float[Array, "t 13 t 4"]:
     """∂(state at the end of each interval) / ∂(all commands); `before` are the initial rotor speeds."""
-    d, (t, m) = STATE_SIZE, commands.shape
+    d, (t, m) = x.shape[1], commands.shape
     share, k = math.exp(-dt / lag) if lag else 0.0, np.arange(t)  # of the speeds that an interval keeps
     mixed = np.tril((1 - share) * share ** np.maximum(k[:, None] - k - 1, 0), -1).astype(x.dtype)
     speeds = (share**k).astype(x.dtype)[:, None] * before + mixed @ commands

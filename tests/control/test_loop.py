@@ -12,6 +12,7 @@ import hybrid_jax as hj
 from hybrid_jax import control
 from hybrid_jax.control.cost import deviations
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
+from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
 from hybrid_jax.networks.mlp import InputScaling
 
 CONTROLLER = control.Controller(hj.IRIS)
@@ -86,6 +87,28 @@ def test_observer_finds_the_wind_and_removes_its_error():
     assert without.position_rmse > 0.1
     assert found.position_rmse < 0.3 * without.position_rmse
     assert np.linalg.norm(flight.x[-1, :3] - reference[0, :3]) < 0.01
+
+
+def test_a_model_with_a_past_carries_its_state_and_removes_the_wind():
+    """This one takes the last error, filtered over 0.1 s, for the next."""
+    model = DisturbanceModel(BODY, jnp.eye(12, 13), jnp.ones(13), (0.1,), ())
+    reference = reference_of("hover")
+    pushed = plant(hj.Hybrid(BODY, ConstantDisturbance(WIND)))
+    flight = jax.jit(lambda: control.fly(pushed, model, reference, reference[0], CONTROLLER))()
+    flown = hj.Trajectories(flight.x[None, 0], flight.u[None], flight.x[None, 1:], CONTROLLER.period)
+    np.testing.assert_allclose(flight.estimates, hj.observe(model, flown)[0, :-1], atol=2e-3)
+    np.testing.assert_allclose(flight.estimates[-1, 13 + 6 :], WIND, atol=0.02)
+    assert np.linalg.norm(flight.x[-1, :3] - reference[0, :3]) < 0.01
+
+
+def test_hidden_states_that_nothing_estimates_are_refused():
+    lagging = hj.with_hidden(BODY, hj.dynamics.Lag(jnp.log(jnp.full(4, 0.05)), (0, 1, 2, 3)))
+    model, reference = DisturbanceModel(BODY, jnp.eye(12, 13), jnp.ones(13), (0.1,), ()), reference_of("hover")
+    for bandwidth, field, message in ((0.0, lagging, "hidden states"), (1.0, model, "bandwidth must be 0")):
+        with pytest.raises(ValueError, match=message):
+            control.fly(plant(BODY), field, reference, reference[0], CONTROLLER, bandwidth)
+    with pytest.raises(ValueError, match=r"x \(25,\) and reference"):
+        CONTROLLER(model, CONTROLLER.horizon(reference, 0), reference[0], CONTROLLER.begin())
 
 
 def still(periods=4):
