@@ -18,7 +18,7 @@ from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.logs import FlightOptions, flights_for, known_of
 from hybrid_jax.flights.windows import cut_windows
-from hybrid_jax.identification.learning import without_past
+from hybrid_jax.identification.learning import windows_for
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.io.models import load
@@ -61,11 +61,13 @@ def run(options: Options) -> int:
     if len(logs) > 1:
         raise ValueError(f"{options.flight}: has {len(logs)} flights; give one of them")
     steps, every = max(1, round(options.ahead / first.dt)), max(1, round(1 / SHOWN / first.dt))
-    windows = cut_windows(logs, steps, every)[: max(1, round(options.seconds * SHOWN))]
+    shown = slice(max(1, round(options.seconds * SHOWN)))
+    windows = cut_windows(logs, steps, every)[shown]
     with step(f"predicting and drawing {len(windows)} pictures"):
         forecasts = {
-            str(path): np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt))[..., POSITION]
-            for path, field in ((path, without_past(known.field)) for path, known in models.items())
+            str(path): np.asarray(rollout_batch(known.field, each.x0, each.u, each.dt))[..., POSITION]
+            for path, known in models.items()
+            for each in [windows_for(known.field, logs[0], steps, every)[shown]]
         }
         picture = _animated(windows, forecasts, every * windows.dt)
         write_atomic(options.out / "replay.gif", picture)
@@ -73,7 +75,7 @@ def run(options: Options) -> int:
     rms = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in ends.items()}
     rows = [(name, f"{rms[name]:.3g} m", f"{np.max(each):.3g} m") for name, each in ends.items()]
     seconds = steps * windows.dt
-    shown = page.Page(
+    result = page.Page(
         f"Where do models expect the vehicle of {options.flight.name}?",
         f"{seconds:g} s ahead it is {rms[str(options.model)]:.3g} m from where {options.model.name} expects it.",
         page.Table(f"Distance after {seconds:g} s", ("model", "RMS", "largest"), rows),
@@ -81,7 +83,7 @@ def run(options: Options) -> int:
         ["Each line begins where the vehicle is, and ends where a model expects it with the recorded inputs."],
         [f"Over whole flights and against baselines: hybrid-jax check {options.model} FLIGHTS."],
     )
-    page.write(options.out, "replay", shown, {"distance": rms, "files": [options.out / "replay.gif"]})
+    page.write(options.out, "replay", result, {"distance": rms, "files": [options.out / "replay.gif"]})
     return 0
 
 

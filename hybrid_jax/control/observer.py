@@ -10,7 +10,7 @@ from hybrid_jax.control.sensitivities import advance
 from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, as_field
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
+from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.rotation import canonicalize_quaternion
 from hybrid_jax.vehicle import BODY_RATES, QUATERNION, VELOCITY, State
 

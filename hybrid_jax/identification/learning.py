@@ -11,6 +11,7 @@ import scipy
 from jaxtyping import Float
 
 from hybrid_jax.adaptation import METHODS, Adaptation, Auto, adapt
+from hybrid_jax.adaptation.expectation import Expected
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.hidden import DisturbanceModel
@@ -32,6 +33,7 @@ STEPS = 10  # intervals of a window
 LEVEL = 0.8  # of the interval of the error on a new flight
 TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
 ENOUGH = 10  # windows for each parameter that is learned by default, or its error exceeds its effect
+NAMES = "position", "velocity", "attitude", "body rates"  # of a rigid body's quantities, in the order of `UNITS`
 FOLDS = 3  # at most so many groups of flights are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
 PHYSICS, OUTPUTS = "theta_least_squares", "accelerations"
@@ -119,7 +121,7 @@ def adapted(
 ) -> tuple[AbstractVectorField, Adaptation]:
     """Adapt the physics of a model to at most `most` windows of flights after a change, and what it has of the past.
 
-    Also return the adaptation of the model without its past.
+    Also return the adaptation of the model without its past, but with the errors to expect of the model with it.
 
     Args:
         field: the source model.
@@ -131,7 +133,26 @@ def adapted(
     found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)
     if not isinstance(field, DisturbanceModel):
         return found.field, found
-    return with_past(eqx.tree_at(lambda model: model.field, field, found.field), logs, most * STEPS), found
+    moved = eqx.tree_at(lambda model: model.field, field, found.field)
+    return with_past(moved, logs, most * STEPS), replace(found, expected=counting_past(found.expected, moved, logs))
+
+
+def counting_past(expected: Expected, model: DisturbanceModel, logs: Sequence[FlightLog]) -> Expected:
+    """Multiply errors to expect without a past by what the past changes in logs that its weights were not learned from.
+
+    Args:
+        expected: as in `Adaptation`.
+        model: the model with its past.
+        logs: the logs that `expected` is from.
+    """
+    found: dict[str, Any] = {}
+    for horizon, errors in expected.items():
+        steps = round(float(horizon.split()[0]) / logs[0].dt)
+        long = [log for log in logs if len(log) > steps]
+        own, alone = (np.concatenate([errors_of(field, log, steps) for log in long]) for field in (model, model.field))
+        shares: dict[str, float] = dict(zip(NAMES, (rmse(own) / rmse(alone))[-1].tolist(), strict=True))
+        found[horizon] = {name: tuple(shares[name] * value for value in values) for name, values in errors.items()}
+    return found
 
 
 def with_past(field: AbstractVectorField, logs: Sequence[FlightLog], most: int | None = None) -> DisturbanceModel:
@@ -218,13 +239,17 @@ def rmse_by_flight(
 
 def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[np.ndarray, "n t 4"]:
     """Compute the errors in UNITS for windows of a flight at the end of each interval."""
-    if isinstance(field, DisturbanceModel):  # which starts from what was seen before
-        parts = [(each, observe(field, each)[0]) for each in sequences([log], steps)]
-        cut = [windows_of(seen, np.asarray(each.u[0]), each.dt, steps=steps) for each, seen in parts]
-        windows = concatenate(cut)
-    else:
-        windows = cut_windows([log], steps, steps)
-    return np.stack(flight_errors(field, windows), axis=-1)
+    return np.stack(flight_errors(field, windows_for(field, log, steps, steps)), axis=-1)
+
+
+def windows_for(field: AbstractVectorField, log: FlightLog, steps: int, stride: int) -> Trajectories:
+    """Cut a flight into windows, as `cut_windows` does, with the filters' states of a field that has a past."""
+    if not isinstance(field, DisturbanceModel):
+        return cut_windows([log], steps, stride)
+    parts = [(each, observe(field, each)[0]) for each in sequences([log], steps)]
+    return concatenate(
+        [windows_of(seen, np.asarray(each.u[0]), each.dt, steps=steps, stride=stride) for each, seen in parts]
+    )
 
 
 def rmse(errors: Float[np.ndarray, "n t 4"]) -> Float[np.ndarray, "t 4"]:

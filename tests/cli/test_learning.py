@@ -9,7 +9,17 @@ from recorded import LOGS
 import hybrid_jax as hj
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.vehicle_file import LEARN, VehicleModel
-from hybrid_jax.identification.learning import STEPS, choose, errors_of, expected, learnable, with_past, without_past
+from hybrid_jax.identification.learning import (
+    NAMES,
+    STEPS,
+    choose,
+    counting_past,
+    errors_of,
+    expected,
+    learnable,
+    with_past,
+    without_past,
+)
 from hybrid_jax.vehicle import IRIS
 
 BODY = hj.rigid_body(IRIS)
@@ -40,6 +50,17 @@ def test_a_push_that_the_model_lacks_is_predicted_from_the_errors_before():
     assert eqx.tree_equal(without_past(model), lacking)
     before, after = (errors_of(field, LOGS[7], STEPS)[2:, -1, 1].mean() for field in (lacking, model))
     assert after < 0.3 * before
+
+
+def test_errors_to_expect_count_the_past():
+    lacking = hj.Hybrid(BODY, ConstantDisturbance(jnp.array([0, 0, -1.0, 0, 0, 0])))
+    model, flown = with_past(lacking, LOGS[:6]), LOGS[6:]
+    ones = {"0.1 s": dict.fromkeys(NAMES, (1.0, 0.5, 2.0))}
+    found = counting_past(ones, model, flown)["0.1 s"]
+    ends = [np.concatenate([errors_of(each, log, STEPS) for log in flown])[:, -1, 1] for each in (model, lacking)]
+    share = np.sqrt(np.mean(np.square(ends[0])) / np.mean(np.square(ends[1])))
+    np.testing.assert_allclose(found["velocity"], share * np.array([1.0, 0.5, 2.0]), rtol=1e-5)
+    assert share < 0.8 < found["attitude"][0]  # the force that it lacks does not turn it
 
 
 def test_weights_of_zero_have_the_errors_of_the_field_in_the_same_windows():

@@ -12,7 +12,7 @@ import hybrid_jax as hj
 from hybrid_jax import control
 from hybrid_jax.control.cost import deviations
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.dynamics.disturbance_model import DisturbanceModel
+from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.networks.mlp import InputScaling
 
 CONTROLLER = control.Controller(hj.IRIS)
