@@ -40,17 +40,18 @@ def rotate(q: Quaternion, v: Vector) -> Vector:
 def matrix(q: Quaternion | Rows) -> tuple[Rows, Rows, Rows]:
     """The rows of R, with R v = rotate(q, v)."""
     w, x, y, z = q
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    wx, wy, wz, xy, xz, yz = w * x, w * y, w * z, x * y, x * z, y * z
     return (
-        (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+        (ww + xx - yy - zz, 2 * (xy - wz), 2 * (xz + wy)),
+        (2 * (xy + wz), ww - xx + yy - zz, 2 * (yz - wx)),
+        (2 * (xz - wy), 2 * (yz + wx), ww - xx - yy + zz),
     )
 
 
 def body_z(q: Quaternion | Rows) -> Vector:
     """rotate(q, [0, 0, 1]) written out: the direction of thrust in the world frame."""
-    w, x, y, z = q
-    return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z])
+    return jnp.stack([row[2] for row in matrix(q)])
 
 
 def derivative(q: Quaternion | Rows, body_rates: Vector | Rows) -> Quaternion:

@@ -21,8 +21,8 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
     thrust, torque = _wrench(vehicle, constants, u)
     gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], jnp.result_type(thrust)), (3,) + (1,) * thrust.ndim)
-    acceleration = (thrust / constants["mass"][0]) * rotation.body_z(q) + gravity
     attitude = rotation.matrix(q)
+    acceleration = (thrust / constants["mass"][0]) * jnp.stack([row[2] for row in attitude]) + gravity
     velocity = [dot(column, v) for column in zip(*attitude, strict=True)]
     force = _specific_force(constants, velocity, torque)
     faster = _velocity_error(constants, velocity, force)
@@ -98,7 +98,8 @@ def in_world(attitude, parts) -> Float[Array, " 3 *b"]:
 
 
 def dot(a, b) -> Array:
-    return sum(left * right for left, right in zip(a, b, strict=True))  # type: ignore
+    first, *others = (left * right for left, right in zip(a, b, strict=True))
+    return sum(others, first)
 
 
 def is_present(term, absent: float = 0.0) -> bool:

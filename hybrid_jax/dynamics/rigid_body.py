@@ -110,8 +110,12 @@ class RigidBody(AbstractVectorField):
         entries = self.entries()
         return {name: jnp.stack(entries[name]).reshape(at) if at else entries[name][0] for name, at in shapes.items()}
 
-    def entries(self) -> dict[str, Rows]:
-        """Return the numbers of θ_p."""
+    def entries(self, *names: str) -> dict[str, Rows]:
+        """Return the numbers of θ_p.
+
+        Args:
+            names: the parameters that you need; by default all. Those that are not learned are left out.
+        """
         units, known = units_of(self.vehicle), nominal_values(self.vehicle, self.terms)
 
         def value(name: str, middle: float, deviation: Array) -> Array:
@@ -122,7 +126,8 @@ class RigidBody(AbstractVectorField):
                 deviation = tuple(jnp.ravel(deviation)) if shape_of(self.vehicle, name) else (deviation,)
             return tuple(value(name, *pair) for pair in zip(known[name], deviation, strict=True))
 
-        return {name: values(name, self.deviations[name]) for name in sorted(self.deviations)}
+        learned = sorted(self.deviations.keys() & set(names or self.deviations))
+        return {name: values(name, self.deviations[name]) for name in learned}
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
         return self.of_rows(tuple(x), tuple(u))
@@ -142,7 +147,7 @@ class RigidBody(AbstractVectorField):
             for name, at in INERTIAS.items():
                 factors = factors.at[at].set(jnp.exp(-self.deviations[name])) if name in self.deviations else factors
             residual = expand_trailing(factors, residual) * residual
-        lag = self.entries().get("velocity_lag", (self.terms.velocity_lag,))
+        lag = self.entries("velocity_lag").get("velocity_lag", (self.terms.velocity_lag,))
         if not equations.is_present(lag):
             return residual
         attitude = rotation.matrix(tuple(x[QUATERNION]))
