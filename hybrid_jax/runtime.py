@@ -36,6 +36,7 @@ if version("jaxlib").split(".")[:2] == ["0", "10"]:
 # At optimisation level 1 the simulator compiles in two thirds of the time of level 3, and flights are 3 % slower. At
 # level 0, which XLA_FLAGS can set, they are five times slower.
 FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
+UNOPTIMISED = FAST_COMPILE | {"xla_backend_optimization_level": 0}  # for programs in which nothing is repeated
 UNUSED = 30 * 24 * 3600  # s after which a program that nobody used is deleted: its source has changed
 MOST = 2**30  # bytes of programs; beyond, those used longest ago are deleted
 THREADS = "OPENBLAS_NUM_THREADS"

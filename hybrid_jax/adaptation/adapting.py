@@ -16,7 +16,7 @@ from hybrid_jax.adaptation.auto import Auto, Choice, extended, has_network
 from hybrid_jax.adaptation.expectation import expected_errors
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.outliers import outliers
-from hybrid_jax.adaptation.plausible import groups_of
+from hybrid_jax.adaptation.plausible import groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, correlated, longest_chain, overlap
@@ -30,7 +30,7 @@ from hybrid_jax.dynamics.disturbance import (
 )
 from hybrid_jax.dynamics.rigid_body import uncorrected
 from hybrid_jax.estimation.least_squares import discretisation, warn_of_steps
-from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters, sandwich
+from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, sandwich
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
@@ -229,7 +229,8 @@ def _parameters(
         return {"parameters": {}, "without_intervals": NOT_LEAST_SQUARES}
     own, d = physics_of(without_disturbance(field)), windows.x0.shape[-1]
     known = (own.parameter_units if isinstance(own, AbstractVectorField) else {}) | disturbance_units(field)
-    values, groups = named_parameters(field), groups_of([*named_parameters(field)])
+    values = values_of(field)
+    groups = groups_of([*values])
     units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
     found = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
     free, absorbed, vague = np.ones(len(values), bool), np.zeros(len(values)), np.zeros(len(values), bool)
@@ -264,7 +265,7 @@ def _parameters(
     whole = covariance + np.diag(absorbed)
     bounds = intervals(field, jnp.asarray(whole), level, degrees)
     apart = intervals(field, jnp.asarray(covariance), level, degrees)  # the source has the same network
-    before = jax.device_get(named_parameters(extended(source, d)))
+    before = values_of(extended(source, d))
     scaled, moved = "efficiency" in np.array(groups)[free], dict[str, float]()
     for i, name in enumerate(values):
         value, low, high = jax.device_get(tuple(bounds[name]))

@@ -113,17 +113,34 @@ def weights_of(field: AbstractVectorField) -> tuple[Float[Array, " w"], Callable
     return ravel_learned(field.residual)
 
 
+class Effect(NamedTuple):
+    """The squared difference that the network makes to the predictions, summed over the windows.
+
+    Attributes:
+        total: over all states.
+        of_states: of each state, after what another start explains.
+    """
+
+    total: Float[Array, ""]
+    of_states: Float[Array, " d"]
+
+
 def network_effect(
-    field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, starts: Starts | None = None
-) -> Float[Array, " d"]:
-    """Return the squared difference of predictions with and without the network, over windows, of each state."""
-    fields, (smooth, weigh) = (field, without_network(field)), from_starts(windows, starts)
+    field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, starts: Starts | None
+) -> Effect:
+    weights, _ = weights_of(field)
+    smooth, weigh = from_starts(windows, starts)
 
-    def errors(part: Trajectories):
-        return tuple(jax.vmap(lambda w, f=f: prediction_errors(f, w, solver, scale))(part) for f in fields)
+    def effect(part: Trajectories):
+        def errors(change: Float[Array, " w"]):
+            changed: Any = with_change(field, change)
+            return jax.vmap(lambda window: prediction_errors(changed, window, solver, scale))(part)
 
-    there, without = map(weigh, in_chunks(errors, smooth, CHUNK))
-    return jnp.sum(jnp.square(there - without), axis=(0, 1))
+        return jax.lax.map(errors, jnp.stack([jnp.zeros_like(weights), -weights]))  # one copy of the rollout
+
+    there, without = jnp.moveaxis(in_chunks(lambda part: jnp.moveaxis(effect(part), 0, 1), smooth, CHUNK), 1, 0)
+    apart = jnp.square(weigh(there) - weigh(without))
+    return Effect(jnp.sum(jnp.square(there - without)), jnp.sum(apart, axis=(0, 1)))
 
 
 def taken_by_network(
@@ -137,7 +154,7 @@ def taken_by_network(
     4.3.7).
 
     Args:
-        effect: ‖b_s‖², see `network_effect`.
+        effect: ‖b_s‖², see `Effect`.
         equations: of the same windows and the fitted parameters.
         of_states: J_sᵀ J_s, of these and others.
     """

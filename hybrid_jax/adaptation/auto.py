@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.anchored import (
+    Anchored,
     fit_anchored,
     network_effect,
     taken_by_network,
@@ -46,7 +48,7 @@ from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import sandwich_of_repeated
 from hybrid_jax.networks.standardise import motion_of
-from hybrid_jax.runtime import FASTEST_COMPILE, jit_by_size
+from hybrid_jax.runtime import FASTEST_COMPILE, UNOPTIMISED, jit_by_size
 from hybrid_jax.status import Status
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
@@ -142,11 +144,11 @@ class Auto(Method):
         """
         jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))  # then the outer program has the options
-        begin, fits, replace, judge, conclude = STEPS if traced else COMPILED
+        fits, anchor, begin, measure, replace, judge, conclude = STEPS if traced else COMPILED
         # Only these settings matter; as an array, another scale needs no other program.
         scale, solver = scale_of(settings.objective, train.x0.shape[-1]), settings.solver
         larger, physics, sizes = begin(self, field, train)
-        options = sizes, solver, scale, self.max_steps
+        options, effect, step = (sizes, solver, scale, self.max_steps), None, None
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
         learned_from = motion_of(field) if learned_from is None else learned_from
         if learned_from is not None:
@@ -156,11 +158,15 @@ class Auto(Method):
             larger, source = replace(self, larger, own, rival, distinct)
         options = *options, jnp.array(len(train))
         (found, every, starts), fitted = fits(larger, train, both, *options), None
+        if has_network(field):  # also if physics replaced the source: then it is the difference of two models
+            effect = measure(field, train, solver, scale, starts)
         for _ in range(ROUNDS):
-            chosen, nothing, rows = judge(field, larger, train, found, every, source, learned_from, *options[:3])
-            if traced or fitted is None or (rows != fitted).any():
+            chosen, nothing, rows = judge(larger, train, found, every, source, learned_from, effect, sizes)
+            if traced or fitted is None or not np.array_equal(rows, fitted):
                 found, fitted = fits(larger, train, rows, *options)[1], rows
-        return conclude(self, field, larger, train, starts, (found, chosen, source, nothing), options[:3])
+        if self.networks and has_network(field):
+            step = anchor(larger, train, starts, found, solver, scale, nothing.error, self.blocks)
+        return conclude(self, field, larger, train, (found, chosen, source, nothing, effect, step), options[:2])
 
 
 class OfSource(NamedTuple):
@@ -179,7 +185,7 @@ def _begin(method: Auto, field, train: Trajectories):
 
 def _fits(field, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
     found, starts = fit_each(field, windows, free, *options)
-    return at(found, 0), at(found, 1), starts
+    return (*(jax.tree.map(itemgetter(row), found) for row in (0, 1)), starts)
 
 
 def _replace(method: Auto, larger, own: Fit, rival: Fit | None, distinct) -> tuple[Any, OfSource]:
@@ -193,21 +199,25 @@ def _replace(method: Auto, larger, own: Fit, rival: Fit | None, distinct) -> tup
 
 
 def _judge(
-    field, larger, train: Trajectories, around: Fit, every: Fit, source: OfSource | None, learned_from, *options
+    larger, train: Trajectories, around: Fit, every: Fit, source: OfSource | None, learned_from, effect, sizes
 ) -> tuple[Posterior, Unchanged, Bool[Array, "2 p"]]:
-    (sizes, solver, scale), start = options, ravel_parameters(larger)[0]
+    start = ravel_parameters(larger)[0]
     free, nothing = np.stack([*free_parameters(larger).values()]), Unchanged(jnp.zeros_like(start), jnp.zeros(()))
     if source is not None:
-        # Also if physics replaced the source: the effect is the difference of two models of it.
-        added = jnp.sum(network_effect(field, train, solver, scale)) if has_network(field) else 0.0
-        nothing = unchanged(source.own, around, added, larger, learned_from, train)
+        nothing = unchanged(source.own, around, effect.total if effect else 0.0, larger, learned_from, train)
     found = posterior(around, every, start, free, sizes, nothing.apparent)
     return found, nothing, jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
 
 
-def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome, options) -> Solution:
-    """Fit the network's change on top of the chosen candidate, and compute the errors of left-out blocks."""
-    (found, chosen, source, nothing), (sizes, solver, scale) = outcome, options
+def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale, error, blocks: int) -> Anchored:
+    """Fit the network's change on top of the chosen candidate."""
+    field = ravel_parameters(larger)[1](found.theta)
+    return fit_anchored(field, train, starts, found.noise, solver, scale, error, blocks_of(len(train), blocks))
+
+
+def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options) -> Solution:
+    """Add the network's change if it is probable, and compute the errors of left-out blocks."""
+    (found, chosen, source, nothing, effect, step), (sizes, solver) = outcome, options
     start, unravel = ravel_parameters(larger)
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
@@ -223,9 +233,8 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
     held = jnp.diag(jnp.where(free[taken] & found.seen, found.noise / jnp.square(sizes), 0.0))
     left_out = found.theta + left_out_steps(equations, held, held @ (found.theta - start), blocks)
     changes = jnp.zeros((len(left_out), 0))
-    if method.networks and has_network(larger):
+    if step is not None:
         removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, if physics replaced it
-        step = fit_anchored(unravel(found.theta), train, starts, found.noise, solver, scale, nothing.error, blocks)
         odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
         better = odds > STRONG
         changes, change = jnp.where(better, step.left_out, 0.0), jnp.tile(removed, (len(names) + 1, 1))
@@ -242,25 +251,22 @@ def _conclude(method: Auto, field, larger, train: Trajectories, starts, outcome,
 
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[blocks[0]], train)
     ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(blocks[1])))
+    absorbed = jnp.zeros_like(start)
+    if effect is not None:
+        absorbed = jnp.where(alone, absorbed, taken_by_network(effect.of_states, equations, found.of_states))
+    # Other systems' sizes are relative to the source's value, and change with the parametrisation.
+    vague = jnp.sqrt(absorbed) > VAGUE * (sizes if "drag" in groups_of(names_of(larger)) else jnp.inf)
     first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
-    choice = Choice(*first, inherited, jnp.asarray(degrees), jnp.zeros_like(start), jnp.zeros(len(start), bool))
+    choice = Choice(*first, inherited, jnp.asarray(degrees), absorbed, vague)
     adapted = candidate(extended(field, train.x0.shape[1]), choice, taken)
-    if has_network(larger):
-        effect = network_effect(adapted, train, solver, scale, starts)
-        absorbed = taken_by_network(effect, equations, found.of_states)
-        # Other systems' sizes are relative to the source's value, and change with the parametrisation.
-        plausible = sizes if "drag" in groups_of(names_of(larger)) else jnp.inf
-        choice = choice._replace(absorbed=absorbed, vague=jnp.sqrt(absorbed) > VAGUE * plausible)
     finite = (found.status == Status.OK) | ~jnp.isinf(ends).any()
     return Solution(adapted, found.steps, jnp.where(finite, found.status, Status.DIVERGED), choice)
 
 
-STEPS: tuple[Any, ...] = (_begin, _fits, _replace, _judge, _conclude)
-COMPILED = tuple(jit_by_size(FASTEST_COMPILE)(step) for step in STEPS)
-
-
-def at(fits: Fit, index: Int[Array, ""] | int) -> Fit:
-    return jax.tree.map(lambda leaf: leaf[index], fits)
+LOOPS: tuple[Any, ...] = (_fits, _anchor)
+ONCE: tuple[Any, ...] = (_begin, network_effect, _replace, _judge, _conclude)
+STEPS = LOOPS + ONCE
+COMPILED = (*map(jit_by_size(FASTEST_COMPILE), LOOPS), *map(jit_by_size(UNOPTIMISED), ONCE))
 
 
 def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
@@ -280,10 +286,9 @@ def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:
 
 def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
     """Return which parameters of an extended field each candidate fits (c, p)."""
-    names = names_of(field)
+    names, found = names_of(field), {}
     group = groups_of(names)
     lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
-    found = {}
     for name, fitted in CANDIDATES.items():
         if set(fitted) <= {*group, "theta"}:
             free = np.array([each in fitted for each in group])

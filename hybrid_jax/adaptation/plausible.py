@@ -12,6 +12,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 # Parameters of a corrected rigid body; the others are its own, θ_p.
@@ -73,6 +74,16 @@ def names_of(field: AbstractVectorField) -> list[str]:
     names: list[str] = []
     jax.eval_shape(lambda: names.extend(named_parameters(field)))  # computes nothing
     return names
+
+
+@jit_by_size(UNOPTIMISED)  # one by one, these small operations take as long to compile as a rollout
+def _numbers(field: AbstractVectorField) -> list[Array]:
+    return [*named_parameters(field).values()]
+
+
+def values_of(field: AbstractVectorField) -> dict[str, float]:
+    """Return the parameters of a field's physics by name."""
+    return dict(zip(names_of(field), map(float, jax.device_get(_numbers(field))), strict=True))
 
 
 def groups_of(names: Sequence[str]) -> list[str]:
