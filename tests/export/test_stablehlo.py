@@ -13,7 +13,13 @@ from hybrid_jax.export import export_program, load_program
 from hybrid_jax.export.stablehlo import FORMAT
 from hybrid_jax.io.files import save_archive
 
-KINDS = ("rigid body", "multirotor, per rotor", "hybrid, norm batch", "residual from body_motion to motion", "hold")
+KINDS = (
+    "rigid body",
+    "multirotor, per rotor",
+    "hybrid, norm batch",
+    "residual from body_motion to accelerations",
+    "hold",
+)
 
 
 @pytest.fixture
