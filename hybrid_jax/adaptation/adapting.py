@@ -12,7 +12,8 @@ import numpy as np
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
-from hybrid_jax.adaptation.auto import Auto, Choice, extended, has_network
+from hybrid_jax.adaptation.anchored import has_network
+from hybrid_jax.adaptation.auto import Auto, Choice, extended
 from hybrid_jax.adaptation.expectation import expected_errors
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.outliers import outliers

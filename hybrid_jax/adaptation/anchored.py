@@ -14,8 +14,9 @@ from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax.adaptation.selection import TINY, left_out_steps
 from hybrid_jax.batches import in_chunks
-from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
+from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
 from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
 from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, inverse
 from hybrid_jax.estimation.starts import Starts, from_starts
@@ -105,6 +106,13 @@ def fit_anchored(
 def with_change(field: AbstractVectorField, change: Float[Array, " w"]) -> AbstractVectorField:
     weights, unravel = weights_of(field)
     return eqx.tree_at(lambda hybrid: hybrid.residual, field, unravel(weights + change))
+
+
+def has_network(field: AbstractVectorField) -> bool:
+    """Whether a field is a hybrid with a trainable residual other than a disturbance."""
+    return (
+        isinstance(field, Hybrid) and physics_of(field) is not field and any(jax.tree.leaves(trainable(field.residual)))
+    )
 
 
 def weights_of(field: AbstractVectorField) -> tuple[Float[Array, " w"], Callable[[Float[Array, " w"]], PyTree]]:

@@ -16,6 +16,7 @@ from hybrid_jax import checks
 from hybrid_jax.adaptation.anchored import (
     Anchored,
     fit_anchored,
+    has_network,
     network_effect,
     taken_by_network,
     weights_of,
@@ -40,9 +41,8 @@ from hybrid_jax.adaptation.selection import (
     spread,
     unchanged,
 )
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
-from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations, masked
@@ -294,10 +294,3 @@ def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
             free = np.array([each in fitted for each in group])
             found[name] = free & ~lost if "efficiency" in fitted else free
     return found
-
-
-def has_network(field: AbstractVectorField) -> bool:
-    """Whether a field is a hybrid with a trainable residual other than a disturbance."""
-    return (
-        isinstance(field, Hybrid) and physics_of(field) is not field and any(jax.tree.leaves(trainable(field.residual)))
-    )

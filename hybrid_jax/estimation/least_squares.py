@@ -22,7 +22,7 @@ from hybrid_jax.estimation.levenberg_marquardt import State, begin, corrected, j
 from hybrid_jax.implicit_solvers import solver_errors, unsolved
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.metrics import errors_in
-from hybrid_jax.runtime import entry, jit_by_size, keep_programs
+from hybrid_jax.runtime import FASTEST_COMPILE, entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories, errors_of
 
@@ -122,10 +122,10 @@ def discretisation(field: AbstractVectorField, windows: Trajectories, solver: So
     return float(_standard_errors(field, some, solver, scale, change)) / noise
 
 
-@jit_by_size()
+@jit_by_size(FASTEST_COMPILE)
 def _standard_errors(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, change):
     """Compute by how many standard errors, in noise of 1, a change of the predictions moves a parameter at most."""
-    theta, unravel = ravel_parameters(field)
+    theta, unravel = ravel_parameters(fixed_residual(field))
     jacobian, _ = _linearised(lambda at, w: prediction_errors(unravel(at), w, solver, scale), theta, windows)
     jacobian = jacobian.reshape(-1, theta.size)
     jacobian = jacobian / _nonzero(jnp.linalg.norm(jacobian, axis=0))
