@@ -1,4 +1,4 @@
-"""A system that is not a quadrotor: a pendulum driven by a torque, with flights of it. For the tests of learning."""
+"""Systems that are no quadrotors, with windows of them: a driven pendulum, and one that is linear in θ_p."""
 
 from dataclasses import replace
 from functools import cache
@@ -73,3 +73,25 @@ def flown(truth, count=40, noise=0.003, seed=0):
     start = swings(count, seed=seed)
     x = np.asarray(eqx.filter_jit(rollout_batch)(truth, start.x0, start.u, start.dt))
     return replace(start, x=x + noise * np.random.default_rng(seed).normal(size=x.shape).astype(np.float32))
+
+
+class Push(AbstractVectorField):
+    """ẋ = (a u₀ + b u₁, b u₀): linear in its parameters, so least squares has a closed form."""
+
+    gains: Float[Array, " 2"]
+
+    def __call__(self, x, u):
+        a, b = self.gains
+        return jnp.stack([a * u[0] + b * u[1], b * u[0]])
+
+
+def pushes(count, noise, unit=1.0, steps=6, dt=0.1):
+    """Windows of Push(3, −2) with white noise on the states, gains in units of `unit`; and ∂x/∂gains (n, t·d, 2)."""
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(count, steps, 2)) / unit
+    reached = dt * np.cumsum(u, axis=1)
+    zero = np.zeros((count, steps))
+    design = np.stack([np.stack([reached[..., 0], zero], -1), reached[..., ::-1]], -1)
+    x = design @ [3.0 * unit, -2.0 * unit] + noise * rng.normal(size=(count, steps, 2))
+    windows = Trajectories(np.zeros((count, 2), np.float32), u.astype(np.float32), x.astype(np.float32), dt)
+    return windows, design.reshape(count, -1, 2)

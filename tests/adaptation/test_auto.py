@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pendulum import LENGTH, flown, hybrid, pendulum
-from pushes import Push, pushes
+from pendulum import LENGTH, Push, flown, hybrid, pendulum, pushes
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation import FineTune, adapt

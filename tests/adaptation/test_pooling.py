@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy
-from pendulum import LENGTH, pendulum, swings
-from pushes import Push, pushes
+from pendulum import LENGTH, Push, pendulum, pushes, swings
 from surface import refusal
 
 import hybrid_jax as hj

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pendulum import pendulum, swings
-from pushes import Push, pushes
+from pendulum import Push, pendulum, pushes, swings
 
 import hybrid_jax as hj
 from hybrid_jax import AbstractVectorField, fit_least_squares, rollout_batch

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pendulum import LENGTH, pendulum, swings
-from pushes import Push, pushes
+from pendulum import LENGTH, Push, pendulum, pushes, swings
 
 from hybrid_jax import (
     Hybrid,

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
-from pendulum import pendulum, swings
-from pushes import Push, pushes
+from pendulum import Push, pendulum, pushes, swings
 from rich.console import Console
 
 from experiments.paper.known_body import coverage
