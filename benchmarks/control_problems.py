@@ -16,9 +16,7 @@ from benchmarks.subjects import DT, SCALING
 from hybrid_jax import rotation
 from hybrid_jax.control import Controller, figure_eight, hover, low_flyby, sample, step
 from hybrid_jax.control.references import Path
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.dynamics import AbstractVectorField, ConstantDisturbance, Terms
 from hybrid_jax.networks import multirotor_network
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.trajectories import Trajectories

@@ -17,15 +17,12 @@ import numpy as np
 import tyro
 
 from hybrid_jax.cli.command import exit_codes
+from hybrid_jax.flights import FlightLog, Recording, check_recording, find_logs, read_recording
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
 from hybrid_jax.flights.checks.cleaning import in_flight
 from hybrid_jax.flights.checks.consistency import FAILS, UNKNOWN, WARNS, Check, check_log
-from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import flight_at
 from hybrid_jax.flights.formats.raw import Samples, record
-from hybrid_jax.flights.load import find_logs, read_recording
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.recording import Recording
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.flight import DT, gone_wrong, random_flights
 from hybrid_jax.vehicle import IRIS, load_vehicle

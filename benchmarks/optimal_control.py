@@ -23,8 +23,7 @@ from benchmarks.control_problems import CONTROLLER, VEHICLE, Problem, adapted, f
 from benchmarks.shooting import Shooting, Solution
 from benchmarks.timing import Findings, Ratio, run, table
 from hybrid_jax.control import Controller, Plan, advance, figure_eight, fly, performance, sample
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance
+from hybrid_jax.dynamics import AbstractVectorField, ConstantDisturbance
 from hybrid_jax.networks import smoothed
 
 ITERATIONS = 40

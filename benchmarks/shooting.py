@@ -12,9 +12,7 @@ from jaxtyping import Float
 from benchmarks.control_problems import Problem
 from hybrid_jax.control import Controller, Weights
 from hybrid_jax.control.controller import VARIABLE_BOUND
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance
+from hybrid_jax.dynamics import AbstractVectorField, ConstantDisturbance, Hybrid
 from hybrid_jax.export import casadi_function
 from hybrid_jax.vehicle import INPUT_SIZE, QUATERNION, STATE_SIZE
 

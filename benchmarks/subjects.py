@@ -7,18 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.grids import Grid, diffusion
+from hybrid_jax.dynamics import AbstractVectorField, Grid, Hybrid, Terms, diffusion
 from hybrid_jax.dynamics.rigid_body import perturbed, rigid_body
-from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.grids import grid_network
 from hybrid_jax.networks.mlp import InputScaling, residual_network
-from hybrid_jax.training import fitting
+from hybrid_jax.training import Settings, fitting
 from hybrid_jax.training.fitting import RunConfig, make_run_config
 from hybrid_jax.training.loss import REGULARISERS
-from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 

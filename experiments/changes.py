@@ -40,8 +40,7 @@ from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.training import evaluate
+from hybrid_jax.sweep import evaluate, hosts
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS, STATE_SIZE

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics import AbstractVectorField, Hybrid
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.structure import portable
 from hybrid_jax.networks.mlp import residual_network

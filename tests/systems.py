@@ -15,9 +15,7 @@ from jaxtyping import Array, Float
 from pendulum import pendulum, whirling
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.dynamics import AbstractVectorField, Terms, rigid_body
 
 ODD = replace(  # a vehicle without any symmetry
     hj.IRIS, mass=2.1, inertia=(0.05, 0.02, 0.06), thrust_coefficient=1.1e-5, torque_coefficient=2e-6, gravity=9.7,

@@ -9,8 +9,7 @@ import pytest
 from choices import slow
 from pendulum import pendulum
 
-from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.dynamics import Hybrid, rigid_body
 from hybrid_jax.integrate import RK4, SOLVERS, integrate, rollout, rollout_batch
 from hybrid_jax.metrics import predict
 from hybrid_jax.networks.mlp import residual_network

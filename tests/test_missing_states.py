@@ -11,8 +11,7 @@ import pytest
 from pendulum import LENGTH, pendulum, swings, whirling
 
 import hybrid_jax as hj
-from hybrid_jax.estimation.least_squares import fit_least_squares
-from hybrid_jax.estimation.uncertainty import covariance_of
+from hybrid_jax.estimation import covariance_of, fit_least_squares
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.training.objective import TrajectoryLoss
 

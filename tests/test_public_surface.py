@@ -16,12 +16,10 @@ from surface import cases, is_finite, odd, outcome, spoiled
 import hybrid_jax as hj
 from hybrid_jax import metrics
 from hybrid_jax.adaptation import ridge
-from hybrid_jax.estimation import uncertainty
-from hybrid_jax.estimation.least_squares import fit_least_squares
+from hybrid_jax.estimation import fit_least_squares, uncertainty
 from hybrid_jax.export import export_program, load_program
 from hybrid_jax.networks.mlp import InputScaling
-from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sim.flight import SplitSpec, random_flights
+from hybrid_jax.sim import SOURCE, Domain, SplitSpec, random_flights
 from hybrid_jax.status import Status
 from hybrid_jax.training.loss import residual_norm
 from hybrid_jax.trajectories import check, concatenate, split, windows_of

@@ -11,12 +11,10 @@ from surface import refusal
 import hybrid_jax as hj
 from hybrid_jax.control import Controller
 from hybrid_jax.export.program import sizes_of
+from hybrid_jax.flights import FlightLog, load_log
 from hybrid_jax.flights.checks.consistency import OK, check_log
 from hybrid_jax.flights.checks.motor_response import respond
-from hybrid_jax.flights.load import load_log
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.sim.domain import Domain
-from hybrid_jax.sim.flight import random_flights
+from hybrid_jax.sim import Domain, random_flights
 from hybrid_jax.vehicle import IRIS, STATE_NAMES, input_names
 
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import surface
 
-from hybrid_jax.dynamics.rigid_body import RigidBody
-from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.dynamics import RigidBody, Terms
 from hybrid_jax.dynamics.vehicle_file import LAG, load_vehicle_model
 from hybrid_jax.vehicle import load_vehicle
 

@@ -25,8 +25,7 @@ from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation import LeastSquares
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
-from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.sweep import hosts, lane
 from hybrid_jax.vehicle import IRIS
 
 NAME = "closed_loop"

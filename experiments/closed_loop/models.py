@@ -21,8 +21,7 @@ from hybrid_jax import rotation
 from hybrid_jax.adaptation import Method
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.rigid_body import RigidBody, nominal, rigid_body
-from hybrid_jax.io import portable
-from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.io import Dataset, portable
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.forces import WIND_MEAN, drag, ground_effect, parameters_of, wind
 from hybrid_jax.sweep.lanes import lane

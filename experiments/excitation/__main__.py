@@ -40,8 +40,7 @@ from hybrid_jax import control
 from hybrid_jax.control import Controller
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.dynamics.rigid_body import nominal, rigid_body
-from hybrid_jax.estimation.least_squares import fit_least_squares
-from hybrid_jax.estimation.uncertainty import covariance_of, intervals
+from hybrid_jax.estimation import covariance_of, fit_least_squares, intervals
 from hybrid_jax.planning import Excitation, FlightBounds, excitation
 from hybrid_jax.planning.fisher_information import information_of
 from hybrid_jax.sim import flight as random_flight

@@ -18,12 +18,10 @@ from experiments.runner import command
 from hybrid_jax import runtime
 from hybrid_jax.dynamics.actuators import Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
+from hybrid_jax.flights import Recording, read_recording
 from hybrid_jax.flights.checks.airborne import airborne, within
-from hybrid_jax.flights.load import read_recording
-from hybrid_jax.flights.recording import Recording
-from hybrid_jax.identification.fitting import identify
+from hybrid_jax.identification import Layout, identify
 from hybrid_jax.identification.log_checks import inputs_of
-from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.vehicle import Vehicle
 
 WHOLE, SECONDS = 47.0, 3.0  # mm of a propeller; s that are learned from

@@ -26,14 +26,11 @@ from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
+from hybrid_jax.flights import FlightLog, Recording, read_recording
 from hybrid_jax.flights.checks.airborne import airborne, within
-from hybrid_jax.flights.load import read_recording
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.windows import cut_windows, errors_between
-from hybrid_jax.identification.fitting import identify
+from hybrid_jax.identification import Layout, identify
 from hybrid_jax.identification.log_checks import inputs_of
-from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.vehicle import VELOCITY
 
 OF_A = """B2_circle_slow_rep1 B2_circle_medium_rep1 B2_circle_fast_rep1 B3_figure8_slow_rep1 B3_figure8_fast_rep1

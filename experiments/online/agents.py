@@ -14,13 +14,11 @@ from experiments.flying.changes import DOUBLED_DRAG, LOST_THRUST, OFF_CENTRE_LOA
 from experiments.flying.plant import wind_force
 from hybrid_jax.control import Hardware, Observer, advance
 from hybrid_jax.control.observer import MOTION
+from hybrid_jax.dynamics import ConstantDisturbance, Hybrid, with_disturbance
 from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, ravel_learned
-from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
 from hybrid_jax.dynamics.terms import Terms, units_of
-from hybrid_jax.online.estimator import OnlineAdaptation
-from hybrid_jax.online.hypotheses import Hypothesis
+from hybrid_jax.online import Hypothesis, OnlineAdaptation
 from hybrid_jax.rotation import body_z
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.forces import DRAG_COEFFICIENT

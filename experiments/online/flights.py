@@ -21,8 +21,7 @@ from experiments.online.agents import CHANGES, PARTS
 from experiments.online.config import OnlineConfig
 from experiments.runner.stages import Stages
 from hybrid_jax.control import Hardware, Loop
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import with_disturbance
+from hybrid_jax.dynamics import AbstractVectorField, with_disturbance
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.online.estimator import OnlineAdaptation
 from hybrid_jax.sim import flight as random_flight

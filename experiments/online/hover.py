@@ -16,13 +16,10 @@ from experiments.flying.scenario import hardware
 from experiments.worlds.rotorpy import HUMMINGBIRD, ROTORPY, advance, decide
 from experiments.worlds.world import DT, Reference
 from hybrid_jax import control
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import with_disturbance
-from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.dynamics import AbstractVectorField, rigid_body, with_disturbance
 from hybrid_jax.online import Hypothesis, OnlineAdaptation
 from hybrid_jax.runtime import FASTEST_COMPILE, configure, jit_with
-from hybrid_jax.sim import pilot
-from hybrid_jax.sim.domain import SOURCE
+from hybrid_jax.sim import SOURCE, pilot
 from hybrid_jax.sim.forces import Wrench, parameters_of
 from hybrid_jax.vehicle import BODY_RATES, IRIS, VELOCITY, State
 

@@ -15,8 +15,7 @@ from experiments.paper.config import HELD_BACK, Config, Encoding, Stopping, colu
 from experiments.paper.expert_augmentation import expert_augmented
 from experiments.runner.options import NotNegative
 from hybrid_jax import rotation
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
-from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, perturbed
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.io.datasets import Dataset
@@ -25,10 +24,9 @@ from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.flight import permutation
 from hybrid_jax.sweep.lanes import count, lane, stack
-from hybrid_jax.training import fitting
+from hybrid_jax.training import Settings, fitting
 from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config
 from hybrid_jax.training.loss import REGULARISERS
-from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, VELOCITY, Vehicle
 

@@ -15,8 +15,7 @@ from experiments.runner.progress import Line
 from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, nominal, rigid_body
-from hybrid_jax.estimation.least_squares import fit_least_squares
-from hybrid_jax.estimation.uncertainty import covariance_of, intervals
+from hybrid_jax.estimation import covariance_of, fit_least_squares, intervals
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.trajectories import Trajectories

@@ -13,8 +13,7 @@ import hybrid_jax
 from experiments.reporting import names
 from experiments.reporting.names import HYBRID, SOURCE_ONLY, label
 from experiments.reporting.results import Results, Row
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics import AbstractVectorField, Hybrid
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.status import Status
 from hybrid_jax.sweep.lanes import lane

@@ -26,8 +26,7 @@ from hybrid_jax.integrate import compact
 from hybrid_jax.metrics import predict
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.domain import Domain
-from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.sweep import hosts, lane
 from hybrid_jax.vehicle import IRIS
 
 DRAWN_FLIGHTS = 200  # the test flights whose predictions are drawn

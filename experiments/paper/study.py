@@ -28,8 +28,7 @@ from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import DT, SplitSpec
 from hybrid_jax.status import Status
-from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.sweep import hosts, lane
 from hybrid_jax.sweep.training import evaluate, evaluate_windows, sweep
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories

@@ -11,8 +11,7 @@ from experiments.reaction_diffusion.models import error, joined, pieces, weights
 from experiments.reaction_diffusion.systems import D_U, D_V, SCOTT_COARSE, Conversion, gray_scott, patterns
 from experiments.reporting.results import Row
 from experiments.runner.stages import Found, Kept, rows_of
-from hybrid_jax.networks import zero_output
-from hybrid_jax.networks.grids import GridNetwork
+from hybrid_jax.networks import GridNetwork, zero_output
 from hybrid_jax.networks.normalisation import ChannelScaling
 
 PART = "gray_scott"

@@ -14,9 +14,7 @@ from experiments.runner.cache import identity_of
 from experiments.runner.stages import Found, Stages, rows_of
 from hybrid_jax.adaptation import Adaptation, adapt
 from hybrid_jax.cli.logs import Flights
-from hybrid_jax.dynamics.base import AbstractVectorField, HoldState
-from hybrid_jax.dynamics.rigid_body import FrozenRates, rigid_body
-from hybrid_jax.dynamics.vehicle_file import VehicleModel
+from hybrid_jax.dynamics import AbstractVectorField, FrozenRates, HoldState, VehicleModel, rigid_body
 from hybrid_jax.flights.checks.cleaning import lag_motors
 from hybrid_jax.flights.log import FlightLog, segments
 from hybrid_jax.flights.windows import cut_windows, flight_of, folds, manoeuvre_of

@@ -23,8 +23,7 @@ from experiments.runner.run_record import PACKAGES, require_same
 from hybrid_jax.io.datasets import Dataset, versions
 from hybrid_jax.io.files import Arrays, named_leaves, with_leaves
 from hybrid_jax.runtime import cores
-from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.training import Progress, sweep
+from hybrid_jax.sweep import Progress, hosts, sweep
 from hybrid_jax.training.fitting import FitState, RunConfig
 from hybrid_jax.training.objective import Settings
 

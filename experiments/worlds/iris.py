@@ -10,8 +10,7 @@ from experiments.flying import changes
 from experiments.worlds.world import DT, Flown, Kind, draw_reference, flown, starting_state
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
-from hybrid_jax.sim import pilot
-from hybrid_jax.sim.domain import SOURCE, Domain, Quadrotor
+from hybrid_jax.sim import SOURCE, Domain, Quadrotor, pilot
 from hybrid_jax.sim.flight import CLOCK
 from hybrid_jax.sim.forces import Parameters, Scalar, parameters_of
 from hybrid_jax.vehicle import IRIS, Vehicle

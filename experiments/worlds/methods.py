@@ -13,8 +13,7 @@ import numpy as np
 import hybrid_jax as hj
 from experiments.paper.conditions import Noise
 from experiments.worlds.world import DT, World
-from hybrid_jax.adaptation.methods import FineTune, Method
-from hybrid_jax.adaptation.results import Adaptation, Parameter
+from hybrid_jax.adaptation import Adaptation, FineTune, Method, Parameter
 
 WHITE_BOX = "Ix", "Iy", "k", "drag"  # what physics without a network learns
 CHANGING = 1.0  # m/s² and rad/s²: the filter's prior of a disturbance

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.dynamics import ConstantDisturbance, Terms
 
 DRAG = np.array([0.4, 0.3, 0.1])
 NOISE = np.repeat([1e-3, 2e-3, 0.02, 0.02], [3, 4, 3, 3])  # m, 1, m/s, rad/s

@@ -14,8 +14,7 @@ from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.cli.command import NOTHING_CHANGED, ChecksFailed
 from hybrid_jax.cli.fit import Options
 from hybrid_jax.cli.identify import _by_step, _nearest, checked
-from hybrid_jax.dynamics.actuators import Actuator
-from hybrid_jax.dynamics.vehicle_file import VehicleModel
+from hybrid_jax.dynamics import Actuator, VehicleModel
 from hybrid_jax.flights.checks.consistency import FAILS
 from hybrid_jax.identification.log_checks import compared
 from hybrid_jax.vehicle import IRIS

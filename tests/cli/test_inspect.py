@@ -14,8 +14,7 @@ from hybrid_jax.cli.command import ChecksFailed
 from hybrid_jax.cli.inspect import Options, inspected, result_of, trusted
 from hybrid_jax.cli.logs import FlightOptions, read_flights
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.recording import Recording, Signal
+from hybrid_jax.flights import FlightLog, Recording, Signal
 from hybrid_jax.identification.estimates import estimate, vehicle_text
 from hybrid_jax.vehicle import IRIS, load_vehicle
 

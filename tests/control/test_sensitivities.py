@@ -12,8 +12,7 @@ from choices import slow
 import hybrid_jax as hj
 from hybrid_jax.control import advance
 from hybrid_jax.control.sensitivities import advance_lagged, advance_with_jacobian, condensed, stage_shares, step_of
-from hybrid_jax.dynamics.composition import Frozen
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance
+from hybrid_jax.dynamics import ConstantDisturbance, Frozen
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
 from hybrid_jax.networks.views import multirotor_network
 

@@ -11,8 +11,7 @@ from evaluations import infer_batch, train_batch
 from systems import ODD
 
 from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid, rotation
-from hybrid_jax.dynamics.base import HoldState
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance
+from hybrid_jax.dynamics import ConstantDisturbance, HoldState
 from hybrid_jax.dynamics.rigid_body import LEARNED, FrozenRates, RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
 from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY

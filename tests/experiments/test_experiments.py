@@ -24,8 +24,7 @@ from experiments.identification import emps, record, tanks
 from experiments.paper.config import SMOKE
 from experiments.paper.lanes import physics_in
 from experiments.paper.study import placeholder, study
-from hybrid_jax.sim.domain import PARAMETER_SHIFT
-from hybrid_jax.sim.flight import SplitSpec
+from hybrid_jax.sim import PARAMETER_SHIFT, SplitSpec
 from hybrid_jax.vehicle import IRIS
 
 

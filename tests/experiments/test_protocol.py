@@ -19,8 +19,7 @@ from experiments.paper.config import PAPER, PRESETS, AdaptationConfig, Stopping,
 from experiments.paper.study import drawn_splits, placeholder, pretrained
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.io.datasets import Dataset, save_dataset
-from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
-from hybrid_jax.sim.flight import SplitSpec
+from hybrid_jax.sim import PARAMETER_SHIFT, SOURCE, SplitSpec
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS

@@ -8,8 +8,7 @@ import pytest
 from surface import refusal
 from writers import blackbox
 
-from hybrid_jax.flights.conversion import to_flight
-from hybrid_jax.flights.load import read_recording
+from hybrid_jax.flights import read_recording, to_flight
 
 pytest.importorskip("orangebox")
 

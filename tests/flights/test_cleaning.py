@@ -7,11 +7,10 @@ import pytest
 from recorded import LOGS
 from surface import refusal
 
+from hybrid_jax.flights import Recording, Signal, cut_windows
 from hybrid_jax.flights.checks.airborne import CLEAR, MARGIN, airborne
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean, delay, in_flight, lag_motors, resample
 from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
-from hybrid_jax.flights.recording import Recording, Signal
-from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.trajectories import check
 
 

@@ -7,12 +7,11 @@ from hypothesis import strategies as st
 from surface import outcome, refusal
 from writers import MAP, foreign, table_of
 
-from hybrid_jax.flights import attitude
+from hybrid_jax.flights import attitude, load_log
 from hybrid_jax.flights.attitude import Frames, from_euler, rotation_of
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.flights.formats.raw import Samples, own_samples, record
-from hybrid_jax.flights.load import load_log
 
 EULER = [('["q1", "q2", "q3", "q4"]', '["roll", "pitch", "yaw"]'), ('"xyzw"', '"deg"')]
 AFFINE = [('"rpm"', '"command", polynomial = [100.0, 1000.0]')]

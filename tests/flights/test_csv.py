@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from surface import refusal
 
-from hybrid_jax.flights.checks.suitability import check_recording
+from hybrid_jax.flights import check_recording, load_log, read_recording
 from hybrid_jax.flights.conversion import flight_at
 from hybrid_jax.flights.formats.csv import read_table
-from hybrid_jax.flights.load import load_log, read_recording
 from hybrid_jax.flights.log import COLUMNS
 
 HEADER = ",".join(COLUMNS)

@@ -17,10 +17,7 @@ from experiments.real_flight.simulated import vehicle_toml
 from experiments.runner.run_record import record_in
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.export import Program, export_program, load_program
-from hybrid_jax.flights.checks.consistency import check_log
-from hybrid_jax.flights.checks.suitability import check_recording
-from hybrid_jax.flights.conversion import to_flight
-from hybrid_jax.flights.load import read_recording
+from hybrid_jax.flights import check_log, check_recording, read_recording, to_flight
 from hybrid_jax.flights.log import COLUMNS
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.files import json_text, named_leaves, save_archive, write_atomic

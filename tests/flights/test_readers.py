@@ -10,13 +10,10 @@ from scipy.spatial.transform import Rotation
 from surface import refusal
 from writers import MOTORS, STATES, bag, crazyflie, failures, usd
 
-from hybrid_jax.flights import load_logs
-from hybrid_jax.flights.checks.suitability import check_recording
-from hybrid_jax.flights.conversion import to_flight
+from hybrid_jax.flights import check_recording, find_logs, load_logs, read_recording, to_flight
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.column_map import SCALES, of_unit
 from hybrid_jax.flights.formats.raw import Samples, record
-from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.vehicle import IRIS
 
 

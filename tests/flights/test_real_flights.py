@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from writers import failures
 
+from hybrid_jax.flights import check_recording, cut_windows
 from hybrid_jax.flights.checks.consistency import OK, check_log
-from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.load import CRAZYFLIE, ULOG, find_logs, format_of, load_log, read_recording
-from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.identification.estimates import estimate
 from hybrid_jax.vehicle import load_vehicle
 

@@ -13,13 +13,12 @@ from scipy.interpolate import CubicSpline
 from surface import refusal
 from writers import OUTPUTS, PX4_STATES, START, commands, escs, failures, message, outputs, stamped, ulog
 
+from hybrid_jax.flights import Recording, check_recording
 from hybrid_jax.flights.attitude import BODIES, WORLDS
-from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import to_flight, what_to_log
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.ulog import SOURCES
 from hybrid_jax.flights.load import read_recording, reordered
-from hybrid_jax.flights.recording import Recording
 from hybrid_jax.vehicle import IRIS
 
 pytest.importorskip("pyulog", reason="reading ULog needs the extra `logs`")

@@ -13,8 +13,7 @@ from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax import Trajectories, rigid_body, rotation
-from hybrid_jax.dynamics.base import HoldState
-from hybrid_jax.dynamics.rigid_body import FrozenRates
+from hybrid_jax.dynamics import FrozenRates, HoldState
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.windows import errors_between, flight_errors, flight_of, folds, hold_out, manoeuvre_of
 from hybrid_jax.integrate import rollout_batch

@@ -15,8 +15,7 @@ import hybrid_jax as hj
 from hybrid_jax import IRIS, Actuator, actuated
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.flights.recording import Recording, Signal
-from hybrid_jax.identification import slow_commands
-from hybrid_jax.identification.fitting import identify, identify_in_turn
+from hybrid_jax.identification import identify, identify_in_turn, slow_commands
 from hybrid_jax.identification.multirotor import difference, measure
 from hybrid_jax.identification.recordings import Layout, initial_states, resampled
 from hybrid_jax.records import integral

@@ -17,9 +17,8 @@ from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.status import Status
 from hybrid_jax.sweep.lanes import LaneMap, count, lane, load_balance, schedule, stack
 from hybrid_jax.sweep.training import evaluate, evaluate_windows, sweep
-from hybrid_jax.training import fitting
+from hybrid_jax.training import Settings, fitting
 from hybrid_jax.training.fitting import make_run_config, start
-from hybrid_jax.training.objective import Settings
 
 BATCH = 10
 SETTINGS = Settings(batch_size=BATCH)

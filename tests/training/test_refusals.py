@@ -11,8 +11,7 @@ import pytest
 from pendulum import pendulum, swings
 
 from hybrid_jax import AbstractVectorField, Frozen, Hybrid, Model, Settings, Stage, fit, fit_in_stages, residual_network
-from hybrid_jax.sweep.lanes import stack
-from hybrid_jax.sweep.training import sweep
+from hybrid_jax.sweep import stack, sweep
 from hybrid_jax.training.fitting import make_run_config, start
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)

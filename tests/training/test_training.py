@@ -14,8 +14,7 @@ from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.status import Status
-from hybrid_jax.sweep.lanes import stack
-from hybrid_jax.sweep.training import sweep
+from hybrid_jax.sweep import stack, sweep
 from hybrid_jax.training.driver import FitInterrupted
 from hybrid_jax.training.fitting import make_run_config, run, start
 from hybrid_jax.training.loss import trajectory_correlation
