@@ -16,6 +16,7 @@ from pendulum import pendulum, whirling
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics import AbstractVectorField, Terms, rigid_body
+from hybrid_jax.dynamics.base import as_field
 
 ODD = replace(  # a vehicle without any symmetry
     hj.IRIS, mass=2.1, inertia=(0.05, 0.02, 0.06), thrust_coefficient=1.1e-5, torque_coefficient=2e-6, gravity=9.7,
@@ -245,3 +246,14 @@ SYSTEMS: dict[str, Callable[[], System]] = {
     "ring_convolution": cache(_convolution),
     "wrapper": cache(lambda: _pendulum(lambda network: Gain(jnp.zeros(()), network))),
 }
+
+
+@eqx.filter_jit
+def train_batch(field, x, u):
+    """A field on a minibatch as one program, for tests that compare ways to evaluate it."""
+    return as_field(field).train_batch(x, u)
+
+
+@eqx.filter_jit
+def infer_batch(field, x, u):
+    return as_field(field).infer_batch(x, u)

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from evaluations import infer_batch, train_batch
-from systems import ODD
+from systems import ODD, infer_batch, train_batch
 
 from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid, rotation
 from hybrid_jax.dynamics import ConstantDisturbance, HoldState

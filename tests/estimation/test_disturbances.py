@@ -2,7 +2,6 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from surface import refusal
 
 import hybrid_jax as hj
@@ -51,12 +50,6 @@ def test_white_noise_on_a_true_model_changes_little():
     noisy = flights(2, swing=0.0, noise=0.01)
     tested = flights(3, swing=0.0, noise=0.01)
     assert error(hj.fit_disturbance(Spring(), [noisy]), tested) < 1.1 * error(Spring(), tested)
-
-
-def test_weights_of_zero_predict_as_the_field_does():
-    model = DisturbanceModel(Spring(), jnp.zeros((2, 7)), jnp.ones(7), (0.1, 0.3), (0, 1))
-    tested = flights(4)
-    assert error(model, tested) == pytest.approx(error(Spring(), tested), rel=1e-5)
 
 
 def test_attitudes_are_corrected_in_their_tangent_space():

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from evaluations import infer_batch, train_batch
 from recorded import DT, LOGS, SAMPLES, write
 from surface import refusal
+from systems import infer_batch, train_batch
 
 import hybrid_jax as hj
 from hybrid_jax import Trajectories, rigid_body, rotation

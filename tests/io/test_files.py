@@ -121,13 +121,6 @@ def test_weights_that_are_not_finite_or_of_another_shape_or_type_are_refused(spo
     refusal(lambda: hj.load(tmp_path / "model.npz"), "model.npz", "must be")
 
 
-def test_models_side_by_side_are_loaded(tmp_path):
-    keys = jax.random.split(jax.random.key(0), 3)
-    fields = eqx.filter_vmap(lambda key: hj.residual_network(13, 4, key, hidden=4))(keys)
-    hj.save(tmp_path / "models.npz", fields)
-    assert eqx.tree_equal(hj.load(tmp_path / "models.npz").field, fields)
-
-
 CONFIG = {"domain": "source", "seed": 0, "vehicle": {"mass": 1.5, "inertia": (0.1, 0.2, 0.3)}}
 
 

@@ -80,6 +80,7 @@ MAKERS = {
     "pendulum": lambda: hj.Hybrid(pendulum(0.7), hj.residual_network(2, 1, KEY, hidden=4)),
     "nested": lambda: Nested(jax.random.key(0)),  # which keeps its key
     "no physics": lambda: hj.Hybrid(Kinematics(), hj.residual_network(13, 4, KEY, hidden=4)),
+    "side by side": lambda: eqx.filter_vmap(lambda key: hj.residual_network(2, 1, key))(jax.random.split(KEY)),
 }
 
 

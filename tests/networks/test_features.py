@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from choices import PAIRS, mostly_slow, slow
-from evaluations import infer_batch, train_batch
+from systems import infer_batch, train_batch
 
 from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid, Trajectories, residual_network, rigid_body, rotation
 from hybrid_jax.dynamics import base

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from evaluations import infer_batch, train_batch
+from systems import infer_batch, train_batch
 
 from hybrid_jax import Hybrid, load, save
 from hybrid_jax.dynamics import base

@@ -79,7 +79,7 @@ def test_training_leaves_the_scaling_and_a_file_keeps_it(tmp_path):
     np.testing.assert_array_equal(found.residual.scaling.learned_from.x[-1], car().train.x[-1])
 
 
-TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
+TRAIN, VALIDATION = swings(60), swings(40, seed=1)
 CHANNELS = Channel(0, 1, 0.5), Channel(1, 2, 2.0)
 PLAIN = ChannelLoss((Channel(0, 2, 1.0),))
 FIELD = pendulum(0.8)
