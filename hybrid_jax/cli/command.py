@@ -168,7 +168,7 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
 
 def printable(text: str) -> str:
     """Escape characters that a terminal might act on, for example in the name of a file."""
-    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
+    return "".join(each if each.isprintable() or each == "\N{NO-BREAK SPACE}" else repr(each)[1:-1] for each in text)
 
 
 class _Output(io.FileIO):

@@ -38,7 +38,7 @@ motors = {columns = ["u0", "u1", "u2", "u3"], unit = "dshot"}
 def odd(tmp_path):
     """Flights, and a file that cannot be read, with names like mathematics, like a colour, and not in UTF-8."""
     folder = write(tmp_path / "flights", LOGS[:2])
-    (folder / "chirp_run1.csv.gz").rename(folder / "cost_$5_or_$^6\x1b[31m.csv.gz")
+    (folder / "chirp_run1.csv.gz").rename(folder / "cost\xa0$5_or_$^6\x1b[31m.csv.gz")
     (folder / os.fsdecode(b"broken\xff.csv")).write_text("t,px\n0,0\n")
     (folder / "notes.txt").write_text("windy")
     (tmp_path / "v.toml").write_text(vehicle_toml(IRIS))
@@ -102,7 +102,7 @@ def test_what_a_log_does_not_tell_is_a_placeholder(commanded, tmp_path):
 def test_a_folder_is_described_whatever_is_in_it(tmp_path, odd, called):
     _, said, _ = called("inspect", odd, "--vehicle", tmp_path / "v.toml", "--out", tmp_path)
     assert r"broken\udcff.csv: not read: row 1, field py" in said
-    assert r"cost_$5_or_$^6\x1b[31m.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
+    assert "cost\xa0$5_or_$^6\\x1b[31m.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
     assert "2 of 3 logs are ready for a model" in said
     assert "notes.txt: no format that is read" in (tmp_path / "report.html").read_text()
     results = json.loads((tmp_path / "report.json").read_text())["rows"]
