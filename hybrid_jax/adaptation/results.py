@@ -44,8 +44,8 @@ class Parameter:
         return not math.isnan(self.low)
 
     def __str__(self) -> str:
-        around = "  (effective)" if self.effective else ""
-        around = f"  ({self.low:.4g} to {self.high:.4g})" if self.has_interval else around
+        around = " (effective)" if self.effective else ""
+        around = f" ({self.low:.4g} to {self.high:.4g})" if self.has_interval else around
         return f"{self.value:.4g}{f' {self.unit}' if self.unit else ''}{around}"
 
 
