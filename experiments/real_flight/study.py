@@ -18,7 +18,7 @@ from hybrid_jax.dynamics import AbstractVectorField, FrozenRates, HoldState, Veh
 from hybrid_jax.flights.checks.cleaning import lag_motors
 from hybrid_jax.flights.log import FlightLog, segments
 from hybrid_jax.flights.windows import cut_windows, flight_of, folds, manoeuvre_of
-from hybrid_jax.identification.learning import STEPS, UNITS, Learned, adapted, errors_of, learn, rmse
+from hybrid_jax.identification.learning import NAMES, STEPS, UNITS, Learned, adapted, errors_of, learn, rmse
 
 LEARNED, ADAPTED = "learned", "adapted"
 BASELINES = (names.HOLD, names.THRUST, names.LINEAR_RESIDUAL)
@@ -26,7 +26,6 @@ MODELS = (ADAPTED, LEARNED, names.SCRATCH, names.PHYSICS_ONLY, *reversed(BASELIN
 TAGS = ("flight", "model", "n_train", "seed")
 GROUP_BY = {"flight": flight_of, "manoeuvre": manoeuvre_of}
 LINEAR = 2000  # windows that a linear residual is fitted to
-OF_ADAPT = {"rotation": "attitude", "body_rates": "body rates"}  # what `adapt` calls them
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def expected_of(learned: np.ndarray | None, found: Adaptation | None, curve: np.
         ends = {name: each.tolist() for name, each in zip(UNITS, learned.T, strict=True)}
     elif found is not None and found.expected:
         first = next(iter(found.expected.values()))
-        ends = {name: list(first[OF_ADAPT.get(name, name)]) for name in UNITS}
+        ends = {name: list(first[own]) for name, own in zip(UNITS, NAMES, strict=True)}
     else:
         return {"expected": None, "inside": None}
     came = dict(zip(UNITS, curve[STEPS - 1], strict=True))

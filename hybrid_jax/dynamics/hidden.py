@@ -1,12 +1,12 @@
 """Unmeasured parts of a system, with their own states behind the field's: lags, delays, disturbances and loads."""
 
+import math
 from abc import abstractmethod
 from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
@@ -238,14 +238,6 @@ class DisturbanceModel(AbstractVectorField):
         d = len(x) - self.hidden
         return self.weights @ jnp.concatenate([x[d:], x[jnp.array(self.states, int)], jnp.ones(1, x.dtype)])
 
-    def shares(self, dt: float) -> Float[np.ndarray, " k"]:
-        """Return the share of a new error in each filter.
-
-        Args:
-            dt: the time after which [s].
-        """
-        return -np.expm1(-dt / np.array(self.time_constants))
-
     def after(
         self, x: Float[Array, " d+f"], predicted: Float[Array, " d"], measured: Float[Array, " d"], dt: float
     ) -> Float[Array, " d+f"]:
@@ -259,7 +251,8 @@ class DisturbanceModel(AbstractVectorField):
         """
         e = state_space(self.field, len(measured)).difference(measured, predicted) / dt
         filtered = x[len(measured) :].reshape(-1, len(e))
-        filtered = filtered + jnp.asarray(self.shares(dt), e.dtype)[:, None] * (e - filtered)
+        shares = jnp.array([-math.expm1(-dt / tau) for tau in self.time_constants], e.dtype)
+        filtered = filtered + shares[:, None] * (e - filtered)
         return jnp.concatenate([measured, filtered.ravel()])
 
     def __call__(self, x: Float[Array, " d+f"], u: Float[Array, " m"]) -> Float[Array, " d+f"]:

@@ -85,7 +85,7 @@ def observe(model: DisturbanceModel, past: Trajectories, solver: Solver = None) 
         solver: of diffrax, by default `RK4`.
     """
     errors = errors_after_one(model.field, past, solver)
-    shares = model.shares(past.dt)
+    shares = [-np.expm1(-past.dt / tau) for tau in model.time_constants]
     filtered = np.concatenate([scipy.signal.lfilter([a], [1, a - 1], errors, axis=1) for a in shares], axis=-1)
     x = np.concatenate([past.x0[:, None], past.x], axis=1)
     return np.concatenate([x, np.pad(filtered, ((0, 0), (1, 0), (0, 0)))], axis=-1).astype(x.dtype)

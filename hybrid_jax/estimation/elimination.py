@@ -97,6 +97,8 @@ def descend(
 
 def undetermined(gram: Float[np.ndarray, "k k"], names: Sequence[str]) -> list[str]:
     """Return the directions that change no error by more than rounding, for example "0.71 a - 0.71 b"."""
+    if not np.isfinite(gram).all():  # the search diverged
+        return []
     size = np.sqrt(np.maximum(np.diagonal(gram), 0.0))
     unit = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(gram / unit / unit[:, None])

@@ -10,6 +10,7 @@ import pytest
 import hybrid_jax as hj
 from hybrid_jax import StateSpaceModel, fit_records, predict, simulate
 from hybrid_jax.dynamics.hidden import Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
+from hybrid_jax.estimation.elimination import undetermined
 from hybrid_jax.estimation.record_search import check_rates
 from hybrid_jax.records import Record, on_grid
 
@@ -69,6 +70,11 @@ def test_parameters_and_starts_are_recovered_within_their_errors(fitted):
     assert (found < 4).all()
     assert fitted.errors["angle"] == pytest.approx(NOISE, rel=0.2)
     assert fitted.status.name == "OK"
+
+
+def test_a_search_that_diverged_determines_no_direction():
+    """`numpy.linalg.eigh` raises an error of its own here."""
+    assert undetermined(np.full((3, 3), np.nan), ["a", "b", "c"]) == []
 
 
 def test_steps_that_are_too_long_are_said(records, fitted):
