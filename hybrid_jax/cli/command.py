@@ -62,11 +62,11 @@ class ChecksFailed(Exception):
 
 def run(arguments: Sequence[str]) -> None:
     """Run a verb; on errors, end the process with a line on stderr and an exit code."""
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(USAGE.format(verbs="\n".join(f"  {name:<8} {about}" for name, about in VERBS.items())))
-        return
-    verb, *given = arguments
+    verb, *given = arguments or ["--help"]
     with exit_codes(f"hybrid-jax {verb}", verb, INTERRUPTED):
+        if verb in ("-h", "--help"):
+            print(USAGE.format(verbs="\n".join(f"  {name:<8} {about}" for name, about in VERBS.items())))
+            return
         if verb not in VERBS:
             raise ValueError(f"no such verb{_meant(verb, VERBS)}; see hybrid-jax --help")
         module = import_module(f"hybrid_jax.cli.{verb}")

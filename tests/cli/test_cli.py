@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -92,6 +93,11 @@ def test_output_that_cannot_be_written_or_shown_ends_no_run(where, tmp_path):
     assert done.returncode == 0, done.stderr[-300:]
     assert (tmp_path / "file").exists()
     assert done.stdout in (b"", b"0.1 ? 0.01\n", b"?\n")
+
+
+def test_help_may_be_cut_off():
+    with Path("/dev/full").open("w") as full:
+        assert subprocess.run([sys.executable, "-m", "hybrid_jax"], cwd=ROOT, stdout=full).returncode == 0
 
 
 def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_changed(tmp_path, monkeypatch, called):
