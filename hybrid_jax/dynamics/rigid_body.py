@@ -138,6 +138,8 @@ class RigidBody(AbstractVectorField):
 
     def of_rows(self, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
         """Compute ẋ from the entries of x and u."""
+        if (len(x), len(u)) != (sizes := (STATE_SIZE, len(self.vehicle.rotor_positions))):
+            raise ValueError(f"x and u must have {sizes[0]} and {sizes[1]} numbers, got {len(x)} and {len(u)}")
         return equations.derivative(self.vehicle, self.terms, self.entries(), x, u)
 
     def apply_residual(self, x, residual):
