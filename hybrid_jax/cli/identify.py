@@ -20,12 +20,11 @@ from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel
 from hybrid_jax.flights.checks.consistency import FAILS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.recording import Recording, unit_of
-from hybrid_jax.identification import slow_commands
+from hybrid_jax.identification import Layout, slow_commands
 from hybrid_jax.identification.changes import changes
 from hybrid_jax.identification.fitting import Identified, identify, identify_in_turn, measure_velocity, window_errors
 from hybrid_jax.identification.learning import learnable
 from hybrid_jax.identification.log_checks import compared, unlearned_drag
-from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import Model, save
 from hybrid_jax.vehicle import Vehicle

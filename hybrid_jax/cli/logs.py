@@ -14,6 +14,7 @@ from hybrid_jax.cli.help import RARE
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.export.program import vehicle_in
+from hybrid_jax.flights import Recording, find_logs, read_recording
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean, lag_motors
 from hybrid_jax.flights.checks.consistency import (
     FAILS,
@@ -30,9 +31,7 @@ from hybrid_jax.flights.checks.consistency import (
 from hybrid_jax.flights.checks.suitability import ROTORS, check_recording
 from hybrid_jax.flights.conversion import flight_at
 from hybrid_jax.flights.formats.column_map import load_column_map
-from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import FlightLog, unevenness
-from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.windows import require_length
 from hybrid_jax.identification.learning import STEPS
 from hybrid_jax.io.files import digest

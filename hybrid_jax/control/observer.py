@@ -7,10 +7,8 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.control.cost import Scalar
 from hybrid_jax.control.sensitivities import advance
+from hybrid_jax.dynamics import ConstantDisturbance, DisturbanceModel, Hybrid
 from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, as_field
-from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.rotation import canonicalize_quaternion
 from hybrid_jax.vehicle import BODY_RATES, QUATERNION, VELOCITY, State
 

@@ -11,8 +11,7 @@ import scipy
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
-from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
     disturbance_units,

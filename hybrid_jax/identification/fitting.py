@@ -15,17 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hybrid_jax.dynamics.actuators import Actuated
+from hybrid_jax.dynamics import Actuated, RandomWalk, with_hidden
 from hybrid_jax.dynamics.base import AbstractVectorField, in_double, ravel_learned, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
-from hybrid_jax.dynamics.hidden import RandomWalk, with_hidden
 from hybrid_jax.dynamics.terms import OF_VELOCITY
-from hybrid_jax.estimation import uncertainty
+from hybrid_jax.estimation import Interval, uncertainty
 from hybrid_jax.estimation.elimination import descend, reduced
 from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, inverses, masked
 from hybrid_jax.estimation.record_search import Search
 from hybrid_jax.estimation.shooting import Problem, effects
-from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.multirotor import PUSHED, TANGENT, Multirotor

@@ -12,9 +12,7 @@ from jaxtyping import Float
 
 from hybrid_jax.adaptation import METHODS, Adaptation, Auto, adapt
 from hybrid_jax.adaptation.expectation import Expected
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.hidden import DisturbanceModel
+from hybrid_jax.dynamics import AbstractVectorField, DisturbanceModel, Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, FrozenRates
 from hybrid_jax.dynamics.terms import OF_VELOCITY, shape_of
 from hybrid_jax.dynamics.vehicle_file import LAG, LEARN, VehicleModel

@@ -9,10 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics import batching
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics import AbstractVectorField, batching, unfreeze
 from hybrid_jax.dynamics.batching import AbstractBatchNorm, RunningStats
-from hybrid_jax.dynamics.composition import unfreeze
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.networks.mlp import ResidualNetwork

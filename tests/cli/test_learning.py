@@ -9,20 +9,14 @@ from recorded import LOGS
 import hybrid_jax as hj
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.vehicle_file import LEARN, VehicleModel
-from hybrid_jax.identification.learning import (
-    NAMES,
-    STEPS,
-    choose,
-    counting_past,
-    errors_of,
-    expected,
-    learnable,
-    with_past,
-    without_past,
-)
+from hybrid_jax.identification import learning
 from hybrid_jax.vehicle import IRIS
 
 BODY = hj.rigid_body(IRIS)
+
+
+def errors(field, log):
+    return learning.errors_of(field, log, learning.STEPS)
 
 
 @pytest.mark.parametrize(
@@ -40,33 +34,33 @@ BODY = hj.rigid_body(IRIS)
 )
 def test_what_is_learned_by_default_follows_from_the_logs(given, learned, told):
     learn, seconds, moves = given
-    model, left = learnable(VehicleModel(IRIS, learn=learn), seconds, 0.1, moves)
+    model, left = learning.learnable(VehicleModel(IRIS, learn=learn), seconds, 0.1, moves)
     assert (model.learn, left.startswith(told), bool(left)) == (learned, True, bool(told))
 
 
 def test_a_push_that_the_model_lacks_is_predicted_from_the_errors_before():
     lacking = hj.Hybrid(BODY, ConstantDisturbance(jnp.array([0, 0, -1.0, 0, 0, 0])))  # these flights have no such force
-    model = with_past(lacking, LOGS[:6])
-    assert eqx.tree_equal(without_past(model), lacking)
-    before, after = (errors_of(field, LOGS[7], STEPS)[2:, -1, 1].mean() for field in (lacking, model))
+    model = learning.with_past(lacking, LOGS[:6])
+    assert eqx.tree_equal(learning.without_past(model), lacking)
+    before, after = (errors(field, LOGS[7])[2:, -1, 1].mean() for field in (lacking, model))
     assert after < 0.3 * before
 
 
 def test_errors_to_expect_count_the_past():
     lacking = hj.Hybrid(BODY, ConstantDisturbance(jnp.array([0, 0, -1.0, 0, 0, 0])))
-    model, flown = with_past(lacking, LOGS[:6]), LOGS[6:]
-    ones = {"0.1 s": dict.fromkeys(NAMES, (1.0, 0.5, 2.0))}
-    found = counting_past(ones, model, flown)["0.1 s"]
-    ends = [np.concatenate([errors_of(each, log, STEPS) for log in flown])[:, -1, 1] for each in (model, lacking)]
+    model, flown = learning.with_past(lacking, LOGS[:6]), LOGS[6:]
+    ones = {"0.1 s": dict.fromkeys(learning.NAMES, (1.0, 0.5, 2.0))}
+    found = learning.counting_past(ones, model, flown)["0.1 s"]
+    ends = [np.concatenate([errors(each, log) for log in flown])[:, -1, 1] for each in (model, lacking)]
     share = np.sqrt(np.mean(np.square(ends[0])) / np.mean(np.square(ends[1])))
     np.testing.assert_allclose(found["velocity"], share * np.array([1.0, 0.5, 2.0]), rtol=1e-5)
     assert share < 0.8 < found["attitude"][0]  # the force that it lacks does not turn it
 
 
 def test_weights_of_zero_have_the_errors_of_the_field_in_the_same_windows():
-    model = with_past(BODY, LOGS[:3], most=3 * 60)
+    model = learning.with_past(BODY, LOGS[:3], most=3 * 60)
     model = eqx.tree_at(lambda each: each.weights, model, 0 * model.weights)
-    np.testing.assert_allclose(errors_of(model, LOGS[4], STEPS), errors_of(BODY, LOGS[4], STEPS), atol=2e-5)
+    np.testing.assert_allclose(errors(model, LOGS[4]), errors(BODY, LOGS[4]), atol=2e-5)
 
 
 GOOD = [-0.5, -0.4, -0.6, -0.5]
@@ -91,24 +85,24 @@ def scores(**flights):
     ],
 )
 def test_choice(learned, chosen):
-    assert choose(scores(**learned)) == chosen
+    assert learning.choose(scores(**learned)) == chosen
     moved = {name: each + np.array([0.3, -0.2, 0.1, 0.5]) for name, each in scores(**learned).items()}
-    assert choose(moved) == chosen  # how hard a flight is does not matter
+    assert learning.choose(moved) == chosen  # how hard a flight is does not matter
 
 
 def test_a_baseline_is_mostly_taken_where_others_are_better_by_chance():
     rng = np.random.default_rng(0)
-    taken = [choose(scores(**{f"m{i}": rng.normal(0.1, 0.3, 4) for i in range(5)})) for _ in range(200)]
+    taken = [learning.choose(scores(**{f"m{i}": rng.normal(0.1, 0.3, 4) for i in range(5)})) for _ in range(200)]
     assert np.mean([name == "thrust" for name in taken]) > 0.6
 
 
 @pytest.mark.parametrize("flights", [2, 3, 7])
 def test_interval_holds_another_flight_in_eight_of_ten_cases(flights):
     logs = np.random.default_rng(1).normal(-3, 0.4, (4000, flights + 1))
-    _, low, high = np.transpose([expected(each[:-1]) for each in logs])
+    _, low, high = np.transpose([learning.expected(each[:-1]) for each in logs])
     assert np.mean((low < np.exp(logs[:, -1])) & (np.exp(logs[:, -1]) < high)) == pytest.approx(0.8, abs=0.02)
 
 
 def test_one_flight_bounds_nothing():
-    value, low, high = expected(np.log([[2.0]]))
+    value, low, high = learning.expected(np.log([[2.0]]))
     assert (value[0], low[0], high[0]) == (pytest.approx(2.0), 0.0, np.inf)

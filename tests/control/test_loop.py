@@ -11,8 +11,7 @@ import pytest
 import hybrid_jax as hj
 from hybrid_jax import control
 from hybrid_jax.control.cost import deviations
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.dynamics.hidden import DisturbanceModel
+from hybrid_jax.dynamics import ConstantDisturbance, DisturbanceModel
 from hybrid_jax.networks.mlp import InputScaling
 
 CONTROLLER = control.Controller(hj.IRIS)

@@ -10,16 +10,7 @@ import numpy as np
 import pytest
 from pendulum import LENGTH, Push, pendulum, pushes, swings
 
-from hybrid_jax import (
-    Hybrid,
-    LeastSquares,
-    Settings,
-    Trajectories,
-    adapt,
-    covariance_of,
-    fit_least_squares,
-    residual_network,
-)
+import hybrid_jax as hj
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.estimation import least_squares, levenberg_marquardt
@@ -34,13 +25,13 @@ EXACT, DAMPED = swings(40, damping=0.0), swings(40)  # of a pendulum as the mode
 def test_in_double_precision_the_fit_is_exact_to_more_digits():
     with jax.enable_x64(True):
         x0, u = (jnp.asarray(a, float) for a in (EXACT.x0, EXACT.u))
-        windows = Trajectories(x0, u, _flown(pendulum(), x0, u, EXACT.dt), EXACT.dt)
-        found = fit_least_squares(pendulum(LENGTH * 1.25), windows)
+        windows = hj.Trajectories(x0, u, _flown(pendulum(), x0, u, EXACT.dt), EXACT.dt)
+        found = hj.fit_least_squares(pendulum(LENGTH * 1.25), windows)
         assert found.converged
         np.testing.assert_allclose(jnp.exp(found.field.log_length), LENGTH, rtol=1e-12)  # of 640 states at 1e-16
         # A single-precision field stays one where JAX computes in double precision.
         single = eqx.tree_at(lambda field: field.log_length, pendulum(), jnp.log(jnp.float32(LENGTH * 1.25)))
-        found = fit_least_squares(single, EXACT)
+        found = hj.fit_least_squares(single, EXACT)
         assert found.converged
         assert found.field.log_length.dtype == jnp.float32
 
@@ -49,7 +40,7 @@ def test_in_double_precision_the_fit_is_exact_to_more_digits():
 def test_a_linear_problem_meets_its_closed_form_in_any_unit(unit):
     windows, design = pushes(30, 0.1, unit)
     gains = np.linalg.lstsq(design.reshape(-1, 2), np.asarray(windows.x, float).ravel())[0]
-    found = fit_least_squares(Push(unit * jnp.array([1.0, 1.0])), windows)
+    found = hj.fit_least_squares(Push(unit * jnp.array([1.0, 1.0])), windows)
     assert found.converged
     # Half a step of float32 in each of some hundred terms.
     np.testing.assert_allclose(found.field.gains, gains, rtol=1e-5)
@@ -59,7 +50,7 @@ def test_a_linear_problem_meets_its_closed_form_in_any_unit(unit):
 
 def test_a_residual_is_differentiated_by_the_product_that_jax_would_form():
     field, key = pendulum(), jax.random.key(0)
-    field = Hybrid(field, residual_network(2, EXACT.u.shape[-1], key, hidden=5, norm="none", activation="tanh"))
+    field = hj.Hybrid(field, hj.residual_network(2, EXACT.u.shape[-1], key, hidden=5, norm="none", activation="tanh"))
     x, u = EXACT.x0[0], EXACT.u[0, 0]
     own, plain = (jax.jacfwd(each)(x, u) for each in (fixed_residual(field), field))
     np.testing.assert_allclose(own, plain, rtol=1e-5, atol=1e-6)
@@ -71,10 +62,10 @@ def test_a_residual_is_differentiated_by_the_product_that_jax_would_form():
 
 def test_many_windows_are_fitted_a_few_at_a_time_with_the_same_result(monkeypatch):
     (windows, _), start = pushes(30, 0.1, 1.0), Push(jnp.array([1.0, 1.0]))
-    whole = fit_least_squares(start, windows)
+    whole = hj.fit_least_squares(start, windows)
     monkeypatch.setattr(least_squares, "MANY", 20)
     monkeypatch.setattr(least_squares, "CHUNK", 8)  # not a part of 30
-    parts = fit_least_squares(start, windows, max_steps=99)  # traced anew
+    parts = hj.fit_least_squares(start, windows, max_steps=99)  # traced anew
     assert (parts.converged, parts.steps) == (whole.converged, whole.steps)
     np.testing.assert_allclose(parts.field.gains, whole.field.gains, rtol=1e-5)
     np.testing.assert_allclose(parts.mse, whole.mse, rtol=1e-5)
@@ -96,38 +87,38 @@ def test_a_step_that_biases_a_parameter_is_said(substeps, biased):
     random, truth = np.random.default_rng(0), Coil(jnp.log(0.015))
     x0, u = random.normal(size=(400, 1)), np.repeat(random.normal(size=(400, 5, 1)), 2, axis=1)
     x = np.asarray(rollout_batch(truth, x0, u, 0.01, RK4(substeps=8)))
-    windows = Trajectories(x0, u, x + 2e-3 * random.normal(size=x.shape), 0.01)
+    windows = hj.Trajectories(x0, u, x + 2e-3 * random.normal(size=x.shape), 0.01)
     solver = RK4(substeps=substeps)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        found = fit_least_squares(Coil(jnp.log(0.03)), windows, solver=solver)
-    error = np.asarray(jnp.sqrt(covariance_of(found.field, windows, solver=solver)))[0, 0]
+        found = hj.fit_least_squares(Coil(jnp.log(0.03)), windows, solver=solver)
+    error = np.asarray(jnp.sqrt(hj.covariance_of(found.field, windows, solver=solver)))[0, 0]
     off = abs(float(found.field.log_inductance) - np.log(0.015)) / error
     assert (off > 4) == biased == bool(said)
     assert float(found.discretisation) == pytest.approx(off, rel=0.5) if biased else found.discretisation < 0.1
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        adapt(found.field, windows, method=LeastSquares(disturbance=False), settings=Settings(solver=solver))
+        hj.adapt(found.field, windows, method=hj.LeastSquares(disturbance=False), settings=hj.Settings(solver=solver))
     assert biased == any("half the solver's step" in str(each.message) and each.filename == __file__ for each in said)
 
 
 @pytest.mark.parametrize(
     "fit",
     [
-        lambda field, windows, solver: fit_least_squares(field, windows, solver=solver),
-        lambda field, windows, solver: adapt(field, windows, settings=Settings(solver=solver)),
+        lambda field, windows, solver: hj.fit_least_squares(field, windows, solver=solver),
+        lambda field, windows, solver: hj.adapt(field, windows, settings=hj.Settings(solver=solver)),
     ],
     ids=["least squares", "adapt"],
 )
 def test_an_implicit_solver_that_finds_no_step_ends_in_a_line(fit):
-    windows = Trajectories(np.zeros((2, 1)), np.ones((2, 3, 1)), np.zeros((2, 3, 1)), 0.01)
+    windows = hj.Trajectories(np.zeros((2, 1)), np.ones((2, 3, 1)), np.zeros((2, 3, 1)), 0.01)
     with pytest.raises(ValueError, match="solver: ImplicitEuler finds no step where the search went") as said:
         fit(Coil(jnp.array(-1e3)), windows, diffrax.ImplicitEuler())
     assert len(str(said.value).splitlines()) == 1
 
 
 def test_it_is_the_minimum_of_l_mse():
-    found = fit_least_squares(pendulum(0.8), DAMPED)
+    found = hj.fit_least_squares(pendulum(0.8), DAMPED)
     assert found.converged
     assert found.steps <= 8  # more would be lost in rounding, which hides what they gain
     np.testing.assert_allclose(found.mse, _mse(found.field, DAMPED), rtol=1e-6)  # another order of sums
@@ -140,10 +131,10 @@ def test_it_is_the_minimum_of_l_mse():
 def test_a_lane_is_the_run_alone_and_a_lost_lane_harms_no_other():
     lengths = (0.4, 0.6, np.nan, 0.9)
     stacked = eqx.filter_vmap(pendulum)(jnp.array(lengths))
-    together = eqx.filter_jit(eqx.filter_vmap(lambda field: fit_least_squares(field, DAMPED)))(stacked)
+    together = eqx.filter_jit(eqx.filter_vmap(lambda field: hj.fit_least_squares(field, DAMPED)))(stacked)
     np.testing.assert_array_equal(together.converged, [True, True, False, True])
     for i in (0, 1, 3):
-        alone = fit_least_squares(pendulum(lengths[i]), DAMPED)
+        alone = hj.fit_least_squares(pendulum(lengths[i]), DAMPED)
         # Another program for the same sums; one step more may be taken or not, where rounding hides its gain.
         np.testing.assert_allclose(together.field.log_length[i], alone.field.log_length, rtol=1e-5)
         np.testing.assert_allclose(together.mse[i], alone.mse, rtol=1e-5)
@@ -151,7 +142,7 @@ def test_a_lane_is_the_run_alone_and_a_lost_lane_harms_no_other():
 
 def test_a_run_that_is_cut_short_says_so_and_has_come_nearer():
     start = pendulum(0.8)
-    found = fit_least_squares(start, DAMPED, max_steps=2)
+    found = hj.fit_least_squares(start, DAMPED, max_steps=2)
     assert not found.converged
     assert found.steps == 2
     assert found.mse < _mse(start, DAMPED)
@@ -160,8 +151,8 @@ def test_a_run_that_is_cut_short_says_so_and_has_come_nearer():
 def test_windows_with_infinite_states_are_refused_or_leave_the_start_where_nothing_can_be_raised():
     spoiled = eqx.tree_at(lambda w: w.x, EXACT, EXACT.x.at[3, 1, 0].set(jnp.inf))
     with pytest.raises(ValueError, match=r"windows: x\[3, 1, 0\] is not finite"):
-        fit_least_squares(pendulum(0.8), spoiled)
-    found = eqx.filter_jit(fit_least_squares)(pendulum(0.8), spoiled)
+        hj.fit_least_squares(pendulum(0.8), spoiled)
+    found = eqx.filter_jit(hj.fit_least_squares)(pendulum(0.8), spoiled)
     assert not found.converged
     assert found.field.log_length == pendulum(0.8).log_length
 

@@ -23,22 +23,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from hybrid_jax import vehicle
 from hybrid_jax.flights.attitude import Frames, from_euler
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.csv import header_of, read_table
-from hybrid_jax.vehicle import (
-    BODY_RATES,
-    FEWEST_ROTORS,
-    MOST_ROTORS,
-    POSITION,
-    QUATERNION,
-    STATE_NAMES,
-    VELOCITY,
-    from_table,
-    input_names,
-    read_tables,
-    require_known,
-)
 
 SCALES = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -114,27 +102,27 @@ class ColumnMap:
 
 
 def load_column_map(path: str | Path) -> ColumnMap:
-    tables, parts = read_tables(path), {}
-    require_known(str(path), tables, [*ColumnMap.__dataclass_fields__])
+    tables, parts = vehicle.read_tables(path), {}
+    vehicle.require_known(str(path), tables, [*ColumnMap.__dataclass_fields__])
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise ValueError(f"{path}: [{name}]: must be a table, got {table!r}")
         kind = {"frames": Frames, "format": Format}.get(name, Columns)
-        parts[name] = from_table(kind, table, f"{path}: [{name}]")
-    return from_table(ColumnMap, parts, str(path))
+        parts[name] = vehicle.from_table(kind, table, f"{path}: [{name}]")
+    return vehicle.from_table(ColumnMap, parts, str(path))
 
 
 def library_map(path: str | Path) -> ColumnMap:
     """Return the map of a file with the library's columns t, px … wz, u0 …"""
-    names, motors = header_of(path), input_names(MOST_ROTORS)
-    count = max([FEWEST_ROTORS, *(i + 1 for i, name in enumerate(motors) if name in names)])
+    names, motors = header_of(path), vehicle.input_names(vehicle.MOST_ROTORS)
+    count = max([vehicle.FEWEST_ROTORS, *(i + 1 for i, name in enumerate(motors) if name in names)])
     return ColumnMap(
         Frames("ENU", "FLU", "world"),
         Columns(("t",), "s"),
-        position=Columns(STATE_NAMES[POSITION], "m"),
-        attitude=Columns(STATE_NAMES[QUATERNION], "wxyz"),
-        velocity=Columns(STATE_NAMES[VELOCITY], "m/s"),
-        body_rates=Columns(STATE_NAMES[BODY_RATES], "rad/s"),
+        position=Columns(vehicle.STATE_NAMES[vehicle.POSITION], "m"),
+        attitude=Columns(vehicle.STATE_NAMES[vehicle.QUATERNION], "wxyz"),
+        velocity=Columns(vehicle.STATE_NAMES[vehicle.VELOCITY], "m/s"),
+        body_rates=Columns(vehicle.STATE_NAMES[vehicle.BODY_RATES], "rad/s"),
         motors=Columns(motors[:count], "rad/s"),
     )
 
@@ -187,7 +175,7 @@ def _check(name: str, stated: Columns) -> None:
         raise ValueError(f"[{name}]: unit must be one of {', '.join(SCALES[name])}, got {stated.unit!r}")
     columns, count = stated.columns, COUNTS.get(name, 4 if stated.unit in ("wxyz", "xyzw") else 3)
     if name == "motors" and isinstance(columns, tuple):
-        count = min(max(len(columns), FEWEST_ROTORS), MOST_ROTORS)
+        count = min(max(len(columns), vehicle.FEWEST_ROTORS), vehicle.MOST_ROTORS)
     named = isinstance(columns, tuple) and all(isinstance(column, str) for column in columns)
     if not named or len(columns) != count:
         raise ValueError(f"[{name}]: columns must be a list of {count} names for unit {stated.unit}, got {columns!r}")
