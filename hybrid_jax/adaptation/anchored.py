@@ -28,19 +28,12 @@ TOGETHER = 8  # directions evaluated at a time
 
 
 class Anchored(NamedTuple):
-    """The step with the best penalty.
+    """The step with the best penalty."""
 
-    Attributes:
-        change: change of the network's weights.
-        left_out: change of the weights fitted without each block of windows (b, w).
-        odds: evidence of the best step over no step.
-        naive: the same odds if the source had no errors.
-    """
-
-    change: Float[Array, " w"]
-    left_out: Float[Array, "b w"]
-    odds: Float[Array, ""]
-    naive: Float[Array, ""]
+    change: Float[Array, " w"]  # of the network's weights
+    left_out: Float[Array, "b w"]  # of the weights fitted without each block of windows
+    odds: Float[Array, ""]  # evidence of the best step over no step
+    naive: Float[Array, ""]  # the same odds if the source had no errors
 
 
 def fit_anchored(

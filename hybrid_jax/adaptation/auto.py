@@ -74,41 +74,27 @@ CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
 
 class Choice(NamedTuple):
-    """c candidates and the chosen one.
+    """c candidates and the chosen one."""
 
-    Attributes:
-        names: of the candidates.
-        probability: probability of each change; the network's is relative to the candidate chosen before it (c,).
-        refused: which would be more probable than the chosen one if the source had no errors (c,).
-        taken: index of the chosen candidate.
-        alone: whether physics without the network replaced the source.
-        parameters: names of the p parameters of the extended physics, see `extended`.
-        free: which of these each candidate fitted (c, p).
-        theta: parameters of each candidate in the physics' own parametrisation, to first order unless chosen (c, p).
-        equations: normal equations of each window at the chosen parameters.
-        change: change of the network's weights in each candidate (c, w); None without a trainable network.
-        ends: errors of left-out blocks, see `errors_at_ends` (b, 2, d).
-        inherited: covariance at the chosen parameters from errors of those that the source keeps (p, p).
-        degrees: degrees of freedom of `inherited`.
-        absorbed: variance from what the network may have taken from each parameter, see `taken_by_network` (p,).
-        vague: of a rigid body, parameters of which that is a large part of the plausible change (p,).
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the candidates
+    # Probability of each change; the network's is relative to the candidate chosen before it.
     probability: Float[Array, " c"]
-    refused: Bool[Array, " c"]
-    taken: Int[Array, ""]
-    alone: Bool[Array, ""]
-    parameters: tuple[str, ...]
-    free: Bool[Array, "c p"]
+    refused: Bool[Array, " c"]  # which would be more probable than the chosen one if the source had no errors
+    taken: Int[Array, ""]  # index of the chosen candidate
+    alone: Bool[Array, ""]  # whether physics without the network replaced the source
+    parameters: tuple[str, ...]  # names of the p parameters of the extended physics, see `extended`
+    free: Bool[Array, "c p"]  # which of these each candidate fitted
+    # Parameters of each candidate in the physics' own parametrisation, to first order unless chosen.
     theta: Float[Array, "c p"]
-    equations: NormalEquations
+    equations: NormalEquations  # normal equations of each window at the chosen parameters
+    # Change of the network's weights in each candidate; None without a trainable network.
     change: Float[Array, "c w"] | None
-    ends: Float[Array, "b 2 d"]
-    inherited: Float[Array, "p p"]
-    degrees: Float[Array, ""]
+    ends: Float[Array, "b 2 d"]  # errors of left-out blocks, see `errors_at_ends`
+    inherited: Float[Array, "p p"]  # covariance at the chosen parameters from errors of those that the source keeps
+    degrees: Float[Array, ""]  # degrees of freedom of `inherited`
+    # Variance from what the network may have taken from each parameter, see `taken_by_network`.
     absorbed: Float[Array, " p"]
-    vague: Bool[Array, " p"]
+    vague: Bool[Array, " p"]  # of a rigid body, parameters of which that is a large part of the plausible change
 
 
 @dataclass(frozen=True)

@@ -36,25 +36,15 @@ TINY = float(np.finfo(np.float32).tiny)
 
 
 class Fit(NamedTuple):
-    """A fit to n windows, and the quadratic form of the squared errors around it.
+    """A fit to n windows, and the quadratic form of the squared errors around it."""
 
-    Attributes:
-        theta: the p parameters, in the order of `ravel_parameters`.
-        equations: of each window, there.
-        of_states: JᵀJ of the errors of each state, summed over windows.
-        noise: variance of one error over scale, from differences of successive errors.
-        seen: which parameters change the predictions by more than rounding.
-        steps: evaluations of the Jacobian.
-        status: how it ended, a `Status`.
-    """
-
-    theta: Float[Array, " p"]
-    equations: NormalEquations
-    of_states: Float[Array, "d p p"]
-    noise: Float[Array, ""]
-    seen: Bool[Array, " p"]
-    steps: Int[Array, ""]
-    status: Int[Array, ""]
+    theta: Float[Array, " p"]  # the p parameters, in the order of `ravel_parameters`
+    equations: NormalEquations  # of each window, there
+    of_states: Float[Array, "d p p"]  # JᵀJ of the errors of each state, summed over windows
+    noise: Float[Array, ""]  # variance of one error over scale, from differences of successive errors
+    seen: Bool[Array, " p"]  # which parameters change the predictions by more than rounding
+    steps: Int[Array, ""]  # evaluations of the Jacobian
+    status: Int[Array, ""]  # how it ended, a `Status`
 
     def at(self, theta: Float[Array, " p"]) -> NormalEquations:
         (gram, score, square), move = self.equations, theta - self.theta
@@ -133,19 +123,12 @@ def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:
 
 
 class Posterior(NamedTuple):
-    """The posterior of c candidates.
+    """The posterior of c candidates."""
 
-    Attributes:
-        theta: the parameters, to first order (c, p).
-        probability: of each change (c,).
-        naive: the same probability if the source had no errors.
-        taken: index of the chosen candidate.
-    """
-
-    theta: Float[Array, "c p"]
-    probability: Float[Array, " c"]
-    naive: Float[Array, " c"]
-    taken: Int[Array, ""]
+    theta: Float[Array, "c p"]  # the parameters, to first order
+    probability: Float[Array, " c"]  # of each change
+    naive: Float[Array, " c"]  # the same probability if the source had no errors
+    taken: Int[Array, ""]  # index of the chosen candidate
 
 
 def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array, " p"]) -> Posterior:
