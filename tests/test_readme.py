@@ -67,8 +67,9 @@ def test_its_table_is_that_of_the_reports():
         rows = committed(name).where(n_train=(0, 100))
         means = [rows.where(model=model, mode=mode).spread("test_mse").mean for model, mode in paper]
         expected += [means, flight[domain]]
-    other = committed("worlds").where(world="hummingbird", change="parameter_shift", flight="moving")
-    expected += [flight["off_centre_load"], [other.where(method=way).spread("test_mse").mean for way in ways]]
+    other = committed("worlds").where(world="hummingbird", change="parameter_shift", flight="moving", draw=0)
+    other = other.where(seed=tuple(other.where(method="fine_tune").unique("seed")))  # of which one diverges
+    expected += [flight["off_centre_load"], [other.where(method=way).spread("test_mse").median for way in ways]]
     assert lines[-6:] == [[f"{mean:.3g}" for mean in means] for means in expected]
 
 

@@ -1,6 +1,5 @@
 """Cases of adaptation: a world, a change and a flight to adapt to; with a row for each source and flight."""
 
-import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -31,6 +30,7 @@ STEPS, LONG = 10, 100  # intervals of a window to learn from, and to test on
 LEARNING, TESTING = 20.0, 10.0  # s, of a flight
 SOURCE, TARGET, TEST, NOISE, TRAINING, LOGGING = range(6)  # purposes of a key
 MANY = 5  # flights to train on in the paper's protocol: 1000 windows
+COMPARED = 6  # sources from which other methods adapt, too
 WorldName = Literal["iris", "hummingbird", "crazyflie"]
 FlightName = Literal["moving", "hover", "near_ground", "short", "noisy", "outliers"]
 if TYPE_CHECKING:
@@ -68,14 +68,14 @@ class WorldsConfig(OneFlight):
     changes: tuple[ChangeName, ...] = CHANGES
     """Which changes of the vehicle."""
     learn_from: tuple[FlightName, ...] = get_args(FlightName)
-    """Flights to adapt to. moving: ten seconds of usual flight. near_ground: slow. short: three seconds. noisy: sensors
-    three times as noisy. outliers: 0.3 s of outliers."""
+    """Flights to adapt to. moving: ten seconds of usual flight. Of the others one draw for each source. near_ground:
+    slow. short: three seconds. noisy: sensors three times as noisy. outliers: 0.3 s of outliers."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
     """How a log samples them: means over each interval, or values at its start."""
     rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
-    """Changes after which other methods are compared with `hj.adapt`, on the first flight."""
+    """Changes after which other methods are compared with `hj.adapt`, on the first flight of six sources."""
     test_flights: int = 20
-    """Usual flights of ten seconds after each change, without noise."""
+    """Usual flights of ten seconds after each change, for each source."""
 
     def __post_init__(self):
         OneFlight.__post_init__(self)
@@ -107,10 +107,10 @@ def source_flights(world: World, config: WorldsConfig, seed: int) -> Dataset:
     return Dataset(splits, {"config": {"domain": world.name}})
 
 
-def flown_after(world: World, change: str, flight: str, draw: int, config: WorldsConfig) -> hj.Trajectories:
+def flown_after(world: World, change: str, flight: str, number: int, config: WorldsConfig) -> hj.Trajectories:
     kind, seconds, noise, burst = FLIGHTS[flight]
-    flown = world.fly(change, kind, 1, seconds, key_of(world, config, TARGET, draw))
-    key, averaged = key_of(world, config, NOISE, 1 + draw), config.rotor_speeds == "averaged"
+    flown = world.fly(change, kind, 1, seconds, key_of(world, config, TARGET, number))
+    key, averaged = key_of(world, config, NOISE, 1 + number), config.rotor_speeds == "averaged"
     return logged(flown, key, STEPS, noise=noise * config.noise, averaged=averaged, burst=burst)
 
 
@@ -121,9 +121,9 @@ class Tests(NamedTuple):
     logged: list[hj.Trajectories]
 
 
-def tests_after(world: World, change: str, config: WorldsConfig) -> Tests:
-    flown = world.fly(change, USUAL, config.test_flights, TESTING, key_of(world, config, TEST))
-    key, averaged = key_of(world, config, TEST), config.rotor_speeds == "averaged"
+def tests_after(world: World, change: str, config: WorldsConfig, seed: int) -> Tests:
+    key, averaged = key_of(world, config, TEST, seed), config.rotor_speeds == "averaged"
+    flown = world.fly(change, USUAL, config.test_flights, TESTING, key)
     noisy = logged(flown, key, LONG, noise=config.noise, averaged=averaged)
     each = len(noisy) // config.test_flights
     others = [noisy[i : i + each] for i in range(0, len(noisy), each)]
@@ -140,23 +140,27 @@ def many_after(world: World, change: str, config: WorldsConfig) -> tuple[hj.Traj
 
 
 def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
-    """Return a world's rows: for each case, draw, source and method the change of the error on usual flights."""
+    """Return a world's rows: for each case, source, draw and method the change of the error on usual flights.
+
+    Each source has flights of its own, to adapt to and to test on as well, so that sources are independent cases.
+    """
     flown = [source_flights(world, config, seed) for seed in range(config.seeds)]
     one = replace(config, seeds=1)
     fields = [lane(pretrained(HYBRID, world.vehicle, one, stages, own).fields, 0) for own in flown]
 
     def of_case(change: str, flight: str) -> Found:
-        test = tests_after(world, change, config)
-        compare = flight == USUAL and change in config.rivals
+        compare, noise = flight == USUAL and change in config.rivals, FLIGHTS[flight].noise * config.noise
         many = many_after(world, change, config) if compare else None
         rows: list[dict[str, Any]] = []
-        for draw, seed in itertools.product(range(config.draws), range(config.seeds)):
-            windows, noise = flown_after(world, change, flight, draw, config), FLIGHTS[flight].noise * config.noise
-            task = Task(world, fields[seed], flown[seed].splits["train"], windows, noise, many)
-            tags: dict[str, Any] = {"world": world.name, "change": change, "flight": flight, "draw": draw, "seed": seed}
-            rows += [
-                tags | row_of(name, task, change, test) for name in (METHODS if compare and draw == 0 else (AUTO,))
-            ]
+        for seed, (field, own) in enumerate(zip(fields, flown, strict=True)):
+            test = tests_after(world, change, config, seed)
+            for draw in range(config.draws if flight == USUAL else 1):
+                windows = flown_after(world, change, flight, seed * config.draws + draw, config)
+                task = Task(world, field, own.splits["train"], windows, noise, many)
+                tags: dict[str, Any] = {"world": world.name, "change": change, "flight": flight}
+                tags |= {"draw": draw, "seed": seed}
+                methods = METHODS if compare and draw == 0 and seed < COMPARED else (AUTO,)
+                rows += [tags | row_of(name, task, change, test) for name in methods]
         # Errors on flights of another kind are not those to expect.
         return [row if flight == USUAL else row | dict.fromkeys(EXPECTED) for row in rows], {}
 
