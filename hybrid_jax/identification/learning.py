@@ -132,24 +132,34 @@ def adapted(
     if not isinstance(field, DisturbanceModel):
         return found.field, found
     moved = eqx.tree_at(lambda model: model.field, field, found.field)
-    return with_past(moved, logs, most * STEPS), replace(found, expected=counting_past(found.expected, moved, logs))
+    counted = counting_past(found.expected, moved, logs, most * STEPS // 2)
+    return with_past(moved, logs, most * STEPS), replace(found, expected=counted)
 
 
-def counting_past(expected: Expected, model: DisturbanceModel, logs: Sequence[FlightLog]) -> Expected:
-    """Multiply errors to expect without a past by what the past changes in logs that its weights were not learned from.
+def counting_past(
+    expected: Expected, model: DisturbanceModel, logs: Sequence[FlightLog], most: int | None = None
+) -> Expected:
+    """Multiply errors to expect without a past by what a past changes that was learned from the other halves of logs.
 
     Args:
         expected: as in `Adaptation`.
-        model: the model with its past.
+        model: the model with its past before these logs.
         logs: the logs that `expected` is from.
+        most: the largest number of intervals of each half to learn from.
     """
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = dict(expected)
+    halves = [[log[: len(log) // 2] for log in logs], [log[len(log) // 2 :] for log in logs]]
+    if not all(sequences(half, 2 * STEPS) for half in halves):
+        return found
+    models = [with_past(model, half, most) for half in reversed(halves)]
     for horizon, errors in expected.items():
         steps = round(float(horizon.split()[0]) / logs[0].dt)
-        long = [log for log in logs if len(log) > steps]
-        own, alone = (np.concatenate([errors_of(field, log, steps) for log in long]) for field in (model, model.field))
-        shares: dict[str, float] = dict(zip(NAMES, (rmse(own) / rmse(alone))[-1].tolist(), strict=True))
-        found[horizon] = {name: tuple(shares[name] * value for value in values) for name, values in errors.items()}
+        long = [(one, log) for one, half in zip(models, halves, strict=True) for log in half if sequences([log], steps)]
+        if long:
+            own = np.concatenate([errors_of(one, log, steps) for one, log in long])
+            alone = np.concatenate([errors_of(model.field, log, steps) for _, log in long])
+            shares: dict[str, float] = dict(zip(NAMES, (rmse(own) / rmse(alone))[-1].tolist(), strict=True))
+            found[horizon] = {name: tuple(shares[name] * value for value in values) for name, values in errors.items()}
     return found
 
 

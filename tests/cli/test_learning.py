@@ -49,12 +49,12 @@ def test_a_push_that_the_model_lacks_is_predicted_from_the_errors_before():
 def test_errors_to_expect_count_the_past():
     lacking = hj.Hybrid(BODY, ConstantDisturbance(jnp.array([0, 0, -1.0, 0, 0, 0])))
     model, flown = learning.with_past(lacking, LOGS[:6]), LOGS[6:]
-    ones = {"0.1 s": dict.fromkeys(learning.NAMES, (1.0, 0.5, 2.0))}
-    found = learning.counting_past(ones, model, flown)["0.1 s"]
-    ends = [np.concatenate([errors(each, log) for log in flown])[:, -1, 1] for each in (model, lacking)]
-    share = np.sqrt(np.mean(np.square(ends[0])) / np.mean(np.square(ends[1])))
-    np.testing.assert_allclose(found["velocity"], share * np.array([1.0, 0.5, 2.0]), rtol=1e-5)
-    assert share < 0.8 < found["attitude"][0]  # the force that it lacks does not turn it
+    ones = {horizon: dict.fromkeys(learning.NAMES, (1.0, 0.5, 2.0)) for horizon in ("0.1 s", "0.8 s")}
+    found = learning.counting_past(ones, model, flown)
+    share = found["0.1 s"]["velocity"][0]
+    np.testing.assert_allclose(found["0.1 s"]["velocity"], share * np.array([1.0, 0.5, 2.0]), rtol=1e-5)
+    assert share < 0.8 < found["0.1 s"]["attitude"][0]  # the force that it lacks does not turn it
+    assert found["0.8 s"] == ones["0.8 s"]  # half a flight is shorter
 
 
 def test_weights_of_zero_have_the_errors_of_the_field_in_the_same_windows():
