@@ -5,16 +5,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hybrid_jax.codegen.nodes import Address, Assign, Entry, Expression, Loop, Operation, Statement, nested
+from hybrid_jax.codegen.nodes import Address, Assign, Entry, Expression, Function, Loop, Operation, Statement, nested
 
 LOOPED = 8  # so many entries are copied by a loop
 
 
 @dataclass
 class Tables:
-    """Tables of numbers by name, in double or single precision, and unused names, shared by all functions of a file."""
+    """Functions of a file, and its tables of numbers in double or single precision, by unused names."""
 
     double: bool
+    functions: dict[str, Function] = field(default_factory=dict)
     numbers: dict[str, np.ndarray] = field(default_factory=dict)
     _known: dict[bytes, str] = field(default_factory=dict)  # bytes of the numbers → name
     _count: int = 0
@@ -42,7 +43,11 @@ def is_contiguous(entries: np.ndarray) -> bool:
 def address(tables: Tables, entries: np.ndarray) -> Address:
     """Return the start of contiguous entries."""
     first = entries[0]
-    return Address(first.name, first.index or 0) if isinstance(first, Entry) else Address(tables.table(entries))
+    return (
+        Address(first.name, first.index or 0, first.logical)
+        if isinstance(first, Entry)
+        else Address(tables.table(entries))
+    )
 
 
 def indexed(tables: Tables, entries: np.ndarray, shape: tuple[int, ...]) -> Expression | None:

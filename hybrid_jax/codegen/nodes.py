@@ -57,18 +57,6 @@ class Array:
 
 
 @dataclass(frozen=True)
-class Row:
-    """Name the row of a matrix, which begins at `start`, with so many numbers for each value of a counter."""
-
-    name: str
-    start: Address
-    size: int
-    counter: str
-    logical: bool = False
-    written: bool = False
-
-
-@dataclass(frozen=True)
 class Assign:
     target: Entry
     value: Expression
@@ -92,7 +80,17 @@ class Call:
     arguments: tuple[Expression, ...]
 
 
-Statement = Variable | Array | Row | Assign | Loop | Call
+Statement = Variable | Array | Assign | Loop | Call
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function from arrays to arrays."""
+
+    name: str
+    inputs: tuple[Array, ...]
+    outputs: tuple[Array, ...]
+    body: tuple[Statement, ...]
 
 
 @dataclass(frozen=True)

@@ -5,30 +5,17 @@ physics become straight-line code, and network layers become loops over tables a
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from itertools import repeat
 from typing import Any, ClassVar
 
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
-from hybrid_jax.codegen import loops
+from hybrid_jax.codegen import loops, nodes
 from hybrid_jax.codegen.loops import Tables
-from hybrid_jax.codegen.nodes import (
-    Address,
-    Array,
-    Call,
-    Entry,
-    Expression,
-    Loop,
-    Operation,
-    Row,
-    Statement,
-    Step,
-    Variable,
-    arranged,
-    names,
-)
+from hybrid_jax.codegen.nodes import Address, Array, Call, Entry, Expression, Function, Operation, Statement, Step
 from hybrid_jax.codegen.printer import OPERATIONS
 from hybrid_jax.codegen.translation import Entries, Translation, Value
 
@@ -88,39 +75,64 @@ class CTranslation(Translation[np.ndarray]):
         pairs = zip(done, zip(*columns, strict=True), strict=True)
         return column(self._scalar(name, operands) if one is None else one for one, operands in pairs)
 
+    def _results(self, equation, inputs):
+        if (function := self.tables.functions.get(equation.params.get("name", ""))) is None:
+            return super()._results(equation, inputs)
+        given = [self._address(self._column(value)) for value in inputs if np.prod(value.shape)]
+        whole, places = self.tables.name("a"), _places(one.size for one in function.outputs)
+        call = Call(function.name, (*given, *(Address(whole, at) for at in places[:-1])))
+        self.steps.append(Step(whole, (call,), Array(whole, places[-1])))
+        return _values(whole, places, equation.outvars)
+
     def scan(self, equation, inputs):
-        """Loop over rows; no iteration may need the result of another."""
-        inner, count, shared = (equation.params[key] for key in ("jaxpr", "length", "num_consts"))
-        if equation.params["num_carry"]:
-            raise self._refusal(equation)
-        counter, each = self.tables.name("n"), CTranslation(self.tables)
-        rows = [self._row(value, counter, each) for value in inputs[shared:]]
-        results = each.run(inner, [*inputs[:shared], *rows])
-        outs, starts = [self.tables.name("r") for _ in results], count * np.cumsum([0, *map(len, results)])
+        """Call a function for each row in a loop; the first results of a call are inputs of the next."""
+        inner, rows, shared, carried = (equation.params[key] for key in ("jaxpr", "length", "num_consts", "num_carry"))
+        if equation.params["reverse"]:
+            raise self._refusal(equation, " from the end")
+        whole = self.tables.name("a")  # what is carried, as much of the next call, and the results of all rows
+        begin = self.join([column([]), *map(self._column, inputs[shared : shared + carried])])
+        inside, given = self._passed(inputs, shared, carried, whole)
+        outs = [self.tables.name("r") for _ in equation.outvars]
+        function = define(self.tables, self.tables.name("f"), inner, inside, outs)
+        sizes = [one.size for one in function.outputs]
+        places = _places([*sizes[:carried], *sizes[:carried], *(rows * size for size in sizes[carried:])])
+        given += [Address(whole, at) for at in places[carried : 2 * carried]]
+        given += [Address(whole, places[carried + i], steps=(sizes[i],)) for i in range(carried, len(sizes))]
+        entry = Entry(whole, 0, steps=(0, 1))
+        again = nodes.Loop("i1", len(begin), (nodes.Assign(entry, replace(entry, index=len(begin))),))
+        loop = nodes.nested((rows,), Call(function.name, tuple(given)), *[again][:carried])
+        self.steps.append(Step(whole, (*loops.stores(whole, begin), loop), Array(whole, places[-1])))
+        del places[carried : 2 * carried]
+        return _values(whole, places, equation.outvars)
 
-        def fill(whole: str) -> Statement:
-            places = zip(outs, starts, results, strict=False)
-            rows = [Row(out, Address(whole, int(at)), len(one), counter, written=True) for out, at, one in places]
-            return Loop(counter, count, (*rows, *each.body(results, outs)))
+    def _passed(
+        self, inputs: Sequence[Value], shared: int, carried: int, whole: str
+    ) -> tuple[list[Value], list[Address]]:
+        """Return the inputs of the function in a loop as it sees them, and where its arrays begin in each call."""
+        inside, given, at = list(inputs), list[Address](), 0
+        for i, value in enumerate(inputs):
+            if i < shared and isinstance(value, np.ndarray):
+                continue  # numbers are a part of the function
+            shape = value.shape[int(i >= shared + carried) :]
+            if shared <= i < shared + carried:
+                start, at = Address(whole, at), at + int(np.prod(shape))
+            else:
+                steps = (int(np.prod(shape)),) * (i >= shared + carried)
+                start = replace(self._address(self._column(value)), steps=steps)
+            inside[i] = entries(self.tables.name("p"), shape, logical=start.logical)
+            given.append(start)
+        return inside, given
 
-        parts = np.split(self._filled(int(starts[-1]), fill), starts[1:-1])
-        shapes = (one.aval.shape for one in equation.outvars)  # pyright: ignore[reportAttributeAccessIssue]
-        return [Entries(part, shape) for part, shape in zip(parts, shapes, strict=True)]
-
-    def _row(self, value: Value, counter: str, each: "CTranslation") -> Entries:
-        """Return the row of an array for each value of a counter."""
-        entries, shape, name = self._column(value), value.shape[1:], self.tables.name("p")
-        size, logical = int(np.prod(shape)), any(map(_is_logical, entries))
-        start = loops.address(self.tables, self._gathered(entries))
-        each.steps.append(Step(name, (Row(name, start, size, counter, logical),)))
-        return Entries(column(Entry(name, i, logical) for i in range(size)), shape)
+    def _address(self, entries: np.ndarray, shape: tuple[int, ...] | None = None) -> Address:
+        """Return where the entries begin, which are copied unless they are contiguous."""
+        return loops.address(self.tables, self._gathered(entries, shape))
 
     def body(
         self, results: Sequence[np.ndarray], outs: Sequence[str], begins: Iterable[int] = repeat(0)
     ) -> tuple[Statement, ...]:
         """Generate the statements that fill arrays with results, from `begins` on."""
         end = self._end(results, outs, begins)
-        return arranged(self.steps, names(tuple(end)), end)
+        return nodes.arranged(self.steps, nodes.names(tuple(end)), end)
 
     def _end(self, results: Sequence[np.ndarray], outs: Sequence[str], begins: Iterable[int]) -> list[Statement]:
         filled = zip(outs, results, begins, strict=False)
@@ -154,7 +166,7 @@ class CTranslation(Translation[np.ndarray]):
         (m, k), n = a.shape, b.shape[1]
         if m == 1 and n > 1 and loops.is_contiguous(b.T.ravel()):
             return self._loops(b.T, a.T).T
-        given = [loops.address(self.tables, self._gathered(one.ravel(), one.shape)) for one in (a, b)]
+        given = [self._address(one.ravel(), one.shape) for one in (a, b)]
         return self._filled(m * n, lambda out: Call("product", (*given, Address(out), m, k, n))).reshape(m, n)
 
     def _power(self, base: np.ndarray, exponent: int, shape) -> np.ndarray:
@@ -183,7 +195,7 @@ class CTranslation(Translation[np.ndarray]):
     def _scalar(self, name: str, operands: Sequence) -> Any:
         if (found := self._simple(name, operands)) is None:
             found = self._written[(name, *operands)] = Entry(self.tables.name("t"), None, name in LOGICAL)
-            defined = Variable(found.name, Operation(name, tuple(operands)), found.logical)
+            defined = nodes.Variable(found.name, Operation(name, tuple(operands)), found.logical)
             self.steps.append(Step(found.name, (defined,)))
         return found
 
@@ -237,6 +249,43 @@ def column(entries: Iterable[Any]) -> np.ndarray:
     made = np.empty(len(listed), object)
     made[:] = listed
     return made
+
+
+def entries(name: str, shape: Sequence[int], begin: int = 0, logical: bool = False) -> Entries:
+    """Return the entries of an array, from `begin` on, as a value of this shape."""
+    return Entries(column(Entry(name, begin + i, logical) for i in range(int(np.prod(shape)))), tuple(shape))
+
+
+def define(
+    tables: Tables, name: str, program: ClosedJaxpr, arguments: Sequence[Value], outputs: Sequence[str]
+) -> Function:
+    """Translate a program into a function of a file; its inputs are the arguments that are entries of an array."""
+    translation = CTranslation(tables)
+    results = translation.run(program, arguments)
+    firsts = ((one.column[0], len(one.column)) for one in arguments if isinstance(one, Entries) and len(one.column))
+    made = Function(
+        name,
+        tuple(Array(first.name, size, first.logical) for first, size in firsts),
+        tuple(Array(key, len(one)) for key, one in zip(outputs, results, strict=True)),
+        translation.body(results, outputs),
+    )
+    tables.functions[called(name)] = made
+    return made
+
+
+def _values(array: str, places: Sequence[int], outs: Sequence[Any]) -> list[Value]:
+    """Return the results of an operation, which begin at these places of an array."""
+    return [entries(array, one.aval.shape, at) for at, one in zip(places, outs, strict=False)]
+
+
+def _places(sizes: Iterable[int]) -> list[int]:
+    """Return where each part of an array begins, and the end."""
+    return np.cumsum([0, *sizes]).tolist()
+
+
+def called(name: str) -> str:
+    """Return the name that a jitted function has which is translated to a call of a file's function."""
+    return f"C {name}"  # no name of Python
 
 
 def is_zero(entries: np.ndarray) -> bool:

@@ -109,9 +109,6 @@ class CPrinter:
                 return f"const {_kind(logical)} {name} = {self.expression(value)};"
             case nodes.Array(name, size, logical):
                 return f"{_kind(logical)} {name}[{size}];"
-            case nodes.Row(name, start, size, counter, logical, written):
-                kind = f"{'' if written else 'const '}{_kind(logical)}"
-                return f"{kind} *{name} = {self.expression(start)} + {size} * {counter};"
             case nodes.Assign(target, value):
                 return f"{self.expression(target)} = {self.expression(value)};"
             case nodes.Call(function, arguments):
@@ -133,16 +130,26 @@ class CPrinter:
         read = nodes.names(code)
         return [self.table(name, numbers) for name, numbers in tables.numbers.items() if name in read]
 
-    def parts(self, tables: Tables, **bodies: Sequence[nodes.Statement]) -> dict[str, str]:
-        """Print bodies, and the tables and functions that they use, as parts of a template."""
-        code = tuple(bodies.values())
-        used = {one.function for one in nodes.walk(code) if isinstance(one, nodes.Call)}
-        used |= {OPERATIONS[one.name].partition("(")[0] for one in nodes.walk(code) if isinstance(one, Operation)}
-        return {name: self.body(body) for name, body in bodies.items()} | {
-            "tables": "\n".join(self.tables(tables, code)),
-            "helpers": "\n".join(text for name, text in HELPERS.items() if name in used),
-            "type": "double" if self.double else "float",
-        }
+    def function(self, one: nodes.Function) -> str:
+        given = [f"const {_kind(array.logical)} *{array.name}" for array in one.inputs]
+        given += [f"{_kind(array.logical)} *{array.name}" for array in one.outputs]
+        unused = "".join(
+            f"    (void){array.name};\n" for array in one.inputs if array.name not in nodes.names(one.body)
+        )
+        return f"static void {one.name}({', '.join(given)}) {{\n{unused}{self.body(one.body)}\n}}\n"
+
+    def file(self, tables: Tables, names: Iterable[str]) -> str:
+        """Print functions of these names, with the tables, helpers and functions that they use."""
+        used, printed = set(names), list[nodes.Function]()
+        for one in reversed(tables.functions.values()):
+            if one.name in used:
+                printed.insert(0, one)
+                inside = list(nodes.walk(one.body))
+                used |= {each.function for each in inside if isinstance(each, nodes.Call)}
+                used |= {OPERATIONS[each.name].partition("(")[0] for each in inside if isinstance(each, Operation)}
+        helpers = [text for name, text in HELPERS.items() if name in used]
+        numbers = self.tables(tables, tuple(one.body for one in printed))
+        return "\n".join([*numbers, "", *helpers, *map(self.function, printed)])
 
 
 def _kind(logical: bool) -> str:

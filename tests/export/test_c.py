@@ -1,5 +1,7 @@
 """C of a field is the field: values, steps and their Jacobians, in both precisions, and without a warning."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,6 +102,26 @@ def test_a_map_over_rows_is_a_loop(tmp_path):
     check(rows, tmp_path, sizes=(3, 1), points=(rng.normal(size=(4, 3)), rng.normal(size=(4, 1))))
 
 
+def test_a_loop_that_carries_numbers_on_is_one(tmp_path):
+    def steps(x, u):
+        """Half of it is carried on; each turn gives a number of its own, and reads one."""
+        halved = jax.lax.fori_loop(0, 3, lambda i, y: y / 2 + i * u[0], x)
+
+        def one(carried, row):
+            y, z = carried
+            return (jnp.sin(y) * row, z + y[0]), y[0] * z
+
+        (y, z), rows = jax.lax.scan(one, (halved, u[0]), jnp.arange(3.0))
+        return y + z * rows
+
+    rng = np.random.default_rng(0)
+    check(steps, tmp_path, sizes=(3, 1), points=(rng.normal(size=(4, 3)), rng.normal(size=(4, 1))))
+
+
+def backward(function, x):
+    return jax.lax.scan(lambda y, _: (function(y), None), x, length=3, reverse=True)[0]
+
+
 def test_what_is_not_a_number_is_not_hidden(tmp_path):
     library = Library(export_c(tmp_path, wide(), DT)[1], (13, 4), double=False)
     x, u = (part[0] for part in samples())
@@ -114,6 +136,7 @@ def test_what_makes_no_c_is_refused(tmp_path):
             export_c(tmp_path, body(), DT, name=name)
     refusal(lambda: export_c(tmp_path, body(), 0.0), "dt must be a positive")
     refusal(lambda: export_c(tmp_path, body(), DT, smooth=-1.0), "smooth must be")
-    with pytest.raises(ValueError, match=r"operation 'scan' has no counterpart in C$"):
-        export_c(tmp_path, lambda x, u: jax.lax.fori_loop(0, 3, lambda _, y: y / 2, x), DT, state_size=2, input_size=1)
+    for said, loop in (("'while'", partial(jax.lax.while_loop, lambda y: y[0] > 1)), ("'scan' from the end", backward)):
+        with pytest.raises(ValueError, match=rf"operation {said} has no counterpart in C$"):
+            export_c(tmp_path, lambda x, u, loop=loop: loop(lambda y: y / 2, x), DT, state_size=2, input_size=1)
     assert not list(tmp_path.iterdir())

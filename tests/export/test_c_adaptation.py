@@ -2,7 +2,6 @@
 
 import ctypes
 from functools import cache
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -16,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 import hybrid_jax as hj
 from hybrid_jax.control import advance
 from hybrid_jax.export import export_adaptation_c
-from hybrid_jax.export.c.adaptation import _parts
+from hybrid_jax.export.c.adaptation import _about
 from hybrid_jax.online.estimator import OnlineAdaptation
 
 pytestmark = needs_compiler
@@ -122,8 +121,6 @@ def test_c_is_the_filter(precise, allowed, hypotheses, tmp_path):
 
 
 def test_names_of_a_model_cannot_leave_their_comment():
-    hostile = {"names": ("k*/ int main(void) {} /*", "disturbance[vx]", "β\n#error"), "dt": DT}
-    state = {"trusted": jnp.zeros(1), "*/\\\n": jnp.zeros(2)}
-    parts = _parts(SimpleNamespace(**hostile), state)
-    assert parts["names"] == "k___int_main_void_______, disturbance[vx], ___error"
-    assert parts["layout"] == "____ at 0 (2),\n   trusted at 2 (1)"
+    said = _about(["k*/ int main(void) {} /*", "disturbance[vx]", "β\n#error"], {"trusted": (0, 1), "*/\\\n": (1, 2)})
+    assert "changes of k___int_main_void_______, disturbance[vx], ___error,\n" in said
+    assert "state: trusted at 0 (1),\n   ____ at 1 (2).\n" in said

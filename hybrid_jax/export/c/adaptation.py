@@ -1,7 +1,7 @@
 """The step of an `OnlineAdaptation` as C99, with its state as an array of `ravel_pytree`."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from hybrid_jax.codegen.loops import Tables
-from hybrid_jax.codegen.printer import CPrinter
-from hybrid_jax.export.c.fields import body_of, check_name, written
-from hybrid_jax.export.c.templates import ADAPTATION_HEADER, ADAPTATION_SOURCE
+from hybrid_jax.export.c.files import CFile
 from hybrid_jax.export.program import Size, sizes_of
 from hybrid_jax.runtime import entry
+
+UPDATE = """\
+After a sample x, NaN where nothing was measured, and the mean input u since the last update, periods of {}_DT ago."""
 
 
 @entry
@@ -43,45 +43,52 @@ def export_adaptation_c(
     Returns:
         The paths of the header and of the source.
     """
-    check_name(name)
-    d, m = sizes_of(adaptation.field, state_size, input_size)
-    tables, printer = Tables(double), CPrinter(double)
+    file, (d, m) = CFile(name, double), sizes_of(adaptation.field, state_size, input_size)
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, adaptation)
         first = exact.begin(jnp.zeros(d))
         flat, unravel = ravel_pytree(first)
-        sizes = {"state": flat.size, "x": d, "u": m, "elapsed": 1}
-        likes = {key: jax.ShapeDtypeStruct((size,), float) for key, size in sizes.items()}
 
         def in_turn(one: Callable) -> Callable:  # a loop in the place of `jax.vmap` makes the C code small
             return lambda *stacked: jax.lax.map(lambda row: one(*row), stacked)
 
-        def update(state, x, u, elapsed):
-            return [ravel_pytree(exact.update(unravel(state), x, u, elapsed[0], in_turn))[0]]
+        def update(state, x, u, periods):
+            return ravel_pytree(exact.update(unravel(state), x, u, periods, in_turn))[0]
 
         def begin(x):
-            return [ravel_pytree(exact.begin(x))[0]]
+            return ravel_pytree(exact.begin(x))[0]
 
-        stepped = body_of(update, list(likes.values()), tables, ("next",), tuple(likes))
-        begun = body_of(begin, [likes["x"]], tables, ("state",), ("x",))
-    parts = {"d": d, "m": m, "size": flat.size, "dt": printer.number(float(adaptation.dt))}
-    parts |= {"elapsed": f"periods of {name.upper()}_DT ago"} | _parts(exact, first)
-    parts |= printer.parts(tables, begin=begun, update=stepped)
-    return written(folder, name, ADAPTATION_HEADER, ADAPTATION_SOURCE, parts)
+        file.add("begin", "The state of the filter before the first sample x.", begin, {"x": (d,)}, ["state"])
+        inputs = {"state": flat.shape, "x": (d,), "u": (m,), "periods": ()}
+        file.add("update", UPDATE.format(file.name.upper()), update, inputs, ["next"])
+    places = _places(first)
+    constants = [
+        *(f"STATE_SIZE {d}", f"INPUT_SIZE {m}", f"PARAMETERS {len(adaptation.names)}"),
+        f"SIZE {flat.size} /* of the filter's state */",
+        f"TRUSTED {places['trusted'][0]} /* where the last good theta begins in it */",
+        f"DT {file.printer.number(float(adaptation.dt))} /* time between two samples [s] */",
+    ]
+    return file.write(folder, _about(adaptation.names, places), constants)
 
 
-def _parts(adaptation: Any, state: Any) -> dict[str, Any]:
-    """Describe the layout of the state in words."""
-    places, at = [], 0
+def _places(state: Any) -> dict[str, tuple[int, int]]:
+    """Return where each part of the state begins, and its size."""
+    found, at = {}, 0
     for path, value in jax.tree_util.tree_leaves_with_path(state):
-        places.append((jax.tree_util.keystr(path, simple=True, separator="."), at, value.size))
+        found[jax.tree_util.keystr(path, simple=True, separator=".")] = at, value.size
         at += value.size
-    return {
-        "layout": ",\n   ".join(f"{_plain(key)} at {start} ({size})" for key, start, size in places),
-        "names": ", ".join(map(_plain, adaptation.names)),
-        "p": len(adaptation.names),
-        "trusted": next(start for key, start, _ in places if key == "trusted"),
-    }
+    return found
+
+
+def _about(names: Sequence[str], places: Mapping[str, tuple[int, int]]) -> str:
+    layout = ",\n   ".join(f"{_plain(key)} at {start} ({size})" for key, (start, size) in places.items())
+    return f"""\
+A filter that adapts a model while it runs, written by hybrid_jax.
+
+   state: {layout}.
+   theta holds the changes of {", ".join(map(_plain, names))},
+   in the standard deviations of their prior.
+   No function allocates or keeps a state; results must not overlap what is read."""
 
 
 def _plain(name: str) -> str:

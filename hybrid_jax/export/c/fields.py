@@ -1,27 +1,32 @@
-"""Fields and steps as C99 for a flight controller: one header, one source, no dependency but math.h, no allocation."""
+"""Fields and steps as C99 for a flight controller."""
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from string import Template
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from hybrid_jax import checks
-from hybrid_jax.codegen.loops import Tables
-from hybrid_jax.codegen.nodes import Entry, Statement
-from hybrid_jax.codegen.operations import CTranslation, column
-from hybrid_jax.codegen.printer import CPrinter
-from hybrid_jax.codegen.translation import Entries
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.hidden import DisturbanceModel
-from hybrid_jax.export.c.templates import HEADER, OBSERVE, PAST_HEADER, SOURCE
+from hybrid_jax.export.c.files import CFile
 from hybrid_jax.export.program import OBSERVED, Size, prepared, program_of, sizes_of, vehicle_in
-from hybrid_jax.io.files import write_atomic
 from hybrid_jax.runtime import entry
 from hybrid_jax.vehicle import STATE_NAMES
+
+ABOUT = """\
+A model dx/dt = f(x, u), written by hybrid_jax.
+{}
+
+   Matrices are in row-major order: dx[i][j] is the derivative of entry i of the result by x[j].
+   No function allocates, keeps a state or changes what it reads; results must not overlap what is read.
+   A number that is not finite in x or u goes on into the result: test it there."""
+STEP = """\
+The state a step after x with u held: one step of the classical Runge-Kutta method of order 4.
+   Quaternions are not normalised."""
+OBSERVE = """\
+The state a step after x with u held, where its first {} numbers were measured. The last {} are filtered errors of the
+   model: 0 at the first sample, and then what this function returns, which you carry on."""
 
 
 @entry
@@ -61,48 +66,58 @@ def export_c(
         OSError: if the folder cannot be written.
     """
     checks.positive("dt", dt, "a positive number of seconds")
-    check_name(name)
-    d, m = sizes_of(field, state_size, input_size)
-    tables, printer = Tables(double), CPrinter(double)
+    file, (d, m) = CFile(name, double), sizes_of(field, state_size, input_size)
+    inputs, jacobians = {"x": (d,), "u": (m,)}, ("dx", "du")
     # In double precision, so that constants are rounded once, when they are written.
     with jax.enable_x64(True):
-        likes = [jax.ShapeDtypeStruct((size,), float) for size in (d, m)]
+        likes = [jax.ShapeDtypeStruct(shape, float) for shape in inputs.values()]
         fused = as_field(prepared(field, likes, smooth)).fuse_for_inference()
-        values = body_of(fused, likes, tables, ("xdot",))
-        directions = jnp.split(jnp.eye(d + m), [d])
-        slopes = body_of(lambda x, u: as_field(fused).linearize(x, u, *directions), likes, tables, ("xdot", "jacobian"))
-        bodies, parts, header, source = {"values": values, "slopes": slopes}, {}, HEADER, SOURCE
+        eye = jnp.eye(d + m)
+
+        def linearized(x, u):
+            slope, columns = as_field(fused).linearize(x, u, eye[:d], eye[d:])
+            return [slope, *jnp.split(columns, [d], axis=1)]
+
+        derivative = file.add("derivative", "dx/dt at the state x under the input u.", fused, inputs, ["xdot"])
+        file.add("step", STEP, lambda x, u: _step(derivative, x, u, dt), inputs, ["next"])
+        linearize = file.add(
+            "derivative_jacobian", "As derivative, with its Jacobians.", linearized, inputs, ["xdot", *jacobians]
+        )
+
+        def along(state, u):  # the state, and its derivatives by where the step began and by u
+            slope, dx, du = linearize(state[0], u)
+            return slope, dx @ state[1], dx @ state[2] + du
+
+        def step_jacobian(x, u):
+            return _step(along, (x, jnp.eye(d), jnp.zeros((d, m))), u, dt)
+
+        file.add("step_jacobian", "As step, with its Jacobians.", step_jacobian, inputs, ["next", *jacobians])
         if isinstance(field, DisturbanceModel):
-            header, source, parts = PAST_HEADER, SOURCE + OBSERVE, {"n": d - field.hidden, "hidden": field.hidden}
-            likes.append(jax.ShapeDtypeStruct((parts["n"],), float))
-            bodies["observe"] = body_of(program_of(field, likes, dt, smooth), likes, tables, ("next",), OBSERVED)
-    about = _about(vehicle_in(field) is not None, smooth)
-    parts |= {"d": d, "m": m, "dt": printer.number(float(dt)), "about": about}
-    return written(folder, name, header, source, parts | printer.parts(tables, **bodies))
+            shapes = dict(zip(OBSERVED, (*inputs.values(), (d - field.hidden,)), strict=True))
+            likes = [jax.ShapeDtypeStruct(shape, float) for shape in shapes.values()]
+            about = OBSERVE.format(d - field.hidden, field.hidden)
+            file.add("observe", about, program_of(field, likes, dt, smooth), shapes, ["next"])
+    constants = [
+        f"STATE_SIZE {d}",
+        f"INPUT_SIZE {m}",
+        f"DT {file.printer.number(float(dt))} /* length of a step [s] */",
+    ]
+    return file.write(folder, ABOUT.format(_about(vehicle_in(field) is not None, smooth)), constants)
 
 
-def check_name(name: str) -> None:
-    # math.h is the one header that a source includes.
-    if not isinstance(name, str) or not re.fullmatch("[a-z][a-z0-9_]*", name) or name == "math":
-        raise ValueError(f"name must be a lower-case C identifier, got {checks.short_repr(name)}")
+def _step(derivative: Callable, start, u, dt: float):
+    """A step of RK4 from a tree of arrays, as a loop over its stages with one call of the derivative."""
 
+    def moved(start, factor, slope):
+        return jax.tree.map(lambda a, b: a + factor * b, start, slope)
 
-def written(folder: str | Path, name: str, header: str, source: str, parts: Mapping[str, Any]) -> tuple[Path, Path]:
-    paths = Path(folder) / f"{name}.h", Path(folder) / f"{name}.c"
-    for path, template in zip(paths, (header, source), strict=True):
-        write_atomic(path, Template(template).substitute(parts, name=name, NAME=name.upper()))
-    return paths
+    def stage(carried, factors):
+        slope, total = carried
+        slope = derivative(moved(start, factors[0], slope), u)
+        return (slope, moved(total, factors[1], slope)), None
 
-
-def body_of(
-    function: Callable, likes, tables: Tables, outputs: tuple[str, ...], inputs: tuple[str, ...] = ("x", "u")
-) -> tuple[Statement, ...]:
-    """Return the statements of a C function from arrays, by default x and u, to output arrays."""
-    translation = CTranslation(tables)
-    pairs = zip(inputs, likes, strict=True)
-    arguments = [Entries(column(Entry(name, i) for i in range(like.size)), like.shape) for name, like in pairs]
-    results = translation.run(jax.make_jaxpr(function)(*likes), arguments)
-    return translation.body(results, outputs)
+    none, factors = jax.tree.map(jnp.zeros_like, start), jnp.array([[0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1, 1 / 6]])
+    return jax.lax.scan(stage, (none, start), dt * factors)[0][1]
 
 
 def _about(is_multirotor: bool, smooth: float | None) -> str:
