@@ -5,8 +5,6 @@ sample of these, x and u: forward, and backward by `jax.vjp`. Batch normalisatio
 takes its result n and returns z and the weights W, γ and β besides ẋ; see cpp/rollout.h.
 """
 
-import contextlib
-from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -37,10 +35,9 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """The prefix of a field's XLA targets, as soon as these are, and the conversion of its arrays to its weights."""
+    """The name under which programs find a field's kernel, and the conversion of its arrays to its weights."""
 
     name: str
-    prefix: Future[str]
     sizes: Sizes
     forward: Split
     back: Split | None
@@ -63,26 +60,22 @@ class Kernel:
 
 def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
     """Return the kernel of a field with d states and m inputs, or None with the reason in `REFUSED`."""
-    arrays, rest = eqx.partition(field, _is_array)
-    shapes, structure = jax.tree.flatten(jax.tree.map(lambda leaf: Shape(jnp.shape(leaf), leaf.dtype), arrays))
-    static, frame = jax.tree.flatten(rest)
-    key = tuple((*one.shape, str(one.dtype)) for one in shapes), structure, tuple(static), frame, d, m
+    shapes = jax.tree.map(lambda leaf: Shape(jnp.shape(leaf), leaf.dtype) if _is_array(leaf) else leaf, field)
+    leaves, structure = jax.tree.flatten(shapes)
+    key = *leaves, structure, d, m
     try:
-        if (*key, training) not in _KNOWN:
-            whole, both = eqx.combine(jax.tree.unflatten(structure, shapes), rest), _KNOWN.get((*key, True))
-            _check_methods(whole, "train_batch" if training else "infer_batch")
-            if both is None or both.sizes.units:  # or predictions are a part of training
+        if (known := _KNOWN.get((*key, True))) is None or known.sizes.units:  # else predictions are a part of training
+            if (*key, training) not in _KNOWN:
+                _KNOWN[*key, training] = None  # if it fails, it is not tried again
+                _check_methods(shapes)
                 with jax.ensure_compile_time_eval():  # this may be inside of a program that JAX traces
-                    both = _made(whole, Sizes(d, m), training, _name(field))
-            _KNOWN[*key, training] = both
-        return _KNOWN[*key, training]
-    except Exception as error:  # a user's code may raise anything
-        known = isinstance(error, ValueError | library.Unusable)
-        reason = str(error) if known else f"{type(error).__name__}: {error}"
+                    _KNOWN[*key, training] = _made(shapes, Sizes(d, m), training)
+            known = _KNOWN[*key, training]
+    except Exception as error:  # a user's code may raise anything, and fields that are not hashable a TypeError
+        reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         REFUSED[_name(field)] = reason.removeprefix("field: ").partition("\n")[0]
-        with contextlib.suppress(TypeError):  # of a field that is not hashable
-            _KNOWN[*key, training] = None  # GCC is not asked twice
         return None
+    return known
 
 
 _KNOWN: dict[Any, Kernel | None] = {}
@@ -96,7 +89,7 @@ def _name(field: Any) -> str:
     return f"{own}({modules})" if modules else own
 
 
-def _made(field: PyTree, sizes: Sizes, training: bool, name: str) -> Kernel:
+def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
     """Make the kernel of a field whose arrays are replaced by shapes."""
     arrays, rest = eqx.partition(field, lambda leaf: isinstance(leaf, Shape))
     (shapes, structure), norms = jax.tree.flatten(arrays), batch_norms(field) if training else []
@@ -133,7 +126,7 @@ def _made(field: PyTree, sizes: Sizes, training: bool, name: str) -> Kernel:
     sizes, source = sizes._replace(reads=read.size, units=units), Source(forward, of_sample, training)
     constants = dict(zip("DMZH", sizes, strict=True)) | {"P": count}
     constants |= {name: forward.place(i) for i, name in enumerate(("WEIGHT", "GAIN", "SHIFT"), start=2)}
-    return Kernel(name, library.compiled(source.text(constants)), sizes, forward, source.back, epsilon)
+    return Kernel(library.begun(source.text(constants)), sizes, forward, source.back, epsilon)
 
 
 class _Given(AbstractNorm):
@@ -148,14 +141,15 @@ class _Given(AbstractNorm):
         return self.normal
 
 
-def _check_methods(node: Any, method: str) -> None:
+def _check_methods(node: Any) -> None:
     """Reject a field with a user-defined batched method, which may differ from the method for one sample."""
-    own = getattr(type(node), method, None)
-    if own is not None and not own.__module__.startswith("hybrid_jax."):
-        raise ValueError(f"{type(node).__name__} has a {method} of its own")
-    parts = vars(node).values() if isinstance(node, eqx.Module) else node if isinstance(node, tuple | list) else ()
-    for part in node.values() if isinstance(node, dict) else parts:
-        _check_methods(part, method)
+    for method in ("train_batch", "infer_batch"):
+        own = getattr(type(node), method, None)
+        if own is not None and not own.__module__.startswith("hybrid_jax."):
+            raise ValueError(f"{type(node).__name__} has a {method} of its own")
+    for part in jax.tree.leaves(node, is_leaf=lambda one: one is not node):
+        if part is not node:
+            _check_methods(part)
 
 
 def _is_array(leaf: Any) -> bool:

@@ -1,8 +1,8 @@
-"""Compile C++ with GCC for XLA at first use, keep it in the user's cache folder, verify it and load it.
+"""Compile C++ with GCC at first use, keep it in the user's cache folder, verify it and load it.
 
-GCC runs while JAX traces, which needs the library only when XLA compiles the call. Because the cache contains code,
-its folder must belong to the user, and a library whose checksum is wrong is recompiled.
-HYBRID_JAX_NATIVE=0 disables kernels; `obstacle` reports other reasons.
+GCC runs while JAX traces and XLA compiles: programs call `cpp/entry.cc`, which waits for the kernel when it runs.
+Because the cache contains code, its folder must belong to the user, and a library whose checksum is wrong is
+recompiled. HYBRID_JAX_NATIVE=0 disables kernels; `obstacle` reports other reasons.
 """
 
 import contextlib
@@ -14,7 +14,6 @@ import subprocess
 import tempfile
 import threading
 import time
-from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
 
@@ -37,7 +36,6 @@ code=$?
 kill $!
 exit $code
 """
-_LOCK, _BEGUN = threading.Lock(), dict[str, Future[str]]()  # programs are traced in several threads
 
 
 class Unusable(Exception):
@@ -51,44 +49,52 @@ def obstacle() -> str | None:
         return f"{SWITCH} is 0"
     if jax.default_backend() != "cpu":
         return f"arrays are on a {jax.default_backend()}"
-    if not {"avx2", "fma"} <= set(runtime.machine()[-1].split()):
+    if not {"avx2", "fma"} <= set(_flags()):
         return "the processor has no AVX2"
     if not _compiler():
         return "there is no g++"
     try:
-        runtime.private_folder(FOLDER)
-    except OSError as error:
-        return f"they could not be kept: {error}"
+        _entry()
+    except (OSError, AttributeError, Unusable) as error:
+        return str(error) if isinstance(error, Unusable) else f"they could not be kept, or not be loaded: {error}"
     return None
 
 
-def compiled(source: str) -> Future[str]:
-    """Begin to compile and register a source, whose result is the prefix of its XLA targets, or the error Unusable."""
-    with _LOCK:
-        if source in _BEGUN:
-            return _BEGUN[source]
-        result = _BEGUN[source] = Future()
+def width() -> int:
+    """Return how many numbers a vector has."""
+    return 16 if "avx512f" in _flags() else 8
+
+
+def _flags() -> list[str]:
+    return runtime.machine()[-1].split()
+
+
+@cache
+def _entry() -> ctypes.CDLL:
+    """Load and register what programs call."""
+    library = ctypes.CDLL(str(_checked_library((SOURCES / "entry.cc").read_text())))
+    for handler in ("forward", "backward"):
+        target = jax.ffi.pycapsule(ctypes.cast(library[handler], ctypes.c_void_p).value)
+        jax.ffi.register_ffi_target(f"hybrid_jax_{handler}", target, platform="cpu")
+    return library
+
+
+@cache
+def begun(source: str) -> str:
+    """Begin to compile a source, and return the name under which programs find its functions."""
+    name, entry = _digest(source), _entry()
 
     def run() -> None:
+        ways, said = [None, None], ""
         try:
-            result.set_result(_registered(source))
-        except BaseException as error:
-            result.set_exception(error)
+            library = ctypes.CDLL(str(_checked_library(source)))
+            ways = [getattr(library, one, None) for one in ("forward", "backward")]
+        except BaseException as error:  # ends the program that calls the kernel
+            said = f"a kernel cannot be used: {error}; {SWITCH}=0 does without"
+        entry.publish(name.encode(), said.encode(), *(ctypes.cast(one, ctypes.c_void_p) for one in ways))
 
     threading.Thread(target=run, daemon=True).start()  # Python does not wait for it to exit
-    return result
-
-
-def _registered(source: str) -> str:
-    begin = f"hybrid_jax_{_digest(source)}_"
-    try:
-        library = ctypes.CDLL(str(_checked_library(source)))
-        for handler in ("forward", "backward")[: 1 + source.count("#define TRAINING 1")]:
-            target = jax.ffi.pycapsule(ctypes.cast(library[handler], ctypes.c_void_p).value)
-            jax.ffi.register_ffi_target(begin + handler, target, platform="cpu")
-    except (OSError, AttributeError) as error:
-        raise Unusable(f"its library could not be kept, or not be loaded: {error}") from error
-    return begin
+    return name
 
 
 def _compiler() -> str | None:

@@ -13,6 +13,7 @@ from hybrid_jax.codegen.nodes import Address, Call, Entry, Expression, Loop, Ope
 from hybrid_jax.codegen.operations import LOGICAL, CTranslation, column, is_zero
 from hybrid_jax.codegen.printer import OPERATIONS, CPrinter
 from hybrid_jax.codegen.translation import Entries
+from hybrid_jax.kernels.library import width
 from hybrid_jax.kernels.trace import Shape, Split, outputs_of, split, traced, with_factors
 
 LONGEST = 4000  # statements of a function: GCC takes long for more, and a program of XLA does as well
@@ -159,7 +160,8 @@ class Source:
         self.functions.append(f"void {name}({GIVEN}{parameters}) {{\n{self.printer.body(body)}\n}}\n")
 
     def text(self, constants: dict[str, int]) -> str:
-        head = [f"#define TRAINING {int(self.back is not None)}", '#include "samples.h"', "namespace {"]
+        head = [f"#define TRAINING {int(self.back is not None)}", f"#define V {width()}"]
+        head += ['#include "samples.h"', "namespace {"]
         head += [f"constexpr int64_t {name} = {value};" for name, value in (constants | {"F": self.factors}).items()]
         tables = [one.replace("real", "float", 1) for one in self.printer.tables(self.tables, self.code)]
         return "\n".join([*head, *tables, *self.functions, "}  // namespace", '#include "rollout.h"', ""])

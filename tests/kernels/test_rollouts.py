@@ -121,21 +121,6 @@ def test_a_lane_is_the_same_alone_to_the_bit():
         np.testing.assert_array_equal(one[1, 2], other)
 
 
-@needs_kernels
-def test_a_second_derivative_is_that_of_jax(monkeypatch):
-    field = FIELDS["no physics"]
-    x0, u, d_states = windows(field, 16, steps=2)
-
-    def curvature(function):
-        slope = jax.grad(lambda x0: jnp.sum(d_states * jnp.square(function(field, x0, u))))
-        return jax.grad(lambda x0: jnp.sum(jnp.square(slope(x0))))(x0)
-
-    found = curvature(trained)
-    monkeypatch.setattr(library, "obstacle", lambda: "switched off")
-    expected = curvature(trained)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
-
-
 class Own(RigidBody):
     def train_batch(self, x, u):
         return 2 * super().train_batch(x, u)

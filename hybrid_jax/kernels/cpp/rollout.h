@@ -42,7 +42,7 @@ struct Call {
   float* argument(int i) const { return part(frame->args.args[i]); }
   float* result(int i) const { return part(frame->rets.rets[i]); }
   float number(int i) const {
-    return static_cast<const float*>(static_cast<const XLA_FFI_Array*>(frame->attrs.attrs[0])->data)[i];
+    return static_cast<const float*>(static_cast<const XLA_FFI_Array*>(frame->attrs.attrs[1])->data)[i];
   }
 };
 
@@ -50,33 +50,24 @@ struct Call {
 // the derivatives with respect to the states.
 enum Argument { WEIGHTS, X0, INPUTS, BACK, KEPT, D_STATES };
 
-// An array (t, rows, count) of windows.
+// An array (t, rows, b) of windows.
 struct Windows {
   float* at;
-  int64_t rows, count;
+  int64_t rows, b;
 
-  // V windows from s on. Behind the last come copies of it, or zeros.
-  void gather(int64_t t, int64_t s, bool zeros, Vec* to) const {
-    const float* from = at + t * rows * count;
-    for (int64_t r = 0; r < rows; ++r, from += count) {
-      if (s + V <= count) { to[r] = load(from + s); continue; }
-      for (int j = 0; j < V; ++j) to[r][j] = zeros && s + j >= count ? 0 : from[std::min(s + j, count - 1)];
-    }
+  void gather(int64_t t, int64_t block, Vec* to) const {
+    for (int64_t r = 0; r < rows; ++r) to[r] = load(at + (t * rows + r) * b + block * V);
   }
-  void scatter(const Vec* from, int64_t t, int64_t s) const {
-    float* to = at + t * rows * count;
-    for (int64_t r = 0; r < rows; ++r, to += count) {
-      if (s + V <= count) { store(to + s, from[r]); continue; }
-      for (int j = 0; j < V && s + j < count; ++j) to[s + j] = from[r][j];
-    }
+  void scatter(const Vec* from, int64_t t, int64_t block) const {
+    for (int64_t r = 0; r < rows; ++r) store(at + (t * rows + r) * b + block * V, from[r]);
   }
 };
 
-// b windows of `steps` intervals, and what is kept of each evaluation for the way back, or nothing: x, h and q.
+// b windows of `steps` intervals, of which the last are copies that fill a vector, and what is kept of each evaluation for the way back, or nothing: x, h and q.
 struct Lane {
   const Call& call;
   Vec* kept;
-  const int64_t steps = call.size(INPUTS, -3), b = call.size(INPUTS, -1), blocks = (b + V - 1) / V;
+  const int64_t steps = call.size(INPUTS, -3), b = call.size(INPUTS, -1), blocks = b / V, own = int64_t(call.number(2));
   const int64_t group = H ? blocks : 1, n = group * D;  // vectors of windows, and of their states
   const int64_t size = group * (D + U) + (H + V - 1) / V;  // of what is kept of an evaluation
   // What each stage's slope counts for in the step, and how far along it the next point lies.
@@ -107,13 +98,13 @@ struct Coupling {
   float *scale = reinterpret_cast<float*>(lane.room(U)), *through_q = reinterpret_cast<float*>(lane.room(U));
 
   void centre(Vec* z) const {
-    const int64_t last = lane.b - (blocks - 1) * V;
+    const int64_t last = lane.own - (blocks - 1) * V;
     in_tiles<Z, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
       Vec all[R], *end = z + (blocks - 1) * Z + i;
       UNROLL for (int r = 0; r < R; ++r) all[r] = end[r] = first(end[r], last);
       for (int64_t j = 0; j < blocks - 1; ++j) UNROLL for (int r = 0; r < R; ++r) all[r] += z[j * Z + i + r];
-      UNROLL for (int r = 0; r < R; ++r) all[r] = wide(sum(all[r]) / float(lane.b)), end[r] = first(end[r] - all[r], last);
+      UNROLL for (int r = 0; r < R; ++r) all[r] = wide(sum(all[r]) / float(lane.own)), end[r] = first(end[r] - all[r], last);
       for (int64_t j = 0; j < blocks - 1; ++j) UNROLL for (int r = 0; r < R; ++r) z[j * Z + i + r] -= all[r];
     });
   }
@@ -130,7 +121,7 @@ struct Coupling {
         dense<R, Z>(lane.w + WEIGHT + i * Z, Z, 1, z + j * Z, block);
         UNROLL for (int r = 0; r < R; ++r) squares[r] += block[r] * block[r];
       }
-      UNROLL for (int r = 0; r < R; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(lane.b) + lane.epsilon);
+      UNROLL for (int r = 0; r < R; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(lane.own) + lane.epsilon);
     });
     for (int i = 0; i < H; ++i) scale[i] = lane.w[GAIN + i] * q[i];
   }
@@ -145,7 +136,7 @@ struct Coupling {
         UNROLL for (int r = 0; r < R; ++r) by_scale[r] += dn[j * U + i + r] * h[j * U + i + r], by_shift[r] += dn[j * U + i + r];
       UNROLL for (int r = 0; r < R; ++r) {
         sums[GAIN + i + r] += q[i + r] * by_scale[r], sums[SHIFT + i + r] += by_shift[r];
-        through_q[i + r] = -scale[i + r] * q[i + r] * q[i + r] * sum(by_scale[r]) / float(lane.b);
+        through_q[i + r] = -scale[i + r] * q[i + r] * q[i + r] * sum(by_scale[r]) / float(lane.own);
       }
     });
     for (int64_t j = 0; j < blocks; ++j)
@@ -162,9 +153,9 @@ void forward_lane(const Call& call) {
   Vec *x = lane.room(n), *slopes = lane.room(n), *total = lane.room(n), *u = lane.room(group * M), *passing = lane.room(lane.size);
   const Coupling coupling{lane};
   for (int64_t first = 0; first < lane.blocks; first += group) {
-    for (int64_t j = 0; j < group; ++j) lane.x0.gather(0, (first + j) * V, false, x + j * D);
+    for (int64_t j = 0; j < group; ++j) lane.x0.gather(0, first + j, x + j * D);
     for (int64_t t = 0; t < lane.steps; ++t) {
-      for (int64_t j = 0; j < group; ++j) lane.u.gather(t, (first + j) * V, false, u + j * M);
+      for (int64_t j = 0; j < group; ++j) lane.u.gather(t, first + j, u + j * M);
       for (int stage = 0; stage < STAGES; ++stage) {
         Vec *point = lane.kept ? lane.point(first, t, stage) : passing, *h = lane.h(point);
         for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + lane.ahead[stage - 1] * slopes[i] : x[i];
@@ -174,7 +165,7 @@ void forward_lane(const Call& call) {
         for (int64_t i = 0; i < n; ++i) total[i] = (stage ? total[i] : x[i]) + lane.share[stage] * slopes[i];
       }
       std::swap(x, total);
-      for (int64_t j = 0; j < group; ++j) states.scatter(x + j * D, t, (first + j) * V);
+      for (int64_t j = 0; j < group; ++j) states.scatter(x + j * D, t, first + j);
     }
   }
 }
@@ -197,7 +188,7 @@ void backward_lane(const Call& call) {
     std::fill_n(dx, n, Vec{});
     for (int64_t t = lane.steps; t--;) {
       for (int64_t j = 0; j < group; ++j) {
-        lane.u.gather(t, (first + j) * V, false, u + j * M), d_states.gather(t, (first + j) * V, true, more);
+        lane.u.gather(t, first + j, u + j * M), d_states.gather(t, first + j, more);
         for (int i = 0; i < D; ++i) dx[j * D + i] += more[i];
       }
       std::copy_n(dx, n, next), std::fill_n(du, group * M, Vec{});
@@ -219,32 +210,23 @@ void backward_lane(const Call& call) {
         for (int64_t i = 0; i < n; ++i) dx[i] += d_point[i];
       }
       if (H) add_products<H, Z>(sums + WEIGHT, c.dhs, U, c.zs, Z, STAGES * group);
-      for (int64_t j = 0; j < group; ++j) d_u.scatter(du + j * M, t, (first + j) * V);
+      for (int64_t j = 0; j < group; ++j) d_u.scatter(du + j * M, t, first + j);
     }
-    for (int64_t j = 0; j < group; ++j) d_x0.scatter(dx + j * D, 0, (first + j) * V);
+    for (int64_t j = 0; j < group; ++j) d_x0.scatter(dx + j * D, 0, first + j);
   }
   products(sums, factors, used);
   for (int64_t i = 0; i < P; ++i) call.result(WEIGHTS)[i] = sum(sums[i]);
 }
 #endif
 
-XLA_FFI_Error* each_lane(const XLA_FFI_CallFrame* frame, void (*run)(const Call&)) {
-  auto* asked = frame->extension_start;
-  if (asked && asked->type == XLA_FFI_Extension_Metadata) {  // nothing, but for the version of the interface
-    XLA_FFI_Metadata* about = reinterpret_cast<XLA_FFI_Metadata_Extension*>(asked)->metadata;
-    about->api_version = {XLA_FFI_Api_Version_STRUCT_SIZE, nullptr, XLA_FFI_API_MAJOR, XLA_FFI_API_MINOR};
-    about->traits = 0;
-    about->state_type_id = XLA_FFI_UNKNOWN_TYPE_ID;
-    return nullptr;
-  }
+void each_lane(const XLA_FFI_CallFrame* frame, void (*run)(const Call&)) {
   const int64_t lanes = Call::count(frame->args.args[X0]) / (D * Call{frame}.size(X0, -1));
   for (int64_t lane = 0; lane < lanes; ++lane) run({frame, lane, lanes});
-  return nullptr;
 }
 
 }  // namespace
 
-extern "C" XLA_FFI_Error* forward(XLA_FFI_CallFrame* frame) { return each_lane(frame, forward_lane); }
+extern "C" void forward(const XLA_FFI_CallFrame* frame) { each_lane(frame, forward_lane); }
 #if TRAINING
-extern "C" XLA_FFI_Error* backward(XLA_FFI_CallFrame* frame) { return each_lane(frame, backward_lane); }
+extern "C" void backward(const XLA_FFI_CallFrame* frame) { each_lane(frame, backward_lane); }
 #endif

@@ -30,7 +30,7 @@ INLINE bool is_known(Vec) { return false; }
 EXTREME(larger, >) EXTREME(smaller, <)
 
 // Of glibc's library of vectors, within four units in the last place; and number by number.
-#if defined(__AVX512F__)
+#if V == 16
 #define OF_VECTORS(NAME) _ZGVeN16v_##NAME
 #define OF_PAIRS(NAME) _ZGVeN16vv_##NAME
 #else

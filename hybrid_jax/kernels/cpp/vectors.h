@@ -13,13 +13,9 @@
 
 namespace {
 
-// V numbers in a vector. What registers hold: rows of a product with a vector; and rows and columns of
-// a sum of products.
-#if defined(__AVX512F__)
-constexpr int V = 16, DENSE = 20, ROWS = 4, COLUMNS = 6;
-#else
-constexpr int V = 8, DENSE = 8, ROWS = 3, COLUMNS = 3;
-#endif
+// What registers hold beside vectors of V numbers: rows of a product with a vector; and rows and columns of a sum of
+// products.
+constexpr int DENSE = V == 16 ? 20 : 8, ROWS = V == 16 ? 4 : 3, COLUMNS = V == 16 ? 6 : 3;
 
 #define INLINE inline __attribute__((always_inline))
 #define UNROLL _Pragma("GCC unroll 20")
