@@ -164,9 +164,14 @@ class CTranslation(Translation[np.ndarray]):
     def _loops(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """A B as loops."""
         (m, k), n = a.shape, b.shape[1]
-        if m == 1 and n > 1 and loops.is_contiguous(b.T.ravel()):
+        if m == 1 and n > 1:
             return self._loops(b.T, a.T).T
-        given = [self._address(one.ravel(), one.shape) for one in (a, b)]
+        matrix = loops.indexed(self.tables, a.ravel(), a.shape)
+        if isinstance(matrix, Entry) and matrix.steps:
+            start, steps = Address(matrix.name, matrix.index), matrix.steps
+        else:
+            start, steps = self._address(a.ravel()), (k, 1)
+        given = start, *steps, self._address(b.ravel(), b.shape)
         return self._filled(m * n, lambda out: Call("product", (*given, Address(out), m, k, n))).reshape(m, n)
 
     def _power(self, base: np.ndarray, exponent: int, shape) -> np.ndarray:

@@ -38,28 +38,30 @@ static real larger(real a, real b) { return a > b || a != a ? a : b; }
 static real smaller(real a, real b) { return a < b || a != a ? a : b; }
 """,
     "product": """\
-/* out = A B, of m x k and k x n; four rows at a time, so that sums need not wait for each other. */
-static void product(const real *restrict a, const real *restrict b, real *restrict out, int m, int k, int n) {
+/* out = A B, of m x k and k x n, with A[i, l] at a[i * row + l * step]; four rows at a time, so that sums need not
+   wait for each other. */
+static void product(const real *restrict a, int row, int step, const real *restrict b, real *restrict out, int m,
+                    int k, int n) {
     for (int j = 0; j < n; ++j) {
-        const real *row = a;
         int i = 0;
-        for (; i + 4 <= m; i += 4, row += 4 * k) {
+        for (; i + 4 <= m; i += 4) {
+            const real *at = a + i * row;
             real p = 0, q = 0, r = 0, s = 0;
-            for (int l = 0; l < k; ++l) {
+            for (int l = 0; l < k; ++l, at += step) {
                 const real v = b[l * n + j];
-                p += row[l] * v;
-                q += row[k + l] * v;
-                r += row[2 * k + l] * v;
-                s += row[3 * k + l] * v;
+                p += at[0] * v;
+                q += at[row] * v;
+                r += at[2 * row] * v;
+                s += at[3 * row] * v;
             }
             out[i * n + j] = p;
             out[(i + 1) * n + j] = q;
             out[(i + 2) * n + j] = r;
             out[(i + 3) * n + j] = s;
         }
-        for (; i < m; ++i, row += k) {
+        for (; i < m; ++i) {
             real p = 0;
-            for (int l = 0; l < k; ++l) { p += row[l] * b[l * n + j]; }
+            for (int l = 0; l < k; ++l) { p += a[i * row + l * step] * b[l * n + j]; }
             out[i * n + j] = p;
         }
     }

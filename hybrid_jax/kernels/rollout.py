@@ -1,5 +1,6 @@
 """Rollouts of many windows by a field's kernel: one call for all intervals, and one for the derivative."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,12 +25,12 @@ class Call(NamedTuple):
     dt: float
     windows: int
 
-    def forward(self, kept: int, *arrays: Array) -> list[Array]:
+    def forward(self, kept: int, *arrays: Array) -> Sequence[Array]:
         """Return the states, and so many numbers that the way back needs."""
         shapes = (len(arrays[-1]), *arrays[-2].shape), (kept,)
         return self.run("forward", [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes], *arrays)
 
-    def run(self, way: str, results: list, *arrays: Array) -> list[Array]:
+    def run(self, way: str, results: list, *arrays: Array) -> Sequence[Array]:
         """Call the kernel on arrays, which it does not check; `vmap` makes one call."""
         numbers = np.array([self.dt, self.kernel.epsilon, self.windows], np.float32)
         call = jax.ffi.ffi_call(f"hybrid_jax_{way}", results, vmap_method="broadcast_all")
@@ -45,8 +46,9 @@ def trained(field, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float,
     """Return the trajectories (t, d, b) of a minibatch in training mode, or None without a kernel."""
     if (kernel := _kernel(field, x0, u, solver, -1, True)) is None:
         return None
-    run = Call(kernel, float(dt), x0.shape[-1])
-    return _rollout(run, kernel.weights(field), *_filled(x0, u))[..., : run.windows]
+    call = Call(kernel, float(dt), x0.shape[-1])
+    states: Any = _rollout(call, kernel.weights(field), *_filled(x0, u))
+    return states[..., : call.windows]
 
 
 def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, solver: Solver):

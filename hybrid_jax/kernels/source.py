@@ -9,7 +9,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from hybrid_jax.codegen import loops, nodes
 from hybrid_jax.codegen.loops import Tables
-from hybrid_jax.codegen.nodes import Address, Call, Entry, Expression, Loop, Operation, Statement
+from hybrid_jax.codegen.nodes import Entry, Expression, Loop, Operation, Statement
 from hybrid_jax.codegen.operations import LOGICAL, CTranslation, column, is_zero
 from hybrid_jax.codegen.printer import OPERATIONS, CPrinter
 from hybrid_jax.codegen.translation import Entries
@@ -31,18 +31,6 @@ class SampleTranslation(CTranslation):
 
     def scan(self, equation, inputs):
         raise self._refusal(equation)
-
-    def _loops(self, a, b):
-        (m, k), n = a.shape, b.shape[1]
-        if n > 1:
-            return super()._loops(a, b) if m > 1 else self._loops(b.T, a.T).T
-        matrix, steps = loops.indexed(self.tables, a.ravel(), a.shape), (k, 1)
-        if isinstance(matrix, Entry) and matrix.steps:
-            matrix, steps = Address(matrix.name, matrix.index), matrix.steps
-        else:
-            matrix = loops.address(self.tables, self._gathered(a.ravel()))
-        given = matrix, *steps, loops.address(self.tables, self._gathered(b.ravel(), b.shape))
-        return self._filled(m, lambda out: Call(f"dense<{m}, {k}>", (*given, Address(out)))).reshape(m, 1)
 
     def _mapped(self, value, shape, logical):
         """Cheap values are computed again in loops over entries, instead of being read from an array."""
@@ -88,15 +76,19 @@ class SamplePrinter(CPrinter):
                 return f"const auto {name} = {self.expression(value)};"
             case nodes.Array(name, size, logical):
                 return f"HELD {'logical' if logical else 'real'} {name}[{size}];"
-            case nodes.Assign(target, value):
-                return f"{self.expression(target)} = wide({self.expression(value)});"
+            case nodes.Assign(target, value):  # sums over samples begin at zero
+                return (
+                    f"{self.expression(target)} {'+=' if target.name == 's' else '='} wide({self.expression(value)});"
+                )
+            case nodes.Call("product", (*arguments, m, k, n)):
+                return f"product<{m}, {k}, {n}>({', '.join(map(self.expression, arguments))});"
         return super().statement(node)
 
 
 GIVEN = "const float *__restrict w, const Vec *__restrict x, const Vec *__restrict u, "
 SLOPE, READ = "const Normal n, Vec *out", "Vec *out"
-SLOPE_BACK = "const Normal n, const Vec *__restrict d_slope, Vec *dx, Vec *du, Vec *dn, Sums s, Vec *f"
-READ_BACK = "const Vec *d_read, Vec *dx, Vec *du, Sums s"
+SLOPE_BACK = "const Normal n, const Vec *__restrict d_slope, Vec *dx, Vec *du, Vec *dn, Vec *s, Vec *f"
+READ_BACK = "const Vec *d_read, Vec *dx, Vec *du, Vec *s"
 Outputs = list[tuple[str, int]]  # arrays, and where in them the results begin
 
 

@@ -6,25 +6,15 @@
 
 #include "xla/ffi/api/c_api.h"
 
-namespace {
-
 using Run = void (*)(const XLA_FFI_CallFrame*);
-
 struct Kernel {
-  char* name;
-  char* error;  // why there is no kernel
+  const char *name, *error;  // why there is none
   Run ways[2];  // forward and backward
   Kernel* next;
 };
-std::atomic<Kernel*> known{nullptr};
+static std::atomic<Kernel*> known{nullptr};
 
-const Kernel* found(const char* name) {
-  for (;; usleep(500))
-    for (Kernel* one = known; one; one = one->next)
-      if (!std::strncmp(one->name, name, std::strlen(one->name))) return one;
-}
-
-XLA_FFI_Error* enter(const XLA_FFI_CallFrame* frame, int way) {
+static XLA_FFI_Error* enter(const XLA_FFI_CallFrame* frame, int way) {
   auto* asked = frame->extension_start;
   if (asked && asked->type == XLA_FFI_Extension_Metadata) {  // nothing, but for the version of the interface
     XLA_FFI_Metadata* about = reinterpret_cast<XLA_FFI_Metadata_Extension*>(asked)->metadata;
@@ -33,13 +23,15 @@ XLA_FFI_Error* enter(const XLA_FFI_CallFrame* frame, int way) {
     about->state_type_id = XLA_FFI_UNKNOWN_TYPE_ID;
     return nullptr;
   }
-  const Kernel* kernel = found(static_cast<const XLA_FFI_ByteSpan*>(frame->attrs.attrs[0])->ptr);
-  if (Run run = kernel->ways[way]) return run(frame), nullptr;
-  XLA_FFI_Error_Create_Args args{XLA_FFI_Error_Create_Args_STRUCT_SIZE, nullptr, kernel->error, XLA_FFI_Error_Code_INTERNAL};
-  return frame->api->XLA_FFI_Error_Create(&args);
+  auto* name = static_cast<const XLA_FFI_ByteSpan*>(frame->attrs.attrs[0]);
+  for (;; usleep(500))
+    for (Kernel* one = known; one; one = one->next) {
+      if (std::strncmp(one->name, name->ptr, name->len)) continue;
+      if (one->ways[way]) return one->ways[way](frame), nullptr;
+      XLA_FFI_Error_Create_Args why{XLA_FFI_Error_Create_Args_STRUCT_SIZE, nullptr, one->error, XLA_FFI_Error_Code_INTERNAL};
+      return frame->api->XLA_FFI_Error_Create(&why);
+    }
 }
-
-}  // namespace
 
 extern "C" XLA_FFI_Error* forward(XLA_FFI_CallFrame* frame) { return enter(frame, 0); }
 extern "C" XLA_FFI_Error* backward(XLA_FFI_CallFrame* frame) { return enter(frame, 1); }

@@ -9,9 +9,6 @@
 //
 // A group of vectors of windows goes through all intervals before the next begins: one, or all if they are coupled.
 
-#pragma once
-
-#include "samples.h"
 #include "xla/ffi/api/c_api.h"
 
 namespace {
@@ -26,6 +23,7 @@ constexpr int64_t U = H ? H | 1 : 0;  // vectors from one n to the next: an even
 struct Call {
   const XLA_FFI_CallFrame* frame;
   int64_t lane = 0, lanes = 1;
+  const float* numbers = static_cast<const float*>(static_cast<const XLA_FFI_Array*>(frame->attrs.attrs[1])->data);
 
   int64_t size(int i, int64_t axis) const {  // of an argument; the last axis is −1
     auto* array = static_cast<const XLA_FFI_Buffer*>(frame->args.args[i]);
@@ -41,39 +39,32 @@ struct Call {
   }
   float* argument(int i) const { return part(frame->args.args[i]); }
   float* result(int i) const { return part(frame->rets.rets[i]); }
-  float number(int i) const {
-    return static_cast<const float*>(static_cast<const XLA_FFI_Array*>(frame->attrs.attrs[1])->data)[i];
-  }
 };
 
 // Arguments: the weights, x0 (d, b) and u (t, m, b), on the way back also those of the kernels there, what was kept, and
 // the derivatives with respect to the states.
 enum Argument { WEIGHTS, X0, INPUTS, BACK, KEPT, D_STATES };
 
-// An array (t, rows, b) of windows.
-struct Windows {
-  float* at;
-  int64_t rows, b;
+// V windows of an array (rows, b).
+INLINE void gather(const float* from, int64_t rows, int64_t b, Vec* to) {
+  for (int64_t r = 0; r < rows; ++r) to[r] = load(from + r * b);
+}
+INLINE void scatter(const Vec* from, int64_t rows, int64_t b, float* to) {
+  for (int64_t r = 0; r < rows; ++r) store(to + r * b, from[r]);
+}
 
-  void gather(int64_t t, int64_t block, Vec* to) const {
-    for (int64_t r = 0; r < rows; ++r) to[r] = load(at + (t * rows + r) * b + block * V);
-  }
-  void scatter(const Vec* from, int64_t t, int64_t block) const {
-    for (int64_t r = 0; r < rows; ++r) store(at + (t * rows + r) * b + block * V, from[r]);
-  }
-};
-
-// b windows of `steps` intervals, of which the last are copies that fill a vector, and what is kept of each evaluation for the way back, or nothing: x, h and q.
+// b windows of `steps` intervals, of which `own` are no copies that fill the last vector, and what is kept of each
+// evaluation for the way back, or nothing: x, h and q.
 struct Lane {
   const Call& call;
   Vec* kept;
-  const int64_t steps = call.size(INPUTS, -3), b = call.size(INPUTS, -1), blocks = b / V, own = int64_t(call.number(2));
+  const int64_t steps = call.size(INPUTS, -3), b = call.size(INPUTS, -1), blocks = b / V, own = int64_t(call.numbers[2]);
   const int64_t group = H ? blocks : 1, n = group * D;  // vectors of windows, and of their states
   const int64_t size = group * (D + U) + (H + V - 1) / V;  // of what is kept of an evaluation
   // What each stage's slope counts for in the step, and how far along it the next point lies.
-  const float dt = call.number(0), share[STAGES] = {dt / 6, dt / 3, dt / 3, dt / 6}, ahead[STAGES] = {dt / 2, dt / 2, dt, 0};
-  const float epsilon = call.number(1), *w = call.argument(WEIGHTS);
-  const Windows x0{call.argument(X0), D, b}, u{call.argument(INPUTS), M, b};
+  const float dt = call.numbers[0], share[STAGES] = {dt / 6, dt / 3, dt / 3, dt / 6}, ahead[STAGES] = {dt / 2, dt / 2, dt, 0};
+  const float epsilon = call.numbers[1], *w = call.argument(WEIGHTS);
+  float *x0 = call.argument(X0), *u = call.argument(INPUTS);
   mutable Room room{};
 
   Vec* point(int64_t first, int64_t t, int stage) const { return kept + ((first * steps + t) * STAGES + stage) * size; }
@@ -98,14 +89,14 @@ struct Coupling {
   float *scale = reinterpret_cast<float*>(lane.room(U)), *through_q = reinterpret_cast<float*>(lane.room(U));
 
   void centre(Vec* z) const {
-    const int64_t last = lane.own - (blocks - 1) * V;
     in_tiles<Z, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
-      Vec all[R], *end = z + (blocks - 1) * Z + i;
-      UNROLL for (int r = 0; r < R; ++r) all[r] = end[r] = first(end[r], last);
-      for (int64_t j = 0; j < blocks - 1; ++j) UNROLL for (int r = 0; r < R; ++r) all[r] += z[j * Z + i + r];
-      UNROLL for (int r = 0; r < R; ++r) all[r] = wide(sum(all[r]) / float(lane.own)), end[r] = first(end[r] - all[r], last);
-      for (int64_t j = 0; j < blocks - 1; ++j) UNROLL for (int r = 0; r < R; ++r) z[j * Z + i + r] -= all[r];
+      Vec all[R] = {};
+      for (int64_t j = 0; j < blocks; ++j)
+        UNROLL for (int r = 0; r < R; ++r) all[r] += z[j * Z + i + r] = first(z[j * Z + i + r], lane.own - j * V);
+      UNROLL for (int r = 0; r < R; ++r) all[r] = wide(sum(all[r]) / float(lane.own));
+      for (int64_t j = 0; j < blocks; ++j)
+        UNROLL for (int r = 0; r < R; ++r) z[j * Z + i + r] = first(z[j * Z + i + r] - all[r], lane.own - j * V);
     });
   }
   // z, and unless these are known h and q, some units at a time, so that these stay in the first cache.
@@ -148,14 +139,13 @@ struct Coupling {
 // Results: the states and what is kept, of no size if nothing is.
 void forward_lane(const Call& call) {
   const Lane lane{call, Call::count(call.frame->rets.rets[1]) ? vectors(call.result(1)) : nullptr};
-  const Windows states{call.result(0), D, lane.b};
-  const int64_t group = lane.group, n = lane.n;
+  const int64_t group = lane.group, n = lane.n, b = lane.b;
   Vec *x = lane.room(n), *slopes = lane.room(n), *total = lane.room(n), *u = lane.room(group * M), *passing = lane.room(lane.size);
   const Coupling coupling{lane};
   for (int64_t first = 0; first < lane.blocks; first += group) {
-    for (int64_t j = 0; j < group; ++j) lane.x0.gather(0, first + j, x + j * D);
+    for (int64_t j = 0; j < group; ++j) gather(lane.x0 + (first + j) * V, D, b, x + j * D);
     for (int64_t t = 0; t < lane.steps; ++t) {
-      for (int64_t j = 0; j < group; ++j) lane.u.gather(t, first + j, u + j * M);
+      for (int64_t j = 0; j < group; ++j) gather(lane.u + t * M * b + (first + j) * V, M, b, u + j * M);
       for (int stage = 0; stage < STAGES; ++stage) {
         Vec *point = lane.kept ? lane.point(first, t, stage) : passing, *h = lane.h(point);
         for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + lane.ahead[stage - 1] * slopes[i] : x[i];
@@ -165,7 +155,7 @@ void forward_lane(const Call& call) {
         for (int64_t i = 0; i < n; ++i) total[i] = (stage ? total[i] : x[i]) + lane.share[stage] * slopes[i];
       }
       std::swap(x, total);
-      for (int64_t j = 0; j < group; ++j) states.scatter(x + j * D, t, first + j);
+      for (int64_t j = 0; j < group; ++j) scatter(x + j * D, D, b, call.result(0) + t * D * b + (first + j) * V);
     }
   }
 }
@@ -175,9 +165,9 @@ void forward_lane(const Call& call) {
 // within each place of a vector; their factors wait in slots for the products.
 void backward_lane(const Call& call) {
   const Lane lane{call, vectors(call.argument(KEPT))};
-  const Windows d_states{call.argument(D_STATES), D, lane.b}, d_x0{call.result(X0), D, lane.b}, d_u{call.result(INPUTS), M, lane.b};
-  const int64_t group = lane.group, n = lane.n;
-  const float* back = call.argument(BACK);
+  const int64_t group = lane.group, n = lane.n, b = lane.b;
+  const float *back = call.argument(BACK), *d_states = call.argument(D_STATES);
+  float *d_x0 = call.result(X0), *d_u = call.result(INPUTS);
   Vec *dx = lane.room(n), *next = lane.room(n), *d_slope = lane.room(n), *d_point = lane.room(n);
   Vec *u = lane.room(group * M), *du = lane.room(group * M), *more = lane.room(D), *more_u = lane.room(M);
   Vec *sums = lane.room(P), *factors = lane.room(F * SLOTS);
@@ -188,7 +178,7 @@ void backward_lane(const Call& call) {
     std::fill_n(dx, n, Vec{});
     for (int64_t t = lane.steps; t--;) {
       for (int64_t j = 0; j < group; ++j) {
-        lane.u.gather(t, first + j, u + j * M), d_states.gather(t, first + j, more);
+        gather(lane.u + t * M * b + (first + j) * V, M, b, u + j * M), gather(d_states + t * D * b + (first + j) * V, D, b, more);
         for (int i = 0; i < D; ++i) dx[j * D + i] += more[i];
       }
       std::copy_n(dx, n, next), std::fill_n(du, group * M, Vec{});
@@ -198,21 +188,21 @@ void backward_lane(const Call& call) {
         if (H) c.evaluate(stage, point, u, h, lane.q(point), true);
         for (int64_t j = 0; j < group; ++j) {
           if (used == SLOTS) products(sums, factors, used), used = 0;
-          slope_back(back, point + j * D, u + j * M, c.normal(h + j * U), d_slope + j * D, d_point + j * D, more_u, c.dn + j * U, {sums}, factors + F * used++);
+          slope_back(back, point + j * D, u + j * M, c.normal(h + j * U), d_slope + j * D, d_point + j * D, more_u, c.dn + j * U, sums, factors + F * used++);
           for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
         }
         if (H) c.back(stage, h, lane.q(point), sums);
         for (int64_t j = 0; j < group && H; ++j) {
-          read_back(back, point + j * D, u + j * M, c.dz + j * Z, more, more_u, {sums});
+          read_back(back, point + j * D, u + j * M, c.dz + j * Z, more, more_u, sums);
           for (int i = 0; i < D; ++i) d_point[j * D + i] += more[i];
           for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
         }
         for (int64_t i = 0; i < n; ++i) dx[i] += d_point[i];
       }
       if (H) add_products<H, Z>(sums + WEIGHT, c.dhs, U, c.zs, Z, STAGES * group);
-      for (int64_t j = 0; j < group; ++j) d_u.scatter(du + j * M, t, first + j);
+      for (int64_t j = 0; j < group; ++j) scatter(du + j * M, M, b, d_u + t * M * b + (first + j) * V);
     }
-    for (int64_t j = 0; j < group; ++j) d_x0.scatter(dx + j * D, 0, first + j);
+    for (int64_t j = 0; j < group; ++j) scatter(dx + j * D, D, b, d_x0 + (first + j) * V);
   }
   products(sums, factors, used);
   for (int64_t i = 0; i < P; ++i) call.result(WEIGHTS)[i] = sum(sums[i]);

@@ -1,7 +1,5 @@
 // Operations on a number of each of V samples, for generated code: a `real` is such a vector, a float the same for all.
 
-#pragma once
-
 #include "vectors.h"
 
 namespace {
@@ -70,22 +68,16 @@ struct Normal {
   INLINE Normal operator+(int64_t i) const { return {scale + i, shift + i, h + i}; }
 };
 
-// out = A B, of m x k and k x n.
-template <class A, class B>
-INLINE void product(A a, B b, Vec* out, int m, int k, int n) {
-  for (int j = 0; j < n; ++j)
-    for (int i = 0; i < m; ++i) {
+// out = A B of M rows and N columns, with A[i, k] at a[i row + k step].
+template <int M, int K, int N, class A, class B>
+INLINE void product(A a, int64_t row, int64_t step, B b, Vec* out) {
+  if constexpr (N == 1 && std::is_pointer_v<A>) dense<M, K>(a, row, step, b, out);
+  else for (int j = 0; j < N; ++j)
+    for (int i = 0; i < M; ++i) {
       Vec sum{};
-      for (int l = 0; l < k; ++l) sum += a[i * k + l] * b[l * n + j];
-      out[i * n + j] = sum;
+      for (int l = 0; l < K; ++l) sum += a[i * row + l * step] * b[l * N + j];
+      out[i * N + j] = sum;
     }
 }
-
-// Where results go that are added up over samples.
-struct Sums {
-  Vec* at;
-  struct Sum { Vec* at; INLINE void operator=(Vec v) const { *at += v; } };
-  INLINE Sum operator[](int64_t i) const { return {at + i}; }
-};
 
 }  // namespace

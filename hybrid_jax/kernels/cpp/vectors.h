@@ -3,8 +3,6 @@
 //
 // The order of all sums depends on the sizes alone, so that a lane of a sweep is the same run alone.
 
-#pragma once
-
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
