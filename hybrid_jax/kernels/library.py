@@ -16,6 +16,7 @@ import threading
 import time
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -72,7 +73,7 @@ def _flags() -> list[str]:
 @cache
 def _entry() -> ctypes.CDLL:
     """Load and register what programs call."""
-    library = ctypes.CDLL(str(_checked_library((SOURCES / "entry.cc").read_text())))
+    library = ctypes.CDLL(str(_checked_library((SOURCES / "entry.cc").read_text("utf-8"))))
     for handler in ("forward", "backward"):
         target = jax.ffi.pycapsule(ctypes.cast(library[handler], ctypes.c_void_p).value)
         jax.ffi.register_ffi_target(f"hybrid_jax_{handler}", target, platform="cpu")
@@ -85,7 +86,8 @@ def begun(source: str) -> str:
     name, entry = _digest(source), _entry()
 
     def run() -> None:
-        ways, said = [None, None], ""
+        ways: list[Any] = [None, None]
+        said = ""
         try:
             library = ctypes.CDLL(str(_checked_library(source)))
             ways = [getattr(library, one, None) for one in ("forward", "backward")]
