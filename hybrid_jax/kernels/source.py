@@ -9,10 +9,9 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from hybrid_jax.codegen import loops, nodes
 from hybrid_jax.codegen.loops import Tables
-from hybrid_jax.codegen.nodes import Entry, Expression, Loop, Operation, Statement
-from hybrid_jax.codegen.operations import LOGICAL, CTranslation, column, is_zero
+from hybrid_jax.codegen.nodes import Expression, Loop, Operation, Statement
+from hybrid_jax.codegen.operations import LOGICAL, CTranslation, entries, is_zero
 from hybrid_jax.codegen.printer import OPERATIONS, CPrinter
-from hybrid_jax.codegen.translation import Entries
 from hybrid_jax.kernels.library import width
 from hybrid_jax.kernels.trace import Shape, Split, outputs_of, split, traced, with_factors
 
@@ -136,10 +135,8 @@ class Source:
     def _add(self, name: str, parameters: str, program: ClosedJaxpr, weights, inputs, outputs: Outputs) -> None:
         """Add a function of inputs and weights, which begin at these places of `w`, that fills the outputs."""
         starts = [*(("w", place) for place in weights), *((name, 0) for name in inputs)]
-        arguments = [
-            Entries(column(Entry(array, first + k) for k in range(one.size)), one.shape)
-            for (array, first), one in zip(starts, program.in_avals, strict=True)
-        ]
+        pairs = zip(starts, program.in_avals, strict=True)
+        arguments = [entries(array, one.shape, first) for (array, first), one in pairs]
         translation = SampleTranslation(self.tables)
         pairs = zip(outputs, translation.run(program, arguments), strict=True)
         written = [(*out, one) for out, one in pairs if len(one) and not (out[0] == "s" and is_zero(one))]
