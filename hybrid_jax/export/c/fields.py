@@ -93,7 +93,9 @@ def export_c(
 
         file.add("step_jacobian", "As step, with its Jacobians.", step_jacobian, inputs, ["next", *jacobians])
         if isinstance(field, DisturbanceModel):
-            shapes = dict(zip(OBSERVED, (*inputs.values(), (d - field.hidden,)), strict=True))
+            shapes: dict[str, tuple[int, ...]] = dict(
+                zip(OBSERVED, (*inputs.values(), (d - field.hidden,)), strict=True)
+            )
             likes = [jax.ShapeDtypeStruct(shape, float) for shape in shapes.values()]
             about = OBSERVE.format(d - field.hidden, field.hidden)
             file.add("observe", about, program_of(field, likes, dt, smooth), shapes, ["next"])
