@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks, kernels
 from hybrid_jax.batches import in_chunks
-from hybrid_jax.dynamics.base import AbstractVectorField, continuous
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.window_checks import continuous
 from hybrid_jax.integrate import LONG, RK4, Solver, rollout_batch
 from hybrid_jax.runtime import FAST_COMPILE, entry, jit_by_size
 from hybrid_jax.trajectories import Trajectories, check, errors_of

@@ -195,6 +195,12 @@ class StateSpace:
         """The dimension of the state's tangent space."""
         return sum(quantity.tangent_size for quantity in self.quantities)
 
+    @property
+    def tangent_names(self) -> list[str]:
+        """The name of each number of a change of the state, for example "attitude[0]"."""
+        sizes = [(one.name, one.tangent_size) for one in self.quantities]
+        return [name if size == 1 else f"{name}[{i}]" for name, size in sizes for i in range(size)]
+
     def padded(self, d: int) -> "StateSpace":
         """Return this space, extended to d numbers by quantities x[i]; only these if d is too small.
 

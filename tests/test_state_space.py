@@ -9,9 +9,10 @@ from pendulum import pendulum, whirling
 from systems import windows, wrap
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.base import check_windows, state_space
+from hybrid_jax.dynamics.base import state_space
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, rigid_body
+from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.state_space import Angle, Attitude, Quantity, StateSpace
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off

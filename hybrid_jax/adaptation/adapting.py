@@ -21,7 +21,7 @@ from hybrid_jax.adaptation.plausible import groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, correlated, longest_chain, overlap
-from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
     disturbance_units,
@@ -30,6 +30,7 @@ from hybrid_jax.dynamics.disturbance import (
     without_zeros,
 )
 from hybrid_jax.dynamics.rigid_body import uncorrected
+from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.least_squares import discretisation, warn_of_steps
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, sandwich
 from hybrid_jax.implicit_solvers import solver_errors
@@ -129,7 +130,8 @@ def adapt(
     if good.sum() >= max(FEWEST, given / 2):
         windows, errors = (windows, errors) if good.all() else (windows[good], errors[good])
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
-    held_out = check_windows(field, held_out, "validation", missing=True)
+    if validation is not None:
+        held_out = check_windows(field, held_out, "validation", missing=True)
     check_like(held_out, train, "validation")
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
     motion = {"learned_from": learned_from} if getattr(method, "uses_motion", False) else {}

@@ -1,19 +1,15 @@
 """Vector fields ẋ = f(x, u) of one state x (d,) and one input u (m,): physics, a network, or any function."""
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, ClassVar, Self, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import (
     AbstractInferenceOnly,
     Batch,
@@ -23,8 +19,8 @@ from hybrid_jax.dynamics.batching import (
     training_mode,
     with_moved_stats,
 )
-from hybrid_jax.state_space import StateSpace, last_measured
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.state_space import StateSpace
+from hybrid_jax.trajectories import Trajectories
 
 Learned = TypeVar("Learned")
 Columns = Float[Array, "d c"]  # derivatives of d numbers in c directions
@@ -177,46 +173,6 @@ def state_space(field: AbstractVectorField, d: int | None = None) -> StateSpace:
     """The state space of a field, or of the first field inside another callable, padded to d numbers."""
     own = as_field(field).state_space
     return own if d is None else own.padded(d)
-
-
-def check_windows(
-    field: AbstractVectorField, windows: Trajectories, name: str = "windows", missing: bool = False
-) -> Trajectories:
-    """The checked windows, without jumps between representations of a state, in the parameters' precision if double.
-
-    If `missing`, x may contain NaN where a state was not measured.
-    """
-    check(windows, name, missing)
-    space = state_space(field, windows.x0.shape[-1])
-    known = windows.x if checks.is_traced(windows.x) else last_measured(windows.x0, windows.x)
-    for part, states in (("x0", windows.x0), ("x", known)):
-        space.check(f"{name}: {part}", states)
-    _warn_of_turns(space, windows.x0, known, name)
-    return continuous(field, windows)
-
-
-def _warn_of_turns(space: StateSpace, x0, x, name: str) -> None:
-    """Warn of numbers that jump by 2π, as an angle does where it is wrapped, and otherwise change little."""
-    if checks.is_traced(x0) or checks.is_traced(x):
-        return
-    path = np.concatenate([np.asarray(x0)[:, None], x], axis=1)
-    for part, one in space.parts:
-        moved = np.abs(np.diff(path[..., part], axis=1)).max(axis=1, initial=0.0) if one.is_vector else np.zeros((1, 0))
-        for i, each in enumerate(moved.T):
-            jumps = each > 1.5  # rad, of the largest change in each window
-            if jumps.any() and np.all(np.abs(each[jumps] - 2 * np.pi) < 1):
-                where = f"{name}: x[{part.start + i}] jumps by about 2π in {jumps.sum()} of {len(each)} windows"
-                remedy = "if it is an angle, unwrap it, or give the field a `state_space` with an `Angle`"
-                warnings.warn(f"{where}; {remedy}", stacklevel=3)
-
-
-def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectories:
-    """`check_windows` without the check of the states."""
-    double = any(eqx.is_inexact_array(leaf) and leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(field))
-    if double and windows.x0.dtype != jnp.float64:  # a step of the solver keeps a type
-        windows = replace(windows, **{part: getattr(windows, part).astype(jnp.float64) for part in ("x0", "u", "x")})
-    x = state_space(field, windows.x0.shape[-1]).continuous(windows.x0, windows.x)
-    return windows if x is windows.x else replace(windows, x=x)
 
 
 class _Function(AbstractVectorField):

@@ -11,8 +11,9 @@ import scipy  # not scipy.signal, which takes a second: it is imported where it 
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.hidden import DisturbanceModel
+from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.least_squares import Solver
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.trajectories import Trajectories, windows_of

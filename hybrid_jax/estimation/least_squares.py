@@ -15,9 +15,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.batches import in_chunks
-from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_learned
+from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
+from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, corrected, judged, minimise, move_of_rows
 from hybrid_jax.implicit_solvers import solver_errors, unsolved
 from hybrid_jax.integrate import compact, rollout

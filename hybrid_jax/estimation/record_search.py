@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import ravel_learned, trainable
+from hybrid_jax.dynamics.window_checks import foreign_units
 from hybrid_jax.estimation import shooting
 from hybrid_jax.estimation.elimination import End, descend, reduced, undetermined
 from hybrid_jax.estimation.normal_equations import NormalEquations
@@ -24,7 +25,6 @@ APPROACH = (1.0, 0.1, 0.01)  # what a segment's end may be off, over the size of
 MOST = 3000  # unknowns
 CLUSTERS = 20  # of a simulation's errors, each taken as one observation
 TINY, SMALL = 1e-12, 1e-3
-ALIKE, FAR = 0.9, 3.0  # correlation of a rate with what it is the rate of, and a factor between them that is a unit
 
 
 class Sums(NamedTuple):
@@ -173,8 +173,7 @@ def directions(search: Search, end: End, records: Sequence[Record]) -> tuple[str
     p, model = len(search.theta), search.problem.model
     lines = undetermined(np.asarray(jnp.sum(reduced(end.equations, p).equations.gram, axis=0)), paths_of(model))
     if search.off is None:
-        sizes = [(one.name, one.tangent_size) for one in model.space.quantities]
-        names = np.array([name if size == 1 else f"{name}[{i}]" for name, size in sizes for i in range(size)])
+        names = np.array(model.space.tangent_names)
         free, equations = np.array(model.spread) > 0, search.local(end.theta, end.own).equations
         for record, gram in zip(records, np.asarray(equations.gram)[..., p:, p:].sum(axis=1), strict=True):
             own = undetermined(gram[np.ix_(free, free)], names[free].tolist())
@@ -197,9 +196,8 @@ def check_rates(model: Model, records: Sequence[Record]) -> None:
             moved, measured = record.signals[name], record.signals[rate]
             inside = (moved.t >= measured.t[0]) & (moved.t <= measured.t[-1])
             both = moved.values[inside], integral(measured, moved.t[inside], "linear")
-            a, b = (each - each.sum(axis=0) / max(inside.sum(), 1) for each in both)
-            sizes = np.linalg.norm(a) + TINY, np.linalg.norm(b)
-            if np.sum(a * b) > ALIKE * sizes[0] * sizes[1] and not 1 / FAR < (gain := sizes[1] / sizes[0]) < FAR:
+            a, b = ((each - each.sum(axis=0) / max(inside.sum(), 1)).reshape(-1, 1) for each in both)
+            if gain := float(foreign_units(a, b)[0, 0]):
                 raise ValueError(f"{record.name}: {rate} is {gain:.3g} times the rate of {name}: check their units")
 
 

@@ -15,8 +15,9 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import check_batch_norm
+from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable

@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, as_field, check_windows, ravel_learned
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, ravel_learned
 from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, in_python, minimise, move_of_equations
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
