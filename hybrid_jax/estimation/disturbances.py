@@ -1,5 +1,6 @@
 """Learn to predict a disturbance from its own past, and estimate its hidden state from measured states."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -58,7 +59,7 @@ def fit_disturbance(
     e = state_space(field, flights[0].x0.shape[-1]).tangent_size
     features = e * len(taus) + len(places) + 1
     start = before or DisturbanceModel(field, jnp.zeros((e, features)), jnp.ones(features), taus, places)
-    seen = [observe(start, one, solver)[0] for one in flights]
+    seen = [_observed(start, one, solver)[0] for one in flights]
     errors = [errors_after_one(field, one, solver)[0] for one in flights]
     if before is None:
         start = eqx.tree_at(lambda model: model.sizes, start, _sizes(start, np.concatenate(seen)))
@@ -82,9 +83,17 @@ def observe(model: DisturbanceModel, past: Trajectories, solver: Solver = None) 
 
     Args:
         model: as returned by `fit_disturbance`.
-        past: measured windows, longer than the slowest time constant, since the filters start at zero.
+        past: measured windows; you get a warning if they are shorter than the slowest time constant, since the filters
+            start at zero.
         solver: of diffrax, by default `RK4`.
     """
+    seconds, needed = past.horizon * past.dt, max(model.time_constants, default=0.0)
+    if seconds < needed:
+        warnings.warn(f"past: {seconds:.3g} s are too short for filters of up to {needed:.3g} s", stacklevel=2)
+    return _observed(model, past, solver)
+
+
+def _observed(model: DisturbanceModel, past: Trajectories, solver: Solver) -> Float[np.ndarray, "n t+1 d+f"]:
     errors = errors_after_one(model.field, past, solver)
     shares = [-np.expm1(-past.dt / tau) for tau in model.time_constants]
     filtered = np.concatenate([scipy.signal.lfilter([a], [1, a - 1], errors, axis=1) for a in shares], axis=-1)

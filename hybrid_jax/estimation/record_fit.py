@@ -28,7 +28,7 @@ from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import RK4
-from hybrid_jax.records import Between, Record, Signal, on_grid
+from hybrid_jax.records import GAP, Between, Record, Signal, on_grid
 from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 
@@ -228,17 +228,20 @@ def predict(
         options: others of `fit_records`, such as noise, robust, segment, solver and substeps.
 
     Raises:
-        ValueError: a record without a signal of the model.
+        ValueError: a record without a signal of the model, or with inputs that begin long after the past.
     """
-    still = eqx.tree_at(lambda model: model.field, model, Frozen(model.field))
-    known = fit_records(still, [past], dt=dt, between=between, rounds=1, **options)
-    kept = {name: value for name, value in options.items() if name in ("solver", "substeps")}
     joined = dict(future.signals)
-    for name in set(model.inputs) & past.signals.keys() & joined.keys():
+    for name in (each for each in model.inputs if past.signals.get(each) and joined.get(each)):  # with samples
         before, after = past.signals[name], joined[name]
+        if after.t[0] > before.t[-1] + GAP * before.interval:
+            ends = f"begins at {after.t[0]:.6g} s, and the past ends at {before.t[-1]:.6g} s"
+            raise ValueError(f"{future.name}: {name} {ends}")
         earlier = before.t < after.t[0]
         t, values = np.append(before.t[earlier], after.t), np.concatenate([before.values[earlier], after.values])
         joined[name] = Signal(t, values, after.axes, after.source)
+    still = eqx.tree_at(lambda model: model.field, model, Frozen(model.field))
+    known = fit_records(still, [past], dt=dt, between=between, rounds=1, **options)
+    kept = {name: value for name, value in options.items() if name in ("solver", "substeps")}
     options = {"begin": known.times[0, 1], "dt": dt, "between": between} | kept
     return simulate(model, Record(future.name, joined), known.ends[0], **options)[0]
 

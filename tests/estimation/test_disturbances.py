@@ -2,11 +2,13 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.hidden import DisturbanceModel
+from hybrid_jax.trajectories import split
 
 DT, STEPS, BODY = 0.05, 10, hj.rigid_body(hj.IRIS)
 
@@ -44,6 +46,8 @@ def error(model, tested):
 def test_a_hidden_swing_is_predicted_from_its_past():
     model = hj.fit_disturbance(Spring(), [flights(0)])
     assert error(model, flights(1)) < 0.3 * error(Spring(), flights(1))
+    with pytest.warns(UserWarning, match=r"past: 0\.1 s are too short for filters of up to 3 s"):
+        hj.observe(model, split(flights(1), 2)[0])
 
 
 def test_white_noise_on_a_true_model_changes_little():

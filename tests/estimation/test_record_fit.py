@@ -242,6 +242,15 @@ def test_what_is_wrong_is_said_in_a_line(records, wrong, said):
         fit_records(model_of(pendulum()), **options)
 
 
+def test_inputs_that_nobody_knows_between_past_and_future_are_not_held():
+    near = np.arange(0, 1, 0.1)
+    past, future = (
+        Record.of(name, torque=(t, t), angle=(t, t)) for name, t in {"past": near, "future": near + 9}.items()
+    )
+    with pytest.raises(ValueError, match=r"^future: torque begins at 9 s, and the past ends at 0\.9 s$"):
+        predict(model_of(pendulum()), past, future, dt=0.02)
+
+
 @pytest.mark.parametrize("factor", [180 / np.pi, 1e-3])
 def test_a_rate_in_another_unit_than_its_angle_is_said(factor):
     outputs = {"angle": angle, "rate": lambda x, u: x[1]}
