@@ -42,7 +42,7 @@ from hybrid_jax.runtime import entry, keep_programs, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
-from hybrid_jax.training.objective import Settings
+from hybrid_jax.training.objective import UNSCALED, Settings
 from hybrid_jax.trajectories import Trajectories, check_like, features_of, overflows, shares_outside
 
 FEWEST = 10  # windows, of which outliers are told apart
@@ -95,7 +95,7 @@ def adapt(
         learned_from: windows that the source was trained on, by default those that `hj.fit` stores in its networks.
             "auto" uses them to estimate the source's own error, and the report warns if `windows` are unlike them.
         settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, which is
-            independent of units. If you pass settings, their objective is used, by default the plain MSE.
+            independent of units.
         level: confidence level of the intervals, between 0 and 1.
 
     Raises:
@@ -133,7 +133,9 @@ def adapt(
     if validation is not None:
         held_out = check_windows(field, held_out, "validation", missing=True)
     check_like(held_out, train, "validation")
-    settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
+    settings = Settings() if settings is None else settings
+    if settings.objective is UNSCALED:
+        settings = replace(settings, objective=scaled_loss(field, train))
     motion = {"learned_from": learned_from} if getattr(method, "uses_motion", False) else {}
     if motion and learned_from is None and has_network(field):
         warnings.warn(NO_MOTION, stacklevel=3)

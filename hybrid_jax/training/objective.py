@@ -111,6 +111,9 @@ class TrajectoryLoss(Objective):
         return rollout_mse(field, data, solver=settings.solver)
 
 
+UNSCALED = TrajectoryLoss()  # the default, which `adapt` replaces
+
+
 @dataclass(frozen=True)
 class Settings:
     """Settings of a training program, the same for all runs of a sweep.
@@ -119,7 +122,8 @@ class Settings:
         batch_size: windows in a minibatch, or all if there are fewer. With only a hundred windows you should try 20.
         regulariser: L_reg, a function of a `Hybrid`, the minibatch and its predicted states; by default there is none.
         solver: the integrator from sample to sample, by default one step of RK4.
-        objective: the training and validation loss, by default the squared error of trajectories.
+        objective: the training and validation loss, by default the squared error of trajectories; `adapt` divides it by
+            the size of each state, see `scaled_loss`.
 
     Raises:
         ValueError: if the batch size, regulariser, solver or objective is invalid.
@@ -128,7 +132,7 @@ class Settings:
     batch_size: int = 100
     regulariser: Regulariser | None = None
     solver: diffrax.AbstractSolver = field(default_factory=RK4)
-    objective: Objective = TrajectoryLoss()
+    objective: Objective = UNSCALED
 
     def __post_init__(self):
         if self.regulariser is not None and not callable(self.regulariser):

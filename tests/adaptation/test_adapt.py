@@ -47,7 +47,8 @@ def test_units_of_the_states_do_not_matter():
     stretched = replace(data, x0=np.asarray(data.x0) * factor, x=np.asarray(data.x) * factor)
     stretched = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), stretched)
     plain = adapt(pendulum(0.7), data, method="theta_least_squares").parameters["log_length"]
-    other = adapt(Stretched(pendulum(0.7), factor), stretched, method="theta_least_squares")
+    options = {"method": "theta_least_squares", "settings": hj.Settings(solver=hj.RK4())}
+    other = adapt(Stretched(pendulum(0.7), factor), stretched, **options)
     found = other.parameters["field.log_length"]
     np.testing.assert_allclose([found.value, found.low, found.high], [plain.value, plain.low, plain.high], rtol=1e-3)
 
