@@ -245,8 +245,9 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
     choice = Choice(*first, inherited, jnp.asarray(degrees), absorbed, vague)
     adapted = candidate(extended(field, train.x0.shape[1]), choice, taken)
-    finite = (found.status == Status.OK) | ~jnp.isinf(ends).any()
-    return Solution(adapted, found.steps, jnp.where(finite, found.status, Status.DIVERGED), choice)
+    status = jnp.where(jnp.any(found.seen), found.status, Status.STALLED)  # of what has no effect nothing is found
+    finite = (status == Status.OK) | ~jnp.isinf(ends).any()
+    return Solution(adapted, found.steps, jnp.where(finite, status, Status.DIVERGED), choice)
 
 
 LOOPS: tuple[Any, ...] = (_fits, _anchor)
