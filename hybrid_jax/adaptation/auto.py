@@ -135,22 +135,25 @@ class Auto(Method):
         scale, solver = scale_of(settings.objective, train.x0.shape[-1]), settings.solver
         larger, physics, sizes = begin(self, field, train)
         options, effect, step = (sizes, solver, scale, self.max_steps), None, None
+        still, network = np.zeros(sizes.shape, sizes.dtype), has_network(field)
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
         learned_from = motion_of(field) if learned_from is None else learned_from
         if learned_from is not None:
             distinct, learned_from = jnp.array(min(len(learned_from), len(train))), alike(learned_from, train)
-            own = fits(larger, learned_from, both, *options, distinct)[0]
-            rival = None if physics is None else fits(physics, learned_from, both, *options, distinct)[1]
+            own = fits(larger, still, learned_from, both, *options, distinct)[0]
+            rival = None if physics is None else fits(physics, still, learned_from, both, *options, distinct)[1]
             larger, source = replace(self, larger, own, rival, distinct)
         options = *options, jnp.array(len(train))
-        (found, every, starts), fitted = fits(larger, train, both, *options), None
-        if has_network(field):  # also if physics replaced the source: then it is the difference of two models
-            effect = measure(field, train, solver, scale, starts)
+        (found, every, starts), fitted = fits(larger, still, train, both, *options), None
         for _ in range(ROUNDS):
-            chosen, nothing, rows = judge(larger, train, found, every, source, learned_from, effect, sizes)
+            if network:  # also if physics replaced the source: then it is the difference of two models
+                effect = measure(field, train, solver, scale, starts)
+            chosen, nothing, move, rows = judge(larger, train, found, every, source, learned_from, effect, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
-                found, fitted = fits(larger, train, rows, *options)[1], rows
-        if self.networks and has_network(field):
+                (_, found, starts), fitted = fits(larger, move, train, rows, *options), rows
+                if not traced and found.status == Status.DIVERGED:
+                    _, found, starts = fits(larger, still, train, rows, *options)
+        if self.networks and network:
             step = anchor(larger, train, starts, found, solver, scale, nothing.error, self.blocks)
         return conclude(self, field, larger, train, (found, chosen, source, nothing, effect, step), options[:2])
 
@@ -169,8 +172,10 @@ def _begin(method: Auto, field, train: Trajectories):
     return larger, physics, method.plausible.sizes(larger, train)
 
 
-def _fits(field, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
-    found, starts = fit_each(field, windows, free, *options)
+def _fits(field, move, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
+    """Fit nothing and some parameters, from where the parameters moved by `move`, which smooths the starts as well."""
+    start, unravel = ravel_parameters(field)
+    found, starts = fit_each(unravel((start + move).astype(start.dtype)), windows, free, *options, moved=move)
     return (*(jax.tree.map(itemgetter(row), found) for row in (0, 1)), starts)
 
 
@@ -186,13 +191,14 @@ def _replace(method: Auto, larger, own: Fit, rival: Fit | None, distinct) -> tup
 
 def _judge(
     larger, train: Trajectories, around: Fit, every: Fit, source: OfSource | None, learned_from, effect, sizes
-) -> tuple[Posterior, Unchanged, Bool[Array, "2 p"]]:
+) -> tuple[Posterior, Unchanged, Float[Array, " p"], Bool[Array, "2 p"]]:
     start = ravel_parameters(larger)[0]
     free, nothing = np.stack([*free_parameters(larger).values()]), Unchanged(jnp.zeros_like(start), jnp.zeros(()))
     if source is not None:
         nothing = unchanged(source.own, around, effect.total if effect else 0.0, larger, learned_from, train)
     found = posterior(around, every, start, free, sizes, nothing.apparent)
-    return found, nothing, jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
+    rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
+    return found, nothing, jnp.where(rows[1], every.theta - start, 0.0).astype(sizes.dtype), rows
 
 
 def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale, error, blocks: int) -> Anchored:

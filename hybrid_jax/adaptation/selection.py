@@ -65,11 +65,13 @@ def fit_each(
     scale: Scale,
     max_steps: int,
     distinct: Int[Array, ""] | None = None,
+    moved: Float[Array, " p"] | float = 0.0,
 ) -> tuple[Fit, Starts | None]:
     """Fit the free parameters of each candidate, with the prior `sizes`; also return the `smoothed` starts.
 
     Args:
         distinct: see `fit_and_linearise`.
+        moved: how far the field's parameters are from the centre of the prior.
     """
     starts, noise = smoothed(field, windows, solver, scale)
     smooth, weigh = from_starts(windows, starts)
@@ -77,7 +79,7 @@ def fit_each(
 
     def one(known, free: Bool[Array, " p"]):
         held, given = jnp.sqrt(noise) / sizes, (field, smooth, solver, max_steps, scale)
-        found, jacobian, r = fit_and_linearise(*given, free, weigh, held, distinct, known)
+        found, jacobian, r = fit_and_linearise(*given, free, weigh, held, distinct, known, moved)
         equations = jax.vmap(equations_of)(jacobian, r)
         seen = has_effect(equations, windows, scale)
         theta = ravel_parameters(found.field)[0]

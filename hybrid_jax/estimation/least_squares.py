@@ -185,6 +185,7 @@ def fit_and_linearise(
     held: Theta | float = 0.0,
     distinct: Int[Array, ""] | None = None,
     known: tuple[Array, Array, Bool[Array, ""]] | None = None,
+    moved: Theta | float = 0.0,
 ) -> tuple[LeastSquaresFit, Float[Array, "n s d p"], Float[Array, "n s d"]]:
     """Run `fit_free` and return also the Jacobian of the predictions and their negative errors at the end.
 
@@ -192,7 +193,7 @@ def fit_and_linearise(
 
     Args:
         weigh: an affine map of the errors, such as `starts.projected`.
-        held: error per unit of a parameter's distance from the start.
+        held: error per unit of a parameter's distance from the start minus `moved`, to which a fit that fails returns.
         distinct: how many windows are distinct, if the others repeat them in order.
         known: the Jacobian and the errors at the start, and whether they are that or must be computed.
     """
@@ -215,11 +216,12 @@ def fit_and_linearise(
     def scaled(array, size):
         return (array / size).astype(float).reshape(-1, *array.shape[3:])
 
-    def anchor(units):
-        return (jnp.broadcast_to(held, start.shape) * units[0] / units[1]).astype(float)
+    def anchor(z: Theta, units):
+        slope = jnp.broadcast_to(held, start.shape) / units[1]
+        return (slope * units[0]).astype(float), (slope * (moved + units[0] * z)).astype(float)
 
     def cost_of(z: Theta, found, units):
-        return jnp.sum(jnp.square(scaled(found, units[1]))) + jnp.sum(jnp.square(anchor(units) * z))
+        return jnp.sum(jnp.square(scaled(found, units[1]))) + jnp.sum(jnp.square(anchor(z, units)[1]))
 
     def bent(tried, state: State) -> tuple[Theta, Float[Array, ""]]:
         (z, upper), (before, found, jacobian, units) = tried, state.best
@@ -252,9 +254,9 @@ def fit_and_linearise(
 
     def aim(best, damping):
         z, found, jacobian, (unit, size) = best
-        to_start = anchor((unit, size))
-        rows, r = scaled(jacobian * unit, size), jnp.concatenate([scaled(found, size), to_start * z])
-        move, expected, upper = move_of_rows(jnp.concatenate([rows, jnp.diag(to_start)]), r, damping)
+        slope, away = anchor(z, (unit, size))
+        rows, r = scaled(jacobian * unit, size), jnp.concatenate([scaled(found, size), away])
+        move, expected, upper = move_of_rows(jnp.concatenate([rows, jnp.diag(slope)]), r, damping)
         return (z + move, upper), expected, jnp.square(LEAST * rounding(windows, scale) / size)
 
     shape = jax.eval_shape(lambda: linearised(start)[1] if compressed else own(jnp.asarray(windows.x)))
@@ -265,7 +267,7 @@ def fit_and_linearise(
     end = minimise(evaluate, aim, begin((zero, jnp.eye(start.size)), (zero, found, jacobian, units)), max_steps)
     z, found, jacobian, (unit, _) = end.best
     mse = jnp.sum(jnp.square(found)) / (len(windows) * (windows.horizon if weigh is None else found.shape[1]))
-    theta = jnp.where(jnp.isfinite(mse), theta_at(z, unit), start)
+    theta = jnp.where(jnp.isfinite(mse), theta_at(z, unit), (start - moved).astype(start.dtype))
     fitted = True if free is None else jnp.any(free)
     blind = fitted & jnp.all(unit == 0) & (end.status == Status.OK)  # nothing that is fitted has an effect
     status = jnp.where(blind, Status.STALLED, end.status)

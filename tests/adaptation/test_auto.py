@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -232,6 +233,31 @@ def test_one_window_warns_and_a_source_without_its_motion_says_how_to_add_it():
         pytest.warns(UserWarning, match="its training windows are unknown.*; pass learned_from="),
     ):
         assert adapt(hybrid(), flown(hybrid(), count=1)).chosen == "source"
+
+
+class Stiff(hj.AbstractVectorField):
+    """A slow state, and one that follows it within a tenth of a millisecond."""
+
+    log_rate: jax.Array
+
+    def __call__(self, x, u):
+        return jnp.stack([u[0] - jnp.exp(self.log_rate) * x[0] - 0.1 * x[1] ** 2, 1e4 * (jnp.sin(x[0]) - x[1])])
+
+
+def test_a_stiff_system_is_adapted_to_the_same_rate_from_near_and_far():
+    """From far, the starts of windows must be smoothed again: around the source alone the rate is 1 % too high."""
+    solver, random = diffrax.Kvaerno3(), np.random.default_rng(0)
+    slow, u = random.normal(size=(30, 1)), random.normal(size=(30, 10, 1)).astype("f4")
+    x0 = np.concatenate([slow, np.sin(slow)], axis=1).astype("f4")
+    x = np.asarray(hj.rollout_batch(Stiff(jnp.log(0.5)), x0, u, 0.1, solver))
+    noisy = [(each + 0.005 * random.normal(size=each.shape)).astype("f4") for each in (x0, x)]
+    windows, settings = hj.Trajectories(noisy[0], u, noisy[1], dt=0.1), hj.Settings(solver=solver)
+    far, near = (adapt(Stiff(jnp.log(rate)), windows, settings=settings) for rate in (0.3, 0.48))
+    assert far.converged
+    assert near.converged
+    one, other = (each.parameters["log_rate"] for each in (far, near))
+    assert one.low < np.log(0.5) < one.high < one.low + 0.02
+    assert one.value == pytest.approx(other.value, abs=0.1 * (other.high - other.low))
 
 
 def example(key, scaling):
