@@ -36,7 +36,9 @@ def believed(
     doubt = jnp.where(counted >= tuning.alarms, doubled, counted)
     trusted = jnp.where(nis < tuning.reject, verdict.theta, state.trusted)
     trusted = jnp.where(doubt < tuning.alarms, trusted, state.settled)
-    settled = jnp.where(doubt < SETTLED, trusted, state.settled)
+    # A mean, as the last value may be that of a gust, or of a fault before its first alarm.
+    rate = jnp.where(doubt < SETTLED, -jnp.expm1(-periods / TRIAL), 0.0)
+    settled = state.settled + rate * (trusted - state.settled)
     return {"nis": nis, "doubt": doubt, "trusted": trusted, "settled": settled}
 
 

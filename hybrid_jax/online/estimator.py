@@ -34,7 +34,7 @@ from hybrid_jax.online.kalman import Belief, Correction, Each, FilterModel
 from hybrid_jax.online.multiple_model import Verdict
 from hybrid_jax.online.samples import HUGE, Sample, SampleHistory, classify
 from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, flags_of, named_priors
-from hybrid_jax.online.tuning import HOLD, PAUSE, Tuning
+from hybrid_jax.online.tuning import HOLD, MEMORY, PAUSE, Tuning
 from hybrid_jax.runtime import entry
 
 RISE, FALL = 10.0, 0.2  # of the logarithm of how much faster [1/s]
@@ -279,7 +279,10 @@ class OnlineAdaptation(AbstractEstimator):
         told, gains = state.excitation, correction.gains[:, d:]
         if tuning.excitation:
             varies = jnp.asarray(np.where(self._varies(), 1.0, 0.0), ones.dtype)
-            hidden, share = jnp.maximum(walk, BREEZE * varies), 1 + (TAKEN - 1) * varies
+            # Each alarm but the first in 10 s is like a step of a random walk by the prior: a gust that has just begun.
+            begun = jnp.sqrt(jnp.maximum(state.doubt - 1, 0.0) / MEMORY)
+            breeze = jnp.maximum(jnp.minimum(begun, tuning.drift * tuning.gusts), BREEZE)
+            hidden, share = jnp.maximum(walk, breeze * varies), 1 + (TAKEN - 1) * varies
             told = excitation.after_sample(told, slope, correction, sample, hidden, share, periods, tuning)
             belief, gains = excitation.consider(predicted, belief, correction, told, share)
         return kalman.triangular(belief, d), told, correction, gains

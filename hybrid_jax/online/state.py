@@ -35,7 +35,7 @@ class OnlineState(eqx.Module):
         test: the change test of the filter of all parameters.
         mixture: the filters of the hypotheses and their weights; None without hypotheses.
         trusted: the last consistent θ, which the model uses.
-        settled: the last of these before alarms began, restored if they persist.
+        settled: their mean over the last 10 s without alarms, restored if alarms persist.
         doubt: number of recent alarms.
         opened: 1 for each parameter whose variance rises to its prior before the next sample, after an alarm; else 0.
         haste: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.

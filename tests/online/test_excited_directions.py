@@ -30,10 +30,10 @@ def filter_of(noise):
 
 
 @eqx.filter_jit
-def hovering(adaptation, noise, key, steps, change=0.0, sensor=1.0, turned=1.0, swing=0.0, gusts=0.0):
-    """States of the filter while a controller holds a speed, in gusts of an rms [m/s²] that last for a second; and the
-    errors of the acceleration that its model and the first one expect. Halfway the gain changes, the sensor by a
-    factor, or the sign of what the input that the filter is given adds to hover."""
+def hovering(adaptation, noise, key, steps, change=0.0, sensor=1.0, turned=1.0, swing=0.0, gusts=0.0, alarms=0.0):
+    """States of a filter, after some alarms, while a controller holds a speed in gusts of an rms [m/s²] that last for a
+    second; and the errors of the acceleration that its model and the first one expect. Halfway the gain changes, the
+    sensor by a factor, or the sign of what the input that the filter is given adds to hover."""
 
     def step(carry, given):
         v, y, gust, state = carry
@@ -50,8 +50,9 @@ def hovering(adaptation, noise, key, steps, change=0.0, sensor=1.0, turned=1.0, 
         return (v, y, gust, state), (state, errors)
 
     zero = jnp.zeros(())
+    begun = eqx.tree_at(lambda state: state.doubt, adaptation.begin(zero[None]), jnp.asarray(alarms))
     given = jnp.arange(steps), jax.random.normal(key, (steps, 2))
-    return jax.lax.scan(step, (zero, zero, zero, adaptation.begin(zero[None])), given)[1]
+    return jax.lax.scan(step, (zero, zero, zero, begun), given)[1]
 
 
 def gains(adaptation, states):
@@ -82,6 +83,15 @@ def test_gusts_are_followed_and_not_taken_for_another_gain(noise):
     assert np.abs(theta).max() < 0.5
     assert (np.abs(theta) < 2 * deviation).mean() > 0.95
     assert adaptation.flags(states).inconsistent.mean() < 0.1
+
+
+def test_after_repeated_alarms_more_excitation_is_needed():
+    """They are of gusts that the random walk of the disturbance does not follow yet."""
+    adaptation = filter_of(NOISE)
+    given = adaptation, NOISE, jax.random.key(0), 2 * SECOND
+    calm, gusty = (hovering(*given, swing=2.0, alarms=alarms)[0] for alarms in (1.0, 4.0))
+    assert gains(adaptation, calm)[1][-1] < 0.1
+    assert gains(adaptation, gusty)[1][-1] > 0.8
 
 
 @pytest.mark.slow
@@ -119,3 +129,12 @@ def test_a_wrong_sensor_or_input_ends_the_adaptation_at_the_last_model_that_was_
     states, _ = hovering(adaptation, NOISE, jax.random.key(0), 24 * SECOND, **wrong)
     assert adaptation.flags(states).inconsistent[15 * SECOND :].all()
     assert np.abs(states.trusted[15 * SECOND :]).max() < 0.1
+
+
+def test_a_wrong_sensor_in_gusts_leaves_a_model_without_them():
+    def flight(key):
+        return hovering(filter_of(NOISE), NOISE, key, 24 * SECOND, sensor=-1.0, swing=1.0, gusts=1.0)[0]
+
+    states = jax.vmap(flight)(jax.random.split(jax.random.key(5), 8))
+    assert filter_of(NOISE).flags(states).inconsistent[:, 15 * SECOND :].all()
+    assert np.abs(states.trusted[:, 15 * SECOND :]).max() < 0.5

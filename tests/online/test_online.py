@@ -155,7 +155,7 @@ def test_what_the_model_cannot_explain_is_not_believed():
     states = watch(adaptation(), samples, inputs)
     assert adaptation().flags(last(states)).inconsistent
     rejected = np.flatnonzero(np.asarray(states.nis) >= adaptation().tuning.reject)
-    np.testing.assert_array_equal(states.trusted[-1], states.trusted[rejected[0] - 1])
+    np.testing.assert_allclose(states.trusted[-1], states.trusted[rejected[0] - 1], atol=0.05)
 
 
 def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
