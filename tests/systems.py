@@ -143,13 +143,13 @@ def _system(truth, changed, model, start, inputs, dt) -> System:
     return System(truth, changed, model, *made)
 
 
-def _pendulum(wrap=lambda network: network) -> System:
+def _pendulum(wrap=lambda network: network, made=pendulum, most=(2.0, 4.0)) -> System:
     residual = hj.residual_network(2, 1, jax.random.key(1), hidden=16)
     return _system(
-        truth=pendulum(0.5, 0.8),
-        changed=pendulum(0.7, 0.8),
-        model=hj.Hybrid(pendulum(0.6), wrap(residual)),
-        start=lambda rng, n: rng.uniform(-1, 1, (n, 2)) * [2.0, 4.0],
+        truth=made(0.5, 0.8),
+        changed=made(0.7, 0.8),
+        model=hj.Hybrid(made(0.6), wrap(residual)),
+        start=lambda rng, n: rng.uniform(-1, 1, (n, 2)) * most,
         inputs=lambda rng, shape: 3 * rng.normal(size=(*shape, 1)),
         dt=0.05,
     )
@@ -157,14 +157,7 @@ def _pendulum(wrap=lambda network: network) -> System:
 
 def _circle() -> System:
     """A pendulum that whirls, with angles that are given within half a turn."""
-    system = _system(
-        truth=whirling(0.5, 0.8),
-        changed=whirling(0.7, 0.8),
-        model=hj.Hybrid(whirling(0.6), hj.residual_network(2, 1, jax.random.key(1), hidden=16)),
-        start=lambda rng, n: rng.uniform(-1, 1, (n, 2)) * [np.pi, 8.0],
-        inputs=lambda rng, shape: 3 * rng.normal(size=(*shape, 1)),
-        dt=0.05,
-    )
+    system = _pendulum(made=whirling, most=(np.pi, 8.0))
     space, names = system.truth.state_space, ("train", "validation", "target", "test")
     wrapped = {name: wrap(space, getattr(system, name)) for name in names}
     assert all(np.abs(np.diff(one.x[..., 0])).max() > 6 for one in wrapped.values())  # it jumps

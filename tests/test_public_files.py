@@ -9,7 +9,6 @@ import os
 import pickle
 import zipfile
 
-import jax
 import numpy as np
 import pytest
 from surface import outcome
@@ -20,13 +19,6 @@ from hybrid_jax.export.stablehlo import FORMAT as PROGRAM
 from hybrid_jax.io.datasets import FORMAT as DATASET
 from hybrid_jax.io.datasets import load_dataset
 from hybrid_jax.io.models import FORMAT as MODEL
-
-KEY = jax.random.key(0)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("files")
 
 
 def npy(descr="<f8", shape="(2,)", data=bytes(16), version=1):

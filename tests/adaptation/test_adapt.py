@@ -104,9 +104,6 @@ def test_a_fit_of_what_has_no_effect_has_not_converged(method):
     assert "found no step that lowers the error" in result.report()
 
 
-WIDE = replace(swings(40), u=np.zeros((40, 8, 2), np.float32))
-
-
 @pytest.mark.parametrize(("frozen", "moves"), [("residual", "physics"), ("physics", "residual")])
 def test_what_is_frozen_stays(frozen, moves):
     field = hybrid(0.55)
@@ -165,11 +162,7 @@ WIDE = replace(swings(40), u=np.zeros((40, 8, 2), np.float32))
     [
         (pendulum(), {"method": "magic"}, "method must be one of auto, .*source, or a value, got 'magic'"),
         (pendulum(), {"method": 3}, "method must have a method solve, see Method, got 3"),
-        (
-            pendulum(),
-            {"settings": hj.Settings(4, objective=Own())},
-            "^settings.objective must be a .* got Own; .*fine_t",
-        ),
+        (pendulum(), {"settings": hj.Settings(4, objective=Own())}, "^settings.objective must be .* got Own; .*fine_t"),
         (pendulum(), {"method": LeastSquares(indices=(9,))}, "indices must be different .* and at most 1, got"),
         (pendulum(), {"level": 95}, "level must be between 0 and 1, got 95"),
         (pendulum(), {"method": "theta_only"}, "field must be a Hybrid where its residual is frozen, got Pendulum"),

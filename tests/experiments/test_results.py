@@ -53,9 +53,8 @@ def test_rows_that_are_not_finite_count_as_infinitely_bad():
 
 
 def test_pairs_are_of_the_same_seed():
-    rows = Results(
-        [{"model": m, "seed": s, "error": 10 * s + (m == "b")} for m in "ab" for s in (2, 0, 1)], ("model", "seed")
-    )
+    made = [{"model": m, "seed": s, "error": 10 * s + (m == "b")} for m in "ab" for s in (2, 0, 1)]
+    rows = Results(made, ("model", "seed"))
     first, second = rows.where(model="b"), rows.where(model="a").sort(seed=None)
     np.testing.assert_array_equal(np.subtract(*first.paired(second, "error")), 1)
     np.testing.assert_array_equal(first.paired(second.where(seed=0), "error")[1], 0)  # one model for all seeds
@@ -161,10 +160,14 @@ def test_ratio_of_stds_has_the_size_and_the_ends_of_pitmans_test():
     assert math.isnan(ratio_of_stds([1.0, math.inf], [2.0, math.inf]).value)
 
 
-def test_share_of_gap_is_one_at_the_reachable_and_zero_before():
+def test_share_of_gap_is_one_at_the_reachable_and_zero_before_and_leaves_out_failed_seeds():
     before, reachable = np.array([4.0, 5.0, 6.0]), np.ones(3)
     assert share_of_gap(before, reachable, reachable) == pytest.approx((1.0, 1.0, 1.0))
     assert share_of_gap(before, before, reachable) == pytest.approx((0.0, 0.0, 0.0))
+    whole = share_of_gap([4.0, 5.0, 6.0], [1.5, 1.4, 1.6], [1.0] * 3)
+    assert share_of_gap([4.0, 5.0, 6.0, 7.0], [1.5, 1.4, 1.6, math.inf], [1.0] * 4) == pytest.approx(whole)
+    with pytest.raises(ValueError, match="same seeds"):
+        share_of_gap([1.0, 2.0], [1.0], [1.0])
 
 
 def test_share_without_significant_gap_has_no_ends():
@@ -173,13 +176,3 @@ def test_share_without_significant_gap_has_no_ends():
     assert math.isnan(unsure.low)
     assert math.isnan(unsure.high)
     assert math.isnan(share_of_gap([0.9, 0.8], [0.9, 0.8], [1.0, 1.0]).value)
-
-
-def test_failed_seeds_are_left_out():
-    whole = share_of_gap([4.0, 5.0, 6.0], [1.5, 1.4, 1.6], [1.0] * 3)
-    assert share_of_gap([4.0, 5.0, 6.0, 7.0], [1.5, 1.4, 1.6, math.inf], [1.0] * 4) == pytest.approx(whole)
-
-
-def test_samples_of_other_seeds_are_refused():
-    with pytest.raises(ValueError, match="same seeds"):
-        share_of_gap([1.0, 2.0], [1.0], [1.0])

@@ -35,10 +35,6 @@ def total_wrench(vehicle, x, u, t):
     return (sum(part) for part in zip(*wrenches, strict=True))
 
 
-def at_rest(altitude=5.0):
-    return jnp.zeros(13).at[2].set(altitude).at[3].set(1.0)
-
-
 @pytest.mark.parametrize("vehicle", [IRIS, ODD], ids=["iris", "odd"])
 def test_mjx_is_newton_euler_and_c_mujoco(vehicle):
     rng, derivative = np.random.default_rng(7), jax.jit(Quadrotor.derivative)
@@ -78,7 +74,7 @@ def reference_flight(x0, u, t0, duration):
 
 def test_order_of_convergence_is_four():
     step = jax.jit(Quadrotor.step)
-    x0 = at_rest(0.35).at[7:13].set(jnp.array([2.0, -1.0, 0.4, 0.5, -0.8, 1.5]))
+    x0 = hovering(0.35).at[7:13].set(jnp.array([2.0, -1.0, 0.4, 0.5, -0.8, 1.5]))
     u = jnp.array([650.0, 660.0, 655.0, 668.0])
     truth = jax.jit(reference_flight)(x0, u, 0.2, 0.4)
     errors = []
