@@ -33,7 +33,6 @@ class Library:
         shapes = [(self.d,)] + [(self.d, self.d), (self.d, self.m)] * function.endswith("jacobian")
         results = [np.full(shape, np.nan, self.dtype) for shape in shapes]
         arguments = [np.ascontiguousarray(a, self.dtype) for a in given]
-        getattr(self._library, f"{self._name}_{function}")(
-            *(a.ctypes.data_as(ctypes.c_void_p) for a in (*arguments, *results))
-        )
+        places = (a.ctypes.data_as(ctypes.c_void_p) for a in (*arguments, *results))
+        getattr(self._library, f"{self._name}_{function}")(*places)
         return results if len(results) > 1 else results[0]

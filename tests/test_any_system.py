@@ -18,10 +18,8 @@ from hybrid_jax.metrics import rollout_mse
 
 pytestmark = pytest.mark.slow
 # Few epochs: what is checked is that every method goes through, not how well it does.
-METHODS = {
-    name: replace(method, min_epochs=1, max_epochs=5) if isinstance(method, hj.FineTune) else method
-    for name, method in hj.METHODS.items()
-}
+FEW = {"min_epochs": 1, "max_epochs": 5}
+METHODS = {name: replace(one, **FEW) if isinstance(one, hj.FineTune) else one for name, one in hj.METHODS.items()}
 LOADED_ELSEWHERE = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -45,10 +43,8 @@ def adapted(request):
     """A system, its source model and what each method made of it."""
     system = SYSTEMS[request.param]()
     source = hj.fit(system.model, system.train, system.validation, jax.random.key(0), max_epochs=60)
-    results = {
-        name: attempt(hj.adapt, source.best, system.target, method=method, validation=system.validation)
-        for name, method in METHODS.items()
-    }
+    given, validation = (source.best, system.target), system.validation
+    results = {name: attempt(hj.adapt, *given, method=one, validation=validation) for name, one in METHODS.items()}
     return SimpleNamespace(name=request.param, system=system, source=source, results=results)
 
 
@@ -76,10 +72,8 @@ def test_every_method_adapts_or_refuses_in_one_line(adapted):
 
 
 def test_least_squares_improves_windows_that_it_has_not_seen(adapted):
-    before, after = (
-        rollout_mse(field, adapted.system.test)
-        for field in (adapted.source.best, adapted.results["least_squares"].field)
-    )
+    fitted = adapted.results["least_squares"].field
+    before, after = (rollout_mse(field, adapted.system.test) for field in (adapted.source.best, fitted))
     assert after < before
 
 

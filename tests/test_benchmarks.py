@@ -14,14 +14,9 @@ from benchmarks.training_peers import BY_HAND, COMPILED, TORCHDIFFEQ
 
 @pytest.mark.parametrize(
     ("options", "complaint"),
-    [
-        (["--out", "file/report.json"], "--out file: cannot be written"),
-        (["--preset", "huge"], "--preset must be one of full, smoke, got 'huge'"),
-    ],
+    [(["--out", "file/a.json"], "--out file: cannot be written"), (["--preset", "huge"], "--preset must be one of")],
 )
-def test_bad_input_is_refused_in_one_line_before_anything_is_measured(
-    options, complaint, tmp_path, monkeypatch, capsys
-):
+def test_bad_input_is_refused_in_one_line_before_measuring(options, complaint, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("kept")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["benchmark", *options])

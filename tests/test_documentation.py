@@ -9,10 +9,7 @@ from types import ModuleType
 
 from smoke import ROOT
 
-PACKAGES = [
-    "hybrid_jax",
-    *sorted(f"hybrid_jax.{path.parent.name}" for path in (ROOT / "hybrid_jax").glob("*/__init__.py")),
-]
+PACKAGES = ["hybrid_jax", *sorted(f"hybrid_jax.{p.parent.name}" for p in (ROOT / "hybrid_jax").glob("*/__init__.py"))]
 # Of a vector field ẋ = f(x, u) the state and the input, and the random key, are the same everywhere.
 KNOWN = {"self", "cls", "key", "x", "u"}
 

@@ -40,11 +40,9 @@ def reference(double_precision):
     @jax.jit
     def interval(x, held):
         term = diffrax.ODETerm(lambda t, x, held: field(x, held))
-        controller = diffrax.PIDController(rtol=1e-13, atol=1e-13)
+        size = diffrax.PIDController(rtol=1e-13, atol=1e-13)
         span, ends = (0.0, DT, 0.01), diffrax.SaveAt(t1=True)
-        return diffrax.diffeqsolve(
-            term, diffrax.Dopri8(), *span, x, held, stepsize_controller=controller, saveat=ends
-        ).ys[0]
+        return diffrax.diffeqsolve(term, diffrax.Dopri8(), *span, x, held, stepsize_controller=size, saveat=ends).ys[0]
 
     x, path = jnp.asarray(START), []
     for held in jnp.asarray(TORQUES):
@@ -92,10 +90,8 @@ def test_a_solver_for_other_equations_is_refused(name):
 @pytest.mark.parametrize("solver", STEPPERS, ids=lambda value: type(value).__name__)
 def test_a_program_does_not_grow_with_its_substeps(solver):
     def size(substeps):
-        program = jax.make_jaxpr(
-            lambda x0: integrate(pendulum(**FIELD), x0, jnp.asarray(TORQUES), DT, solver, substeps)
-        )
-        return len(str(program(jnp.asarray(START))).splitlines())
+        traced = jax.make_jaxpr(lambda x0: integrate(pendulum(**FIELD), x0, jnp.asarray(TORQUES), DT, solver, substeps))
+        return len(str(traced(jnp.asarray(START))).splitlines())
 
     assert abs(size(100) - size(2)) < 0.1 * size(1)  # lines are broken where names happen to be longer
 

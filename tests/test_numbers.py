@@ -122,12 +122,7 @@ def test_flying():
 
 def test_the_most_informative_flight():
     shown = lines("docs/howto/excitation.md")
-    names = {
-        "hover": "hover",
-        "figure-8": "figure-8 at 3.5 m/s",
-        "random": "random, as in the paper",
-        "designed": "designed",
-    }
+    names = {"figure-8": "figure-8 at 3.5 m/s", "random": "random, as in the paper"}
     for flight, own in committed("excitation").group("flight").items():
         for name, cell in zip(("Ix", "Iy", "k"), shown[names.get(flight, flight)], strict=True):
             width = own.where(parameter=name).spread("half_width").mean
@@ -187,10 +182,8 @@ def said():
         np.divide(*(np.mean(own.where(agent=agent).numbers(error("settled"))) for agent in ("online", "oracle")))
         for own in online.group("change", "reference").values()
     ]
-    inside = [
-        np.mean([np.mean([*row["inside"].values()]) for row in own])
-        for own in online.where(agent="online").group("change").values()
-    ]
+    changes = online.where(agent="online").group("change").values()
+    inside = [np.mean([np.mean([*row["inside"].values()]) for row in own]) for own in changes]
     better = [float(lines("docs/results/control.md")[name][-1]) for name in ("hover", "figure-8, 3.5 m/s", "low pass")]
     fitted = committed("coverage").where(lambda row: row["inside"] is not None)
     wide = {}

@@ -18,7 +18,7 @@ from hybrid_jax import metrics
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.estimation import fit_least_squares, uncertainty
 from hybrid_jax.export import export_program, load_program
-from hybrid_jax.networks.mlp import InputScaling
+from hybrid_jax.networks.mlp import NORMS, InputScaling
 from hybrid_jax.sim import SOURCE, Domain, SplitSpec, random_flights
 from hybrid_jax.status import Status
 from hybrid_jax.training.loss import residual_norm
@@ -140,14 +140,7 @@ def test_what_is_made_of_windows_is_finite_or_refused(found, number, name):
 
 
 @cases(0.05)
-@given(
-    odd(1, 2),
-    odd(1, 2),
-    odd(1, 3),
-    st.sampled_from(["batch", "layer", "none", "group", None, 1, []]),
-    odd(1.0),
-    odd(0.0),
-)
+@given(odd(1, 2), odd(1, 2), odd(1, 3), st.sampled_from([*NORMS, "group", None, 1, []]), odd(1.0), odd(0.0))
 def test_a_network_is_made_or_refused(state_size, input_size, hidden, norm, scale, offset):
     scaling = outcome(InputScaling, offset, scale)
     network = outcome(hj.residual_network, state_size, input_size, KEY, hidden=hidden, norm=norm, scaling=scaling)
@@ -158,9 +151,7 @@ def test_a_network_is_made_or_refused(state_size, input_size, hidden, norm, scal
 
 @cases(0.04)
 @given(odd(1, 2.0), odd(0.4), st.sampled_from([(), None, "drag", (1,)]), odd(1, 5), odd(10), odd(0), odd(1.0))
-def test_the_simulator_refuses_what_makes_no_domain_split_or_flight(
-    vehicle, drag, forces, windows, steps, flights, seconds
-):
+def test_the_simulator_refuses_what_makes_no_domain_or_flight(vehicle, drag, forces, windows, steps, flights, seconds):
     assert outcome(Domain, "mine", vehicle) is None
     domain = outcome(Domain, "mine", drag_coefficient=drag, forces=forces)
     assert domain is None or is_finite(domain.quadrotor().parameters)
@@ -185,8 +176,6 @@ def programs(folder):
 @cases(0.1)
 @given(st.booleans(), st.sampled_from([(), (3,)]), st.data())
 def test_a_program_answers_with_what_is_finite_or_refuses(programs, batched, shape, data):
-    x, u = (
-        data.draw(spoiled(part[..., 0, :] if part.ndim > len(shape) + 1 else part)) for part in states("swing", shape)
-    )
+    x, u = (data.draw(spoiled(a[..., 0, :] if a.ndim > len(shape) + 1 else a)) for a in states("swing", shape))
     found = outcome(programs[batched], x, u)
     assert found is None or is_finite(found) or max(np.abs(x).max(), np.abs(u).max()) > 1e4

@@ -1,5 +1,7 @@
 """Laws of quaternion algebra, in double precision so that a wrong sign cannot hide in round-off."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,11 +83,8 @@ def test_rotation_vector_is_axis_times_angle(angle):
 def test_rotation_vector_has_the_derivative_of_a_small_rotation():
     for angle in (0.0, 1e-5, 1.0):
         here = rotation.from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.array(angle))
-        slope = jax.jacfwd(
-            lambda turn, here=here: rotation.rotation_vector(
-                rotation.multiply(here, jnp.concatenate([jnp.ones(1), turn / 2]))
-            )
-        )(jnp.zeros(3))
+        turned = partial(rotation.multiply, here)
+        slope = jax.jacfwd(lambda v, by=turned: rotation.rotation_vector(by(jnp.append(1.0, v / 2))))(jnp.zeros(3))
         np.testing.assert_allclose(slope[2], [0, 0, 1], rtol=0, atol=1e-5)  # about the axis of the turn
     assert np.isfinite(slope).all()
 
@@ -107,9 +106,6 @@ def test_q_and_minus_q_have_one_canonical_form():
 
 
 def test_heading_is_the_first_of_the_z_y_x_angles():
-    turns = [
-        rotation.from_axis_angle(jnp.array(axis), jnp.array(angle))
-        for axis, angle in zip(np.eye(3)[::-1], (2.5, 0.7, -0.4), strict=True)
-    ]
-    q = rotation.multiply(rotation.multiply(turns[0], turns[1]), turns[2])
+    z, y, x = map(rotation.from_axis_angle, jnp.eye(3)[::-1], jnp.array([2.5, 0.7, -0.4]))
+    q = rotation.multiply(rotation.multiply(z, y), x)
     np.testing.assert_allclose(rotation.heading(jnp.stack([q, -q])), 2.5, rtol=1e-6)

@@ -161,10 +161,7 @@ sys.meta_path.insert(0, Interrupt())
 
 @pytest.mark.parametrize(
     ("module", "program"),
-    [
-        ("hybrid_jax.cli.command", "import hybrid_jax.cli; hybrid_jax.cli.main()"),
-        ("jax", "import experiments, experiments.param_shift"),
-    ],
+    [("hybrid_jax.cli.command", "from hybrid_jax.cli import main; main()"), ("jax", "import experiments.param_shift")],
 )
 def test_an_interrupt_while_modules_load_is_told_in_a_line(module, program):
     code = INTERRUPTED.format(module=module, program=program)
@@ -175,22 +172,14 @@ def test_an_interrupt_while_modules_load_is_told_in_a_line(module, program):
 
 
 # Those of rounding and of the derivative written by hand, which fusing kernels may change.
-SWEEP = (
-    "a_lane_is_the_same_run_alone",
-    "a_lane_is_a_run_by_the_plain_function",
-    "lanes_that_share_a_chunk_are_the_same_runs",
-    "every_lane_comes_to_its_own_end",
-    "a_diverged_lane_changes_no_bit_of_another",
-)
+SWEEP = ["a_lane_is_the_same_run_alone", "a_lane_is_a_run_by_the_plain_function", "every_lane_comes_to_its_own_end"]
+SWEEP += ["lanes_that_share_a_chunk_are_the_same_runs", "a_diverged_lane_changes_no_bit_of_another"]
 NETWORK = (
     "the_derivative_written_by_hand_is_that_of_the_plain_formula",
     "what_few_samples_use_is_the_same_network_with_the_same_slopes_and_so_is_its_file",
 )
-LAWS = [
-    f"tests/{file}.py::test_{law}"
-    for file, laws in {"sweep/test_sweep": SWEEP, "networks/test_residual": NETWORK}.items()
-    for law in laws
-]
+LAWS = [f"tests/sweep/test_sweep.py::test_{law}" for law in SWEEP]
+LAWS += [f"tests/networks/test_residual.py::test_{law}" for law in NETWORK]
 
 
 def test_they_hold():

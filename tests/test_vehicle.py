@@ -9,18 +9,9 @@ from hybrid_jax.dynamics import RigidBody, Terms
 from hybrid_jax.dynamics.vehicle_file import LAG, load_vehicle_model
 from hybrid_jax.vehicle import load_vehicle
 
-GOOD = {
-    "mass": "1.5",
-    "inertia": "[0.029, 0.03, 0.055]",
-    "thrust_coefficient": "8.5e-6",
-    "torque_coefficient": "1e-6",
-    "rotor_positions": "[[0.1, -0.2], [-0.1, 0.2], [0.1, 0.2], [-0.1, -0.2]]",
-    "spin": "[-1, -1, 1, 1]",
-    "max_rotor_speed": "1100.0",
-    "rotor_radius": "0.1",
-    "gravity": "9.8",
-    "name": '"mine"',
-}
+GOOD = {"mass": "1.5", "inertia": "[0.029, 0.03, 0.055]", "thrust_coefficient": "8.5e-6", "torque_coefficient": "1e-6"}
+GOOD |= {"rotor_positions": "[[0.1, -0.2], [-0.1, 0.2], [0.1, 0.2], [-0.1, -0.2]]", "spin": "[-1, -1, 1, 1]"}
+GOOD |= {"max_rotor_speed": "1100.0", "rotor_radius": "0.1", "gravity": "9.8", "name": '"mine"'}
 
 
 @pytest.fixture
@@ -134,9 +125,8 @@ def test_other_files_are_refused(tmp_path):
 
 def test_terms_and_learned_names_are_read(written):
     terms = "[terms]\ndrag = [0.1, 0.2, 0]\nmotor_time_constant = 0.02\n"
-    found = load_vehicle_model(
-        written('learn = ["k_rotors", "drag", "motor_time_constant"]', PAYLOAD + terms), "payload"
-    )
+    learned = 'learn = ["k_rotors", "drag", "motor_time_constant"]'
+    found = load_vehicle_model(written(learned, PAYLOAD + terms), "payload")
     assert found.terms == Terms(drag=(0.1, 0.2, 0.0), motor_time_constant=0.02)
     physics = found.physics()
     assert isinstance(physics, RigidBody)

@@ -95,9 +95,7 @@ def messages(store, flight):
                 "velocity_local": kinds["TwistStamped"](header, twist(v, w).twist),
                 "twist": kinds["TwistWithCovarianceStamped"](header, twist(v, w)),
                 "speed": kinds["Vector3Stamped"](header, vector(*v)),
-                "battery": kinds["BatteryState"](
-                    header, 16.5, *(6 * [0.0]), 0, 0, 0, True, zeros[:0], zeros[:0], "", ""
-                ),
+                "battery": kinds["BatteryState"](header, 16.5, *6 * [0.0], 0, 0, 0, True, zeros[:0], zeros[:0], "", ""),
                 "local": kinds["VehicleLocalPosition"](us, *ned, *vned),
                 "attitude": kinds["VehicleAttitude"](us, turned[i].copy()),
                 "gyro": kinds["VehicleAngularVelocity"](us, (w @ body).astype(np.float32)),

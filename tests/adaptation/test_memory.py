@@ -33,9 +33,7 @@ def adapted(method, sizes):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from Linux's /proc")
-@pytest.mark.parametrize(
-    ("method", "sizes"), [("auto", "[40] * 500"), ("least_squares", "range(40, 90)")], ids=["one size", "fifty sizes"]
-)
+@pytest.mark.parametrize(("method", "sizes"), [("auto", "[40] * 500"), ("least_squares", "range(40, 90)")])
 def test_memory_and_time_stay_where_they_are(method, sizes):
     """Every size of data has programs of its own, which took 46 MiB for ever."""
     code = f"{PATHS}; from test_memory import adapted; adapted({method!r}, {sizes})"

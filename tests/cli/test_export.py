@@ -45,11 +45,9 @@ def test_of_a_model_with_a_past_the_update_is_written_and_said(tmp_path, called)
     _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--to", "c,stablehlo", "--out", tmp_path)
     assert "Behind its state are 12 filtered errors: 0 at first" in said
     assert "adapts Ix, Iy, k, disturbance, of the model without its past, with" in said
-    state = np.concatenate([X, np.zeros(12)])
-    seen = load_program(tmp_path / "observe.npz")(state, U, X)
-    np.testing.assert_allclose(
-        seen, model.after(state, hj.rollout(model.field, X, U[None], 0.02)[0], X, 0.02), atol=1e-3
-    )
+    x0 = np.concatenate([X, np.zeros(12)])
+    seen = load_program(tmp_path / "observe.npz")(x0, U, X)
+    np.testing.assert_allclose(seen, model.after(x0, hj.rollout(model.field, X, U[None], 0.02)[0], X, 0.02), atol=1e-3)
     assert "void model_observe(" in (tmp_path / "model.h").read_text()
 
 

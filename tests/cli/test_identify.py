@@ -44,9 +44,8 @@ def files(tmp_path):
         path = tmp_path / "logs" / f"{name}.csv"
         path.parent.mkdir(exist_ok=True)
         np.savetxt(path, table, "%.9g", ",", header="t,ax,ay,az,c0,c1,c2,c3", comments="")
-    (tmp_path / "vehicle.toml").write_text(
-        f'learn = ["k", "time_constant"]\n{vehicle_toml(IRIS)}{ACTUATOR}time_constants = 0.05\n'
-    )
+    known = f"{vehicle_toml(IRIS)}{ACTUATOR}time_constants = 0.05\n"
+    (tmp_path / "vehicle.toml").write_text('learn = ["k", "time_constant"]\n' + known)
     (tmp_path / "columns.toml").write_text(COLUMNS)
     options = {"vehicle": "vehicle.toml", "columns": "columns.toml", "output": "model.npz", "out": "out"}
     return tmp_path, [str(tmp_path / "logs"), *(f"--{key}={tmp_path / value}" for key, value in options.items())]

@@ -17,8 +17,6 @@ from hybrid_jax.networks.mlp import InputScaling
 CONTROLLER = control.Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)
 WIND = np.array([0.0, -4 / 1.5, 0.0, 0.0, 0.0, 0.0], np.float32)  # m/s²: the mean of experiment 2's
-
-
 DT = 0.01
 TRUE = jnp.array([0.0, -4 / 1.5, 0.5, 0.3, -0.2, 0.1])
 START = jnp.zeros(13).at[2].set(2.0).at[3].set(1.0)
@@ -41,12 +39,8 @@ def simulate(wind, reference, x0, bandwidth, kick):
 
 alone = jax.jit(simulate)  # one program for all flights of 2 s
 NEVER = -1.0
-PATHS = {
-    "hover": control.hover(),
-    "eight": control.figure_eight(3.5),
-    "fast eight": control.figure_eight(6.0),
-    "low pass": control.low_flyby(),
-}
+PATHS = {"hover": control.hover(), "eight": control.figure_eight(3.5), "fast eight": control.figure_eight(6.0)}
+PATHS |= {"low pass": control.low_flyby()}
 
 
 @cache

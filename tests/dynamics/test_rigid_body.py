@@ -19,15 +19,10 @@ pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-o
 
 ALL = tuple(name for name in SHAPES if name not in ("mass", "k"))
 KNOWN = Terms(
-    torque_gain=(0.9, 1.1, 0.8),
-    centre_of_mass=(0.01, -0.02),
-    drag=(0.3, 0.4, 0.1),
-    cable_pull=(4.0, 3.0),
-    aerodynamic_moment=((0.0, -0.02, 0.0), (0.03, 0.0, 0.01), (0.0, 0.005, 0.0)),
-    rate_damping=(0.02, 0.03, 0.01),
-    velocity_gain=(0.95, 0.9, 1.02),
-    velocity_lag=0.2,
-)
+    torque_gain=(0.9, 1.1, 0.8), centre_of_mass=(0.01, -0.02), drag=(0.3, 0.4, 0.1), cable_pull=(4.0, 3.0),
+    aerodynamic_moment=((0.0, -0.02, 0.0), (0.03, 0.0, 0.01), (0.0, 0.005, 0.0)), rate_damping=(0.02, 0.03, 0.01),
+    velocity_gain=(0.95, 0.9, 1.02), velocity_lag=0.2,
+)  # fmt: skip
 
 
 def samples(count=6, seed=1):

@@ -25,10 +25,8 @@ NOISE = np.repeat(np.array([0.001, 0.0, 0.02, 0.02], np.float32), [3, 4, 3, 3]) 
 
 @cache
 def network():
-    made = multirotor_network(
-        hj.IRIS, jax.random.key(0), inputs="no_xy_yaw", outputs="accelerations", hidden=8, norm="none"
-    )
-    return jax.tree.map(lambda leaf: 0.1 * leaf, made)
+    options = {"inputs": "no_xy_yaw", "outputs": "accelerations", "hidden": 8, "norm": "none"}
+    return jax.tree.map(lambda leaf: 0.1 * leaf, multirotor_network(hj.IRIS, jax.random.key(0), **options))
 
 
 def body(**ratios):

@@ -65,14 +65,12 @@ def test_invalid_options_are_refused(options, message):
         replace(CONFIG, **options)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"), [([], "no logs at hand?"), (["--folds-by", "day"], "'day' for argument '--folds-by'")]
-)
-def test_guide_is_printed_without_flights_but_a_wrong_option_is_named_first(arguments, message, capsys):
+@pytest.mark.parametrize(("given", "said"), [([], "no logs at hand?"), (["--folds-by", "day"], "'day' for argument")])
+def test_guide_is_printed_without_flights_but_a_wrong_option_is_named_first(given, said, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(arguments)
+        main(given)
     assert stop.value.code == 2
-    assert message in capsys.readouterr().err.lower()
+    assert said in capsys.readouterr().err.lower()
 
 
 def test_lists_may_be_comma_separated():
@@ -111,11 +109,7 @@ def test_verdicts_are_decided_by_ratios_of_errors_over_flights_and_seeds(noise, 
     rng = np.random.default_rng(0)
 
     def runs(model, value, seeds=(0, 1, 2), n=0):
-        return [
-            row(model, value * np.exp(noise * rng.normal()), seed=seed, flight=flight, n=n)
-            for flight in "abcd"
-            for seed in seeds
-        ]
+        return [row(model, value * np.exp(noise * rng.normal()), seed=s, flight=f, n=n) for f in "abcd" for s in seeds]
 
     rows = runs(ADAPTED, 1.0, n=100) + runs(names.SCRATCH, 2.0, n=100) + runs(LEARNED, 0.5)
     rows += runs(names.HOLD, 4.0, (0,)) + runs(names.PHYSICS_ONLY, 0.9)

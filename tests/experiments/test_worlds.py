@@ -51,10 +51,8 @@ def test_a_log_has_sampled_or_averaged_speeds_and_wild_samples():
     flown = WORLDS["hummingbird"].fly("nothing", "moving", 2, 5.0, jax.random.key(0))
     last, following = flown.sampled[:, :-1], flown.sampled[:, 1:]
     assert np.abs(flown.averaged[:, :-1] - following).mean() < np.abs(flown.averaged[:, :-1] - last).mean()
-    clean, sampled, wild = (
-        logged(flown, jax.random.key(1), 10, **options)
-        for options in ({"noise": 0.0}, {"averaged": False}, {"burst": True})
-    )
+    options = {"noise": 0.0}, {"averaged": False}, {"burst": True}
+    clean, sampled, wild = (logged(flown, jax.random.key(1), 10, **each) for each in options)
     np.testing.assert_array_equal(clean.x0[0], flown.states[0, 0].astype(np.float32))
     np.testing.assert_array_equal(sampled.u[0], flown.sampled[0, :10].astype(np.float32))
     np.testing.assert_array_equal(wild.x0[1], wild.x[0, -1])  # windows share the sample between them

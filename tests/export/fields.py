@@ -38,9 +38,8 @@ def moved(field, size=0.1):
     """The field with every number in it away from what it began as; what is positive stays so."""
     rng = np.random.default_rng(2)
     leaves, structure = jax.tree.flatten(field)
-    return jax.tree.unflatten(
-        structure, [jnp.asarray(leaf + size * rng.uniform(size=leaf.shape), leaf.dtype) for leaf in leaves]
-    )
+    away = [jnp.asarray(leaf + size * rng.uniform(size=leaf.shape), leaf.dtype) for leaf in leaves]
+    return jax.tree.unflatten(structure, away)
 
 
 def network(**options):

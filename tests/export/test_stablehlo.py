@@ -13,13 +13,7 @@ from hybrid_jax.export import export_program, load_program
 from hybrid_jax.export.stablehlo import FORMAT
 from hybrid_jax.io.files import save_archive
 
-KINDS = (
-    "rigid body",
-    "multirotor, per rotor",
-    "hybrid, norm batch",
-    "residual from body_motion to accelerations",
-    "hold",
-)
+KINDS = ("rigid body", "multirotor, per rotor", "hybrid, norm batch", "residual from body to accelerations", "hold")
 
 
 @pytest.fixture

@@ -143,13 +143,9 @@ def hop() -> Recording:
     """Rests, turns its motors too slowly, climbs to 1 m above a table, lands there, and stops."""
     power = np.interp(T, [0, 1, 1.001, CARRIES, STOPS, STOPS + 0.001], [0, 0, 0.3, 0.7, 0.7, 0])
     z = 0.4 + np.interp(T, [CARRIES, CLIMBS, 4, 8, LANDS, 9.2], [0, CLEAR, 1, 1, CLEAR, 0])
-    return Recording(
-        "hop",
-        {
-            "command": Signal(T, np.sqrt(power)[:, None] * np.ones(4), tuple("0123"), "motors"),
-            "position": Signal(T, np.stack([0 * T, 0 * T, z], axis=1), ("x", "y", "z"), "pose"),
-        },
-    )
+    command = Signal(T, np.sqrt(power)[:, None] * np.ones(4), tuple("0123"), "motors")
+    position = Signal(T, np.stack([0 * T, 0 * T, z], axis=1), ("x", "y", "z"), "pose")
+    return Recording("hop", {"command": command, "position": position})
 
 
 def test_a_vehicle_flies_while_it_is_clear_of_where_it_stood(hop):

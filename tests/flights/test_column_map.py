@@ -15,7 +15,7 @@ from hybrid_jax.flights.formats.raw import Samples, own_samples, record
 
 EULER = [('["q1", "q2", "q3", "q4"]', '["roll", "pitch", "yaw"]'), ('"xyzw"', '"deg"')]
 AFFINE = [('"rpm"', '"command", polynomial = [100.0, 1000.0]')]
-QUADRATIC = [('"rpm"', '"command", polynomial = [50, 200.0, 800.0]')]
+CURVE = [('"rpm"', '"command", polynomial = [50, 200.0, 800.0]')]
 
 
 @pytest.fixture
@@ -32,9 +32,7 @@ def mapped(tmp_path):
     return read
 
 
-@pytest.mark.parametrize(
-    ("changes", "motors"), [((), "rpm"), (EULER, "rpm"), (AFFINE, "affine"), (QUADRATIC, "quadratic")]
-)
+@pytest.mark.parametrize(("changes", "motors"), [((), "rpm"), (EULER, "rpm"), (AFFINE, "affine"), (CURVE, "quadratic")])
 def test_mapped_log_is_the_same_flight(flight, mapped, changes, motors):
     log = mapped(foreign(flight), changes, motors)
     np.testing.assert_allclose(log.t - log.t[0], flight.t - flight.t[0], atol=1e-9)

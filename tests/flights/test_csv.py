@@ -164,9 +164,7 @@ def test_semicolons_and_decimal_commas_are_said_and_read(flight, tmp_path):
     (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";"}')
     refusal(lambda: read_recording(path, tmp_path / "map.toml"), "row 2, field t", "decimal comma", 'decimal = ","')
     (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";", decimal = ","}')
-    signals = read_recording(path, tmp_path / "map.toml").signals
-    assert [*signals] == ["velocity", "command"]
-    np.testing.assert_allclose(signals["velocity"].values, flight.x[:, 7:10], atol=1e-8)
-    np.testing.assert_allclose(
-        signals["command"].values, np.where(flight.u < 800, flight.u - 1000, 0) / 1000, atol=1e-8
-    )
+    found = read_recording(path, tmp_path / "map.toml").signals
+    assert [*found] == ["velocity", "command"]
+    np.testing.assert_allclose(found["velocity"].values, flight.x[:, 7:10], atol=1e-8)
+    np.testing.assert_allclose(found["command"].values, np.where(flight.u < 800, flight.u - 1000, 0) / 1000, atol=1e-8)

@@ -25,13 +25,8 @@ from hybrid_jax.io.models import FORMAT as MODEL
 from hybrid_jax.vehicle import IRIS
 
 LOGS = ("flight.csv", "flight.ulg", "flight.bbl", "log00", "log00.gz", "flight.bag", "flight.db3", "flight.mcap")
-LOADERS = {
-    "model.npz": hj.load,
-    "set.npz": load_dataset,
-    "program.npz": load_program,
-    "vehicle.toml": load_vehicle_model,
-    "run.json": record_in,
-}
+LOADERS = {"model.npz": hj.load, "set.npz": load_dataset, "program.npz": load_program}
+LOADERS |= {"vehicle.toml": load_vehicle_model, "run.json": record_in}
 LIBRARY = {"flight.ulg": "pyulog", "flight.bbl": "orangebox", "flight.bag": "rosbags"}
 SECONDS, MEMORY = 10.0, 1 << 20  # of one file, s; kB
 COUNTS = pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])

@@ -15,9 +15,7 @@ from hybrid_jax.vehicle import load_vehicle
 
 FOLDER = Path(os.environ.get("HYBRID_JAX_FLIGHTS", Path(__file__).parents[3] / "shared" / "flights"))
 SETS = {"crazyflie_payload": ("bare", "payload"), "nanodrone": ("train", "valid")}
-FILES = [
-    file for name, parts in SETS.items() for part in parts for file in sorted((FOLDER / name / part).glob("*.csv.gz"))
-]
+FILES = [f for name, parts in SETS.items() for part in parts for f in sorted((FOLDER / name / part).glob("*.csv.gz"))]
 
 needs_flights = pytest.mark.skipif(not FILES, reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder")
 

@@ -64,9 +64,8 @@ def test_old_logs_hold_pwm_and_the_rates_beside_the_attitude(flight, topics, wri
         "actuator_outputs": "uint64_t timestamp;uint32_t noutputs;float[16] output;",
     }
     old = {name: [] for name in formats}
-    for at, q, omega, u in zip(
-        START + np.round(t * 1e6).astype(int), flight.x[:, 3:7], flight.x[:, 10:], flight.u, strict=True
-    ):
+    times = START + np.round(t * 1e6).astype(int)
+    for at, q, omega, u in zip(times, flight.x[:, 3:7], flight.x[:, 10:], flight.u, strict=True):
         old["vehicle_attitude"].append(struct.pack("<Q7f", at, *(omega @ BODIES["FRD"]), *q))
         old["actuator_outputs"].append(struct.pack("<QI16f", at, 6, *(1000 + u), *[900.0] * 2, *[0.0] * 10))
     recording = read_recording(written(ulog(old, formats)))
@@ -75,11 +74,8 @@ def test_old_logs_hold_pwm_and_the_rates_beside_the_attitude(flight, topics, wri
     refusal(lambda: to_flight(recording, polynomial=(0, 1000.0)), "no position and no velocity", "logger_topics.txt")
 
 
-@pytest.mark.parametrize(
-    ("rest", "full"),
-    [(1000.0, 2000.0), (0.0, 1999.0), (0.0, 8191.0), (0.0, 1.0)],
-    ids=["PWM", "DShot", "UAVCAN", "share"],
-)
+# Of PWM, DShot, UAVCAN, and a share.
+@pytest.mark.parametrize(("rest", "full"), [(1000.0, 2000.0), (0.0, 1999.0), (0.0, 8191.0), (0.0, 1.0)])
 @pytest.mark.parametrize("number", [0, 1])
 def test_motors_are_found_in_any_instance_and_unit(flight, topics, written, rest, full, number):
     """PX4 before 1.13 numbers outputs by driver; that of the other driver is constant."""
@@ -92,14 +88,12 @@ def test_motors_are_found_in_any_instance_and_unit(flight, topics, written, rest
     assert any(f"instance {1 - number} is left out" in note for note in recording.notes)
 
 
-@pytest.mark.parametrize(
-    ("hardware", "unit"), [("PX4_SITL", np.pi / 30), ("PX4_SITL", 1.0), ("PX4_FMU_V5", np.pi / 30)]
-)
-def test_rotor_speeds_of_a_simulator_may_be_in_radians(flight, topics, written, hardware, unit):
+@pytest.mark.parametrize(("board", "unit"), [("PX4_SITL", np.pi / 30), ("PX4_SITL", 1.0), ("PX4_FMU_V5", np.pi / 30)])
+def test_rotor_speeds_of_a_simulator_may_be_in_radians(flight, topics, written, board, unit):
     """Gazebo's esc_rpm was in rad/s until PX4-Autopilot #22721; no rotor of a simulated vehicle is that slow."""
     t = flight.t - flight.t[0]
     speeds = escs(t, flight.u * np.pi / 30 / unit)
-    recording = read_recording(written(ulog(topics | {"esc_status": speeds}, hardware=hardware)))
+    recording = read_recording(written(ulog(topics | {"esc_status": speeds}, hardware=board)))
     np.testing.assert_allclose(recording.signals["rotor_speed"].values[:, :4], flight.u, atol=1)
     assert any("rad/s" in note for note in recording.notes) == (unit == 1.0)
 

@@ -25,12 +25,10 @@ from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training.loss import rollout_minibatch
 from hybrid_jax.training.objective import Settings, compiler_options
 
-HEXACOPTER = replace(
-    ODD,
-    rotor_positions=tuple((float(0.2 * np.cos(angle)), float(0.3 * np.sin(angle))) for angle in 0.1 + np.arange(6)),
-    spin=(1.0, -1.0) * 3,
-)
+PLACES = tuple((float(0.2 * np.cos(angle)), float(0.3 * np.sin(angle))) for angle in 0.1 + np.arange(6))
+HEXACOPTER = replace(ODD, rotor_positions=PLACES, spin=(1.0, -1.0) * 3)
 THETA = dict(zip(LEARNED, jnp.array([0.3, -0.4, 0.1]), strict=True))
+BODY = RigidBody(THETA, ODD)
 needs_kernels = pytest.mark.skipif(library.obstacle() is not None, reason=kernels.status())
 
 
@@ -46,7 +44,7 @@ def network(d, r, hidden=32, **options):
 
 FIELDS = {
     "the paper's": untrained("hybrid"),
-    "physics alone": RigidBody(THETA, ODD),
+    "physics alone": BODY,
     "no physics": network(3, 2, hidden=32),
     "no input, a number of units that fills no vector": network(5, 0, hidden=9, activation="tanh"),
     "a force and a torque": Hybrid(RigidBody(THETA, HEXACOPTER, wrench=True), network(13, 6)),
@@ -54,11 +52,9 @@ FIELDS = {
         rigid_body(ODD, ("Ix", "k_rotors", "drag", "centre_of_mass"), Terms(drag=(0.3, 0.2, 0.1))),
         network(13, 4, norm="none", activation="tanh"),
     ),
-    "a skip around a norm": Hybrid(RigidBody(THETA, ODD), LinearSkip(jnp.ones((13, 17)) / 10, network(13, 4))),
+    "a skip around a norm": Hybrid(BODY, LinearSkip(jnp.ones((13, 17)) / 10, network(13, 4))),
     "layer norm": network(4, 1, norm="layer", activation="silu"),
-    "a view of the state": Hybrid(
-        RigidBody(THETA, ODD), multirotor_network(IRIS, jax.random.key(2), inputs="no_xy", hidden=32)
-    ),
+    "a view of the state": Hybrid(BODY, multirotor_network(IRIS, jax.random.key(2), inputs="no_xy", hidden=32)),
 }
 FIELD = FIELDS["the paper's"]
 

@@ -119,12 +119,9 @@ def test_a_change_is_found_within_a_second_as_far_as_samples_tell_it():
     assert gains(filter_of(NOISE), swung)[0][after] == pytest.approx(1.0, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("sensor", "turned", "swing"),
-    [(-1.0, 1.0, 1.0), (57.3, 1.0, 0.3), (1.0, -1.0, 1.0)],
-    ids=["sign", "unit", "exchanged rotors"],
-)
+@pytest.mark.parametrize(("sensor", "turned", "swing"), [(-1.0, 1.0, 1.0), (57.3, 1.0, 0.3), (1.0, -1.0, 1.0)])
 def test_a_wrong_sensor_or_input_ends_the_adaptation_at_the_last_model_that_was_consistent(sensor, turned, swing):
+    """Another sign, another unit, and exchanged rotors."""
     adaptation, wrong = filter_of(NOISE), {"sensor": sensor, "turned": turned, "swing": swing}
     states, _ = hovering(adaptation, NOISE, jax.random.key(0), 24 * SECOND, **wrong)
     assert adaptation.flags(states).inconsistent[15 * SECOND :].all()

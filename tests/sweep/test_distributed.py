@@ -193,10 +193,7 @@ def test_processes_that_do_not_fit_together_are_refused_in_one_line(options, tmp
 
 def test_processes_of_one_run_are_started_alike(tmp_path):
     common = "--distributed", "--coordinator", address(), "--processes", "2", "--process-id"
-    both = [
-        experiment(tmp_path / f"out{i}", tmp_path / "cache", *common, str(i), "--max-epochs", str(4 + i))
-        for i in (0, 1)
-    ]
+    both = [experiment(tmp_path / f"out{i}", tmp_path / "cache", *common, i, "--max-epochs", f"4{i}") for i in "01"]
     texts = [process.communicate(timeout=120)[1] for process in both]
     assert [process.returncode for process in both] == [2, 2]
     assert texts[0].strip().endswith("processes of one run must be started alike, [1] differ from this one")

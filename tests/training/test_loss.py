@@ -118,9 +118,8 @@ def test_residual_norm_is_the_mean_square_of_the_residual(batch):
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 def test_gradients_are_finite_where_the_residual_is_zero(name, precision, batch):
     with jax.enable_x64(precision == np.float64):
-        field, here = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, precision), (Hybrid(pendulum(), zero_output(network())), batch)
-        )
+        given = Hybrid(pendulum(), zero_output(network())), batch
+        field, here = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision), given)
         value, slope = eqx.filter_value_and_grad(lambda field: regulariser(name, field, here))(field)
     assert abs(value) < 1e-10
     assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
@@ -145,10 +144,8 @@ def test_a_field_without_two_parts_has_no_regulariser(batch):
         assert loss(field, batch, cosine, 1e3) == loss(field, batch, None, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "wrong"),
-    [("regulariser", "cosine"), ("solver", "rk4"), ("objective", TrajectoryLoss), ("batch_size", 10.0)],
-)
-def test_settings_that_are_none_are_refused_where_they_are_set(name, wrong):
-    with pytest.raises(ValueError, match=f"^{name} must be"):
-        Settings(**{name: wrong})
+def test_settings_that_are_none_are_refused_where_they_are_set():
+    wrong = {"regulariser": "cosine", "solver": "rk4", "objective": TrajectoryLoss, "batch_size": 10.0}
+    for name, value in wrong.items():
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            Settings(**{name: value})

@@ -43,22 +43,14 @@ REFUSED = {
     "validation": (pendulum(), {"validation": SPOILED}, r"validation: x\[2, 3, 1\] is not finite"),
     "weight": (pendulum(), {"regulariser_weight": 1.0}, "regulariser_weight is 1.0 but settings.regulariser is None;"),
     "optimiser": (pendulum(), {"optimiser": "adam"}, r"optimiser must be an optax\.GradientTransformation"),
-    "line search": (
-        pendulum(),
-        {"optimiser": optax.lbfgs()},
-        "optimiser must need nothing but gradients and parameter",
-    ),
+    "line search": (pendulum(), {"optimiser": optax.lbfgs()}, "optimiser must need nothing but gradients and param"),
     "hidden": (Stopped(jnp.ones(()), NETWORK), {}, "field: Stopped contains a BatchNorm whose minibatch statistics"),
     "float": (Stiff(1.0), {}, f"field: {NOTHING.format('Stiff')}"),
     "integer": (Hybrid(Stiff(jnp.array(1)), NETWORK), {}, "field: physics.length is an integer, which is not learned;"),
     "another dt": (pendulum(), {"validation": replace(VALIDATION, dt=0.1)}, "validation: dt must be 0.05, .* got 0.1$"),
     "settings": (pendulum(), {"settings": "rk4"}, "settings must be a Settings, got 'rk4'"),
     "model": (Model(FIELD), {}, "field: must be a function .* got Model; pass its .field$"),
-    "inputs": (
-        Hybrid(pendulum(), residual_network(2, 3, KEY)),
-        {},
-        "train: field: ResidualNetwork does not take a state",
-    ),
+    "inputs": (Hybrid(pendulum(), residual_network(2, 3, KEY)), {}, "train: field: ResidualNetwork does not take a"),
     "one output": (NARROW, {}, r"train: field: ResidualNetwork must return .* \(2,\) for .* returned float32\[1\]$"),
 }
 STAGES = {

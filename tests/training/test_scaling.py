@@ -92,10 +92,8 @@ def loss(objective, windows, field=FIELD):
 def test_with_a_scale_of_one_it_is_the_plain_loss():
     np.testing.assert_allclose(loss(PLAIN, TRAIN), loss(TrajectoryLoss(), TRAIN), rtol=1e-6)
     many = jax.tree.map(lambda leaf: np.tile(leaf, (26, *(1,) * (leaf.ndim - 1))), VALIDATION)
-    for windows in (VALIDATION, many):  # whole, and in chunks
-        np.testing.assert_allclose(
-            PLAIN.validate(FIELD, windows, Settings()), rollout_mse(FIELD, VALIDATION), rtol=1e-5
-        )
+    for data in (VALIDATION, many):  # whole, and in chunks
+        np.testing.assert_allclose(PLAIN.validate(FIELD, data, Settings()), rollout_mse(FIELD, VALIDATION), rtol=1e-5)
 
 
 def test_the_scales_of_a_field_are_the_changes_over_a_window_and_free_of_units():

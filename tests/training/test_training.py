@@ -131,12 +131,9 @@ def test_it_stops_when_patience_is_spent_and_not_before_the_minimum(damped):
         assert state.status == status
         assert state.epochs == max(minimum, state.best_epoch + patience)
     assert still.best_epoch == 1
-    for rules, ended in (
-        ({"min_epochs": 0, "patience": 7}, (Status.STALLED, 8)),
-        ({"max_epochs": 7}, (Status.CAPPED, 7)),
-    ):
+    for rules, *end in (({"min_epochs": 0, "patience": 7}, Status.STALLED, 8), ({"max_epochs": 7}, Status.CAPPED, 7)):
         state = trained(pendulum(LENGTH, DAMPING), 0.0, **rules)
-        assert (state.status, state.epochs) == ended
+        assert [state.status, state.epochs] == end
 
 
 def test_the_key_decides_the_order_of_minibatches(damped):
@@ -182,9 +179,8 @@ def test_a_huge_rate_ends_the_run_as_diverged_with_a_finite_field(hybrid):
 
 def test_double_precision_trains_alone_and_in_a_sweep():
     with jax.enable_x64(True):
-        field, train, validation = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, float), (pendulum(0.8), TRAIN, VALIDATION)
-        )
+        given = pendulum(0.8), TRAIN, VALIDATION
+        field, train, validation = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), given)
         alone = trained(field, train=train, validation=validation, max_epochs=3)
         plans = stack([make_run_config(rate, jnp.arange(60), 60, 10, 10, 3, 1e-3) for rate in (0.01, 0.03)])
         lanes = sweep(stack([start(field, KEY)] * 2), plans, train, validation, SETTINGS, width=1)
