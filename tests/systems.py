@@ -231,14 +231,9 @@ def _convolution() -> System:
     return _ring(Convolution(eqx.nn.Conv1d(1, 3, **options, key=first), eqx.nn.Conv1d(3, 1, **options, key=second)))
 
 
-SYSTEMS: dict[str, Callable[[], System]] = {
-    "pendulum": cache(_pendulum),
-    "circle": cache(_circle),
-    "car": cache(_car),
-    "multirotor": cache(_multirotor),
-    "ring_convolution": cache(_convolution),
-    "wrapper": cache(lambda: _pendulum(lambda network: Gain(jnp.zeros(()), network))),
-}
+MAKERS = {"pendulum": _pendulum, "circle": _circle, "car": _car, "multirotor": _multirotor}
+MAKERS |= {"wrapper": lambda: _pendulum(lambda network: Gain(jnp.zeros(()), network)), "ring_convolution": _convolution}
+SYSTEMS: dict[str, Callable[[], System]] = {name: cache(make) for name, make in MAKERS.items()}
 
 
 @eqx.filter_jit

@@ -17,12 +17,8 @@ from hybrid_jax.state_space import Angle, Attitude, Quantity, StateSpace
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 CIRCLE = whirling().state_space
-SPACES = {
-    "line": StateSpace((Quantity("place", 2, "m"),)),
-    "circle": CIRCLE,
-    "body": RIGID_BODY_SPACE,
-    "joint": StateSpace((Attitude("attitude"), Angle("angles", 2), Quantity("speed"))),
-}
+SPACES = {"line": StateSpace((Quantity("place", 2, "m"),)), "circle": CIRCLE, "body": RIGID_BODY_SPACE}
+SPACES |= {"joint": StateSpace((Attitude("attitude"), Angle("angles", 2), Quantity("speed")))}
 
 
 @pytest.fixture(params=SPACES)
