@@ -13,11 +13,11 @@ import numpy as np
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.anchored import has_network
-from hybrid_jax.adaptation.auto import Auto, Choice, extended
+from hybrid_jax.adaptation.auto import Auto, Choice
 from hybrid_jax.adaptation.expectation import expected_errors
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.outliers import outliers
-from hybrid_jax.adaptation.plausible import groups_of, values_of
+from hybrid_jax.adaptation.plausible import extended, groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, correlated, longest_chain, overlap

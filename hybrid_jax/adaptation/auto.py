@@ -24,7 +24,7 @@ from hybrid_jax.adaptation.anchored import (
     without_network,
 )
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
-from hybrid_jax.adaptation.plausible import Plausible, groups_of, names_of
+from hybrid_jax.adaptation.plausible import Plausible, extended, groups_of, names_of
 from hybrid_jax.adaptation.results import NETWORK
 from hybrid_jax.adaptation.selection import (
     BLOCKS,
@@ -39,11 +39,10 @@ from hybrid_jax.adaptation.selection import (
     left_out_steps,
     posterior,
     spread,
+    surely_lower,
     unchanged,
 )
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import sized, with_disturbance
-from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import sandwich_of_repeated
@@ -130,7 +129,7 @@ class Auto(Method):
         """
         jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))  # then the outer program has the options
-        fits, anchor, begin, measure, replace, judge, conclude = STEPS if traced else COMPILED
+        fits, anchor, begin, measure, replace, judge, confirm, conclude = STEPS if traced else COMPILED
         # Only these settings matter; as an array, another scale needs no other program.
         scale, solver = scale_of(settings.objective, train.x0.shape[-1]), settings.solver
         larger, physics, sizes = begin(self, field, train)
@@ -144,7 +143,7 @@ class Auto(Method):
             rival = None if physics is None else fits(physics, still, learned_from, both, *options, distinct)[1]
             larger, source = replace(self, larger, own, rival, distinct)
         options = *options, jnp.array(len(train))
-        (found, every, starts), fitted = fits(larger, still, train, both, *options), None
+        (found, every, starts), fitted = first, _ = fits(larger, still, train, both, *options), None
         for _ in range(ROUNDS):
             if network:  # also if physics replaced the source: then it is the difference of two models
                 effect = measure(field, train, solver, scale, starts)
@@ -153,6 +152,7 @@ class Auto(Method):
                 (_, found, starts), fitted = fits(larger, move, train, rows, *options), rows
                 if not traced and found.status == Status.DIVERGED:
                     _, found, starts = fits(larger, still, train, rows, *options)
+        found, starts, chosen = confirm(self, larger, (found, starts), (first[0], first[2]), chosen, sizes)
         if self.networks and network:
             step = anchor(larger, train, starts, found, solver, scale, nothing.error, self.blocks)
         return conclude(self, field, larger, train, (found, chosen, source, nothing, effect, step), options[:2])
@@ -199,6 +199,17 @@ def _judge(
     found = posterior(around, every, start, free, sizes, nothing.apparent)
     rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
     return found, nothing, jnp.where(rows[1], every.theta - start, 0.0).astype(sizes.dtype), rows
+
+
+def _confirm(method: Auto, larger, changed, still, chosen: Posterior, sizes) -> tuple[Fit, Any, Posterior]:
+    """Return the fit and the starts of the chosen change, or those of none if left-out blocks do not confirm it."""
+    free, start = np.stack([*free_parameters(larger).values()]), ravel_parameters(larger)[0]
+    blocks = blocks_of(len(still[0].equations.score), method.blocks)
+    sure = (chosen.taken == 0) | surely_lower(
+        changed[0], still[0], jnp.asarray(free)[chosen.taken], sizes, start, blocks
+    )
+    found, starts = jax.tree.map(partial(jnp.where, sure), changed, still)
+    return found, starts, chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
 
 
 def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale, error, blocks: int) -> Anchored:
@@ -257,7 +268,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
 
 
 LOOPS: tuple[Any, ...] = (_fits, _anchor)
-ONCE: tuple[Any, ...] = (_begin, network_effect, _replace, _judge, _conclude)
+ONCE: tuple[Any, ...] = (_begin, network_effect, _replace, _judge, _confirm, _conclude)
 STEPS = LOOPS + ONCE
 COMPILED = (*map(jit_by_size(FASTEST_COMPILE), LOOPS), *map(jit_by_size(UNOPTIMISED), ONCE))
 
@@ -270,11 +281,6 @@ def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:
     adapted = ravel_parameters(larger)[1](choice.theta[index])
     return adapted if choice.change is None else with_change(adapted, choice.change[index])  # type: ignore
-
-
-def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:
-    """Add all parameters that a candidate may fit, at values that change nothing."""
-    return sized(with_disturbance(corrected(field)), d)
 
 
 def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:

@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import sized, with_disturbance
+from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
@@ -68,6 +70,11 @@ class Plausible:
             rates = jnp.broadcast_to(rates, (max(parts, k),))[np.maximum(np.cumsum(steady) - 1, 0)]
             sizes = jnp.where(steady, self.disturbance * rates, self.relative * jnp.abs(theta))
         return jnp.where(sizes > 0, sizes, jnp.inf)
+
+
+def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:
+    """Add all parameters that a candidate may fit, at values that change nothing."""
+    return sized(with_disturbance(corrected(field)), d)
 
 
 def names_of(field: AbstractVectorField) -> list[str]:

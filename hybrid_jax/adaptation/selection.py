@@ -29,7 +29,8 @@ BLOCKS = 10
 CLUSTERS = 5  # of windows of one flight, for intervals: in gusts, errors a second apart are still correlated
 FEW = 10  # windows, of which no order is seen
 SHIFTS = 20  # other windows that each is compared with
-SURELY = 2.0  # standard errors by which physics must predict the source's motion better to replace it
+SURELY = 2.0  # standard errors by which one model must predict better to replace another
+ENOUGH = 5  # blocks, to know a standard error
 STRONG = 20.0  # odds against no change from which one is believed (Kass and Raftery 1995)
 JOINED = 10  # windows that touch, at most so many, are predicted as one
 TINY = float(np.finfo(np.float32).tiny)
@@ -217,6 +218,21 @@ def left_out_steps(
     gram = jnp.sum(equations.gram[places] * counted[..., None, None], axis=1)
     score = jnp.sum(equations.score[places] * counted[..., None], axis=1)
     return steps_without(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0) + pull, gram, score)
+
+
+def surely_lower(found: Fit, still: Fit, free: Bool[Array, " p"], sizes, start, blocks) -> Bool[Array, ""]:
+    """Whether a change lowers the mean error of blocks that were left out by more than `SURELY` standard errors.
+
+    Evidence within a flight assumes that errors of windows are independent; where physics lacks something they are not.
+    """
+    places, counted = blocks
+    held = jnp.diag(jnp.where(free & found.seen, found.noise / jnp.square(sizes), 0.0))
+    equations = masked(found.equations, free & found.seen)
+    thetas = found.theta + left_out_steps(equations, held, held @ (found.theta - start), blocks)
+    after = jnp.take_along_axis(jax.vmap(lambda theta: found.at(theta).square)(thetas), places, axis=1)
+    gain = jnp.sum((still.equations.square[places] - after) * counted, axis=1)
+    few = len(gain) < ENOUGH
+    return jnp.array(True) if few else jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / jnp.sqrt(len(gain))
 
 
 def errors_at_ends(
