@@ -1,7 +1,4 @@
-"""Systems that the library must serve from fit to file: a truth, a changed truth, a model of it and windows.
-
-`SYSTEMS[name]()` builds one; all are small enough that tens of windows of 10 intervals train in seconds.
-"""
+"""Systems that are served from fit to file: `SYSTEMS[name]()` is a truth, a changed one, a model and windows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,4 @@
-"""Whatever a file contains, it is read completely or refused in one line that names it; its code never runs.
-
-The generated cases are those of test_public_surface.py, for files; test_mutations.py damages sound ones.
-"""
+"""Whatever a file contains, it is read completely or refused in one line that names it; its code never runs."""
 
 import io
 import json

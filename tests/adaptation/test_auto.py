@@ -16,7 +16,7 @@ from hybrid_jax.adaptation import FineTune, adapt
 from hybrid_jax.adaptation.anchored import fit_anchored, taken_by_network, with_change
 from hybrid_jax.adaptation.auto import CANDIDATES, free_parameters
 from hybrid_jax.adaptation.plausible import extended
-from hybrid_jax.adaptation.selection import STRONG, alike, blocks_of, correlated, fit_each, posterior
+from hybrid_jax.adaptation.selection import STRONG, Fit, alike, blocks_of, correlated, fit_each, posterior, surely_lower
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations
@@ -90,6 +90,17 @@ def test_a_change_is_believed_if_the_evidence_is_strong_and_the_source_does_not_
     erring = chosen(truth + jnp.array([0.5, 0.0]), jnp.array(0.25))
     assert erring.taken == 0
     assert erring.naive[1] > STRONG * erring.naive[0]  # it would be believed of an exact source
+
+
+@pytest.mark.parametrize("errors", [np.linspace(0.5, 1.5, 10), np.repeat([3.0, 0.0], [2, 8])])
+def test_left_out_blocks_confirm_a_change_of_all_and_not_of_two(errors):
+    def fit(offset):
+        r = errors - offset
+        equations = NormalEquations(jnp.ones((10, 1, 1)), -r[:, None], r**2)
+        return Fit(jnp.array([offset]), equations, jnp.ones((1, 1, 1)), 0.01, jnp.array([True]), 1, 0)
+
+    found = surely_lower(fit(errors.mean()), fit(0.0), jnp.array([True]), 1.0, 0.0, blocks_of(10, 10))
+    assert found == (errors > 0).all()
 
 
 @pytest.mark.parametrize("chosen", ["source", "theta", "disturbance"])

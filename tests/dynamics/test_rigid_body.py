@@ -196,8 +196,3 @@ def test_a_torque_beside_a_forced_body_turns_it_by_its_own_inertia():
     for field in (Hybrid(body, Push()), Hybrid(Hybrid(body, HoldState()), Push())):
         for evaluate in (one_by_one, train_batch, infer_batch):
             np.testing.assert_allclose(evaluate(field, x, u), expected, rtol=1e-12, atol=1e-11)
-
-
-def test_rotors_that_do_not_exist_are_refused():
-    with pytest.raises(ValueError, match=r"^x and u must have 13 and 4 numbers, got 13 and 6$"):
-        rigid_body(IRIS)(jnp.zeros(13), jnp.ones(6))

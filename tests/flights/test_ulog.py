@@ -1,7 +1,4 @@
-"""A ULog written here, byte by byte, is read as the flight it holds, whatever the clock of each topic.
-
-The format: docs.px4.io, "ULog File Format", version 1.
-"""
+"""A ULog written here, byte by byte, is read as the flight it holds (docs.px4.io, "ULog File Format", version 1)."""
 
 import gzip
 import struct

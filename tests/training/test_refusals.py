@@ -10,6 +10,7 @@ import optax
 import pytest
 from pendulum import pendulum, swings
 
+import hybrid_jax as hj
 from hybrid_jax import AbstractVectorField, Frozen, Hybrid, Model, Settings, Stage, fit, fit_in_stages, residual_network
 from hybrid_jax.sweep import stack, sweep
 from hybrid_jax.training.fitting import make_run_config, start
@@ -51,6 +52,7 @@ REFUSED = {
     "settings": (pendulum(), {"settings": "rk4"}, "settings must be a Settings, got 'rk4'"),
     "model": (Model(FIELD), {}, "field: must be a function .* got Model; pass its .field$"),
     "inputs": (Hybrid(pendulum(), residual_network(2, 3, KEY)), {}, "train: field: ResidualNetwork does not take a"),
+    "rotors": (hj.rigid_body(hj.IRIS), {}, "train: field: RigidBody does not take .* 13 and 4 numbers, got 2 and 1$"),
     "one output": (NARROW, {}, r"train: field: ResidualNetwork must return .* \(2,\) for .* returned float32\[1\]$"),
 }
 STAGES = {
