@@ -101,10 +101,9 @@ class Auto(Method):
     """Choose the most probable of several changes; see `selection`.
 
     The candidates for a rigid body are no change, new θ_p, and new θ_p with constant forces and torques, drag and rotor
-    efficiencies; for other systems no change, new θ_p, and new θ_p with a constant disturbance. Blocks of windows
-    that are left out in turn must confirm a change. A penalised change of the network's weights is then tried on top of
-    the chosen one. If physics without the network predicts the source's
-    own motion better, it replaces the source.
+    efficiencies; for other systems no change, new θ_p, and new θ_p with a constant disturbance. Blocks of windows that
+    are left out in turn must confirm a change. A penalised change of the network's weights is then tried on top of the
+    chosen one. If physics without the network predicts the source's own motion better, it replaces the source.
 
     Attributes:
         networks: whether the network may change.
