@@ -36,7 +36,7 @@ from hybrid_jax.adaptation.selection import (
     blocks_of,
     errors_at_ends,
     fit_each,
-    left_out_steps,
+    left_out_thetas,
     posterior,
     spread,
     surely_lower,
@@ -203,11 +203,10 @@ def _judge(
 
 def _confirm(method: Auto, larger, changed, still, chosen: Posterior, sizes) -> tuple[Fit, Any, Posterior]:
     """Return the fit and the starts of the chosen change, or those of none if left-out blocks do not confirm it."""
-    free, start = np.stack([*free_parameters(larger).values()]), ravel_parameters(larger)[0]
+    free, start = jnp.stack([*free_parameters(larger).values()])[chosen.taken], ravel_parameters(larger)[0]
     blocks = blocks_of(len(still[0].equations.score), method.blocks)
-    sure = (chosen.taken == 0) | surely_lower(
-        changed[0], still[0], jnp.asarray(free)[chosen.taken], sizes, start, blocks
-    )
+    thetas = left_out_thetas(changed[0], free, sizes, start, blocks)
+    sure = (chosen.taken == 0) | surely_lower(changed[0], still[0], thetas, blocks)
     found, starts = jax.tree.map(partial(jnp.where, sure), changed, still)
     return found, starts, chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
 
@@ -233,8 +232,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
         of_source = jnp.where(alone, sandwich_of_repeated(own.equations, len(start), distinct), of_source)
         degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
     inherited = spread(found.equations, free[taken] & found.seen, of_source)
-    held = jnp.diag(jnp.where(free[taken] & found.seen, found.noise / jnp.square(sizes), 0.0))
-    left_out = found.theta + left_out_steps(equations, held, held @ (found.theta - start), blocks)
+    left_out = left_out_thetas(found, free[taken], sizes, start, blocks)
     changes = jnp.zeros((len(left_out), 0))
     if step is not None:
         removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, if physics replaced it

@@ -53,8 +53,7 @@ class Fit(NamedTuple):
 
     def surely_better(self, other: "Fit") -> Bool[Array, ""]:
         """Whether it predicts the same windows significantly better."""
-        gain = other.equations.square - self.equations.square
-        return jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / jnp.sqrt(len(gain))
+        return _surely_positive(other.equations.square - self.equations.square)
 
 
 def fit_each(
@@ -220,19 +219,25 @@ def left_out_steps(
     return steps_without(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0) + pull, gram, score)
 
 
-def surely_lower(found: Fit, still: Fit, free: Bool[Array, " p"], sizes, start, blocks) -> Bool[Array, ""]:
+def left_out_thetas(found: Fit, free: Bool[Array, " p"], sizes, start, blocks) -> Float[Array, "b p"]:
+    """Compute the parameters fitted without each block, with the prior `sizes` around `start`."""
+    free = free & found.seen
+    held = jnp.diag(jnp.where(free, found.noise / jnp.square(sizes), 0.0))
+    return found.theta + left_out_steps(masked(found.equations, free), held, held @ (found.theta - start), blocks)
+
+
+def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) -> Bool[Array, ""]:
     """Whether a change lowers the mean error of blocks that were left out by more than `SURELY` standard errors.
 
-    Evidence within a flight assumes that errors of windows are independent; where physics lacks something they are not.
+    Evidence assumes independent errors; where physics lacks something they are not. See `left_out_thetas`.
     """
-    places, counted = blocks
-    held = jnp.diag(jnp.where(free & found.seen, found.noise / jnp.square(sizes), 0.0))
-    equations = masked(found.equations, free & found.seen)
-    thetas = found.theta + left_out_steps(equations, held, held @ (found.theta - start), blocks)
-    after = jnp.take_along_axis(jax.vmap(lambda theta: found.at(theta).square)(thetas), places, axis=1)
-    gain = jnp.sum((still.equations.square[places] - after) * counted, axis=1)
-    few = len(gain) < ENOUGH
-    return jnp.array(True) if few else jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / jnp.sqrt(len(gain))
+    after = jax.vmap(lambda theta, place: found.at(theta).square[place])(thetas, blocks[0])
+    gain = jnp.sum((still.equations.square[blocks[0]] - after) * blocks[1], axis=1)
+    return jnp.array(True) if len(gain) < ENOUGH else _surely_positive(gain)
+
+
+def _surely_positive(gain: Float[Array, " n"]) -> Bool[Array, ""]:
+    return jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / jnp.sqrt(len(gain))
 
 
 def errors_at_ends(

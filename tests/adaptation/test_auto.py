@@ -12,11 +12,11 @@ import pytest
 from pendulum import LENGTH, Push, flown, hybrid, pendulum, pushes
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation import FineTune, adapt
+from hybrid_jax.adaptation import FineTune, adapt, selection
 from hybrid_jax.adaptation.anchored import fit_anchored, taken_by_network, with_change
 from hybrid_jax.adaptation.auto import CANDIDATES, free_parameters
 from hybrid_jax.adaptation.plausible import extended
-from hybrid_jax.adaptation.selection import STRONG, Fit, alike, blocks_of, correlated, fit_each, posterior, surely_lower
+from hybrid_jax.adaptation.selection import STRONG, Fit, alike, blocks_of, correlated, fit_each, posterior
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations
@@ -99,8 +99,9 @@ def test_left_out_blocks_confirm_a_change_of_all_and_not_of_two(errors):
         equations = NormalEquations(jnp.ones((10, 1, 1)), -r[:, None], r**2)
         return Fit(jnp.array([offset]), equations, jnp.ones((1, 1, 1)), 0.01, jnp.array([True]), 1, 0)
 
-    found = surely_lower(fit(errors.mean()), fit(0.0), jnp.array([True]), 1.0, 0.0, blocks_of(10, 10))
-    assert found == (errors > 0).all()
+    found, blocks = fit(errors.mean()), blocks_of(10, 10)
+    thetas = selection.left_out_thetas(found, jnp.array([True]), 1.0, 0.0, blocks)
+    assert selection.surely_lower(found, fit(0.0), thetas, blocks) == (errors > 0).all()
 
 
 @pytest.mark.parametrize("chosen", ["source", "theta", "disturbance"])
