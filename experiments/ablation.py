@@ -14,7 +14,7 @@ from experiments.paper import figures
 from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, preset_like
 from experiments.paper.lanes import rows_of
 from experiments.paper.study import adapted, assess, flown, pretrained, source_splits, target_splits
-from experiments.paper.tables import ablation_tables
+from experiments.paper.tables import CHOICES, ablation_tables, in_words
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, label
 from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
@@ -43,16 +43,6 @@ NOTES = [
     "Seconds are those that the stages of a value took when they ran; a stage shared by several values counts in each.",
     "Off: mean of the recovered parameter over the true one, less 1.",
 ]
-TITLES = {  # of the figure of each choice
-    "residual": "What the network reads → adds to",
-    "weight": "Weight of the regulariser",
-    "form": "Form of the regulariser",
-    "norm": "Normalisation in the network",
-    "start": "Initial θ_p",
-    "source": "Data before the change",
-    "noise": "Sensor noise",
-    "solver": "Integrator",
-}
 LITTLE = 0.05  # change of an error that counts as none
 Choice = Literal["residual", "weight", "form", "norm", "start", "source", "noise", "solver"]
 
@@ -146,9 +136,9 @@ def report(record: Mapping[str, Any]) -> Report:
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
     drawn = {}
     for choice, group in rows.group("choice").items():
-        title = f"{TITLES[choice]}: error over 1 s after fine-tuning"
+        title = f"{CHOICES[choice].capitalize()}: error over 1 s after fine-tuning"
         figure = figures.ablation(group, title, {EXTERNAL_FORCE.name: FLOOR})
-        drawn[choice] = figure, f"Test errors of all seeds, by {choice}"
+        drawn[choice] = figure, f"Test errors of all seeds, by {CHOICES[choice]}"
     return drawn
 
 
@@ -173,8 +163,8 @@ def effects(rows: Results) -> dict[tuple[str, str], dict[str, Estimate]]:
 def ratio_table(rows: Results) -> list[Table]:
     """Return the effects of the first choice, of which the figure is shown: a line for each value."""
     found = {value: own for (choice, value), own in effects(rows).items() if choice == rows[0]["choice"]}
-    header = (str(rows[0]["choice"]), *map(label, rows.unique("domain")))
-    lines = [(value, *(each.text(".2f") for each in own.values())) for value, own in found.items()]
+    header = (CHOICES[rows[0]["choice"]], *map(label, rows.unique("domain")))
+    lines = [(in_words(value), *(each.text(".2f") for each in own.values())) for value, own in found.items()]
     return [Table("Error after fine-tuning over the default's (95 % interval)", header, lines)] if lines else []
 
 
@@ -185,22 +175,26 @@ def conclusion(rows: Results) -> list[str]:
 
     def times(key: tuple[str, str]) -> str:
         ratios = ", ".join(f"{ratio.value:.2f} times ({label(domain)})" for domain, ratio in found[key].items())
-        return f"{key[0]} = {key[1]}: {ratios}"
+        return f"“{in_words(key[1])}” ({CHOICES[key[0]]}), with {ratios}"
 
     sentences = []
     if better:
         others = len(better) - 1
         more = f"; {others} other value{'s are' if others > 1 else ' is'} better everywhere, too" if others else ""
-        sentences.append(f"Best of all is {times(min(better, key=largest.__getitem__))} the default's error{more}.")
+        sentences.append(
+            f"Best of all is {times(min(better, key=largest.__getitem__))} the error of the default{more}."
+        )
     elif found:
         sentences.append("No value is better than the default in every domain.")
     if found and largest[worst := max(largest, key=largest.__getitem__)] > 1:
-        sentences.append(f"What harms most is {times(worst)}.")
+        sentences.append(f"What harms most is {times(worst)} the error of the default.")
     moved = {
         key[0] for key, ratios in found.items() if any(not abs(ratio.value - 1) <= LITTLE for ratio in ratios.values())
     }
     if idle := [choice for choice in dict.fromkeys(key[0] for key in found) if choice not in moved]:
-        sentences.append(f"Changes nothing by more than {LITTLE:.0%}: {', '.join(idle)}.")
+        sentences.append(
+            f"These choices change no error by more than {LITTLE:.0%}: {'; '.join(CHOICES[choice] for choice in idle)}."
+        )
     return sentences
 
 

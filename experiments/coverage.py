@@ -21,7 +21,7 @@ from experiments.reporting import names
 from experiments.reporting.claims import Claim, Part, all_of, verdict_table
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.names import HYBRID
-from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, note, subplots
+from experiments.reporting.plots import METHODS, STYLE, legend_below, name_lines, note, subplots
 from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import EMPTY, Table, tabulate
@@ -216,7 +216,7 @@ def coverage_figure(rows: Results) -> Figure:
     """Draw the share of pooled and single-source intervals that contain the truth, a panel for each noise."""
     fitted = rows.where(lambda row: row["inside"] is not None)
     noises, changes = fitted.unique("noise"), fitted.unique("domain")
-    figure, (panels,) = subplots((PAGE, 1.5 + 0.42 * len(changes)), 1, len(noises), sharey=True)
+    figure, (panels,) = subplots(1.5 + 0.42 * len(changes), 1, len(noises), sharey=True)
     kinds = {
         "alone": ("one source", METHODS["fine-tuned"], "s"),
         "inside": ("three sources, pooled", METHODS["adapted"], "o"),
@@ -231,7 +231,7 @@ def coverage_figure(rows: Results) -> Figure:
                 axes.plot(shares[column], y, marker, ms=4, color=colour, label=label, clip_on=False)
             note(axes, parameter, (min(shares.values()), y), (-6, 0), va="center", ha="right", color="0.4")
         axes.set(title="without noise" if noise == "none" else "with sensor noise", xlim=(60, 100.5))
-        axes.set_xlabel("intervals that contain the true value [%]")
+        axes.set_xlabel("intervals that contain\nthe true value [%]")
         name_lines(axes, [*map(names.label, changes)])
     return legend_below(figure, "Do 95 % intervals contain the true value?")
 

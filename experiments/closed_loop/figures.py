@@ -3,15 +3,17 @@
 import math
 
 import matplotlib as mpl
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, SOURCES, Agent, by_agent, gaps
+from experiments.closed_loop.results import DOMAINS, ERROR, LEARNED, ORACLE, SOURCES, Agent, by_agent, gaps
 from experiments.flying.scenario import REFERENCES
 from experiments.reporting.names import EXTERNAL_FORCE
-from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, subplots
+from experiments.reporting.plots import METHODS, STYLE, legend_of, name_lines, subplots, tick_errors
 from experiments.reporting.results import Results
 
+SMALLEST = 0.1  # cm, at the left edge
 COLOURS_OF = {"hybrid": METHODS["fine-tuned"], "invariant": "#56B4E9", "least_squares": METHODS["adapted"]}
 
 
@@ -23,32 +25,35 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
 
 @mpl.rc_context(STYLE)
 def shares(rows: Results, domain: str) -> Figure:
-    """Draw the error before and after adaptation to the fewest trajectories [cm], a panel per reference; ×: crash."""
+    """Draw the error before and after adaptation to the fewest trajectories [cm], a line per reference and model."""
     found = gaps(rows, domain)
     few = min((agent.n_train for agent in found if agent.n_train), default=0)
-    agents = [agent for agent in found if agent.n_train == few]
+    models = [name for name in SOURCES if any(agent.model == name for agent in found)]
     names = [name for name in REFERENCES if any(name in line for line in found.values())]
-    columns = min(len(names), 3)
-    lines = -(-len(names) // columns)
-    figure, panels = subplots((PAGE, 0.9 + lines * (0.6 + 0.17 * len(agents))), lines, columns, sharey=True)
-    for axes in panels.flat[len(names) :]:
-        axes.set_visible(False)
-    true = "true vehicle in the mean wind" if domain == EXTERNAL_FORCE else "true vehicle"
+    figure, ((axes,),) = subplots(1.8 + 0.48 * len(names), 1, 1)
     at_home = rows.where(domain=domain, distance=0.0)
-    for axes, name in zip(panels.flat, names, strict=False):
+    for line, name in enumerate(names):
         flown = by_agent(at_home.where(reference=name))
         errors = {agent: 100 * group.spread(ERROR).mean for agent, group in flown.items()}
-        axes.axvline(errors[ORACLE], color="0.4", linestyle=":", label=true)
-        for y, agent in enumerate(agents):
-            before, after = errors[Agent(SOURCES[agent.model])], errors.get(agent, math.inf)
-            axes.plot([before, after], [y, y], color=COLOURS_OF[agent.model], linewidth=1)
-            axes.plot(before, y, "o", color=COLOURS_OF[agent.model], markerfacecolor="white", clip_on=False)
-            axes.plot(after, y, "o", color=COLOURS_OF[agent.model], clip_on=False)
-        axes.set(title=REFERENCES[name], xlim=(0, None))
-        name_lines(axes, [agent.name for agent in agents])
-    for axes in panels[-1]:
-        axes.set_xlabel("position RMSE [cm]")
-    known = {label: Line2D([], [], color="0.3", marker="o", linestyle="") for label in ("not adapted", "adapted")}
-    known["not adapted"].set_markerfacecolor("white")
-    title = f"{DOMAINS[domain].capitalize()}: how closely it flies (lower is better)"
-    return legend_below(figure, title, entries=known)
+        errors = {agent: max(error, SMALLEST) for agent, error in errors.items()}
+        axes.plot([errors[ORACLE]] * 2, [line - 0.4, line + 0.4], color="0.4", linestyle=":")
+        for i, model in enumerate(models):
+            y = line + 0.22 * (i - (len(models) - 1) / 2)
+            agents = {"o": Agent(SOURCES[model]), "s": Agent(model, few), "D": Agent(model, few, observer=True)}
+            marked = {mark: errors.get(agent, math.inf) for mark, agent in agents.items()}
+            drawn = [error for error in marked.values() if math.isfinite(error)]
+            axes.plot(drawn, [y] * len(drawn), color=COLOURS_OF[model], linewidth=1)
+            for mark, error in marked.items():
+                style = {"color": COLOURS_OF[model], "markerfacecolor": "white" if mark == "o" else None}
+                axes.plot(error, y, mark, **style)
+    axes.set(xscale="log", xlabel=f"position RMSE [cm]\n(log scale from {SMALLEST}; lower is better)")
+    tick_errors(axes.xaxis, *axes.get_xlim(), room=3.0)
+    name_lines(axes, [REFERENCES[name] for name in names])
+    known: dict[str, Artist] = {LEARNED[name]: Line2D([], [], color=COLOURS_OF[name], lw=3) for name in models}
+    for label, mark in {"not adapted": "o", "adapted": "s", "adapted, with an observer": "D"}.items():
+        known[label] = Line2D([], [], color="0.3", marker=mark, linestyle="")
+    known["not adapted"].set(markerfacecolor="white")
+    true = "true vehicle in the mean wind" if domain == EXTERNAL_FORCE else "true vehicle"
+    known[true] = Line2D([], [], color="0.4", linestyle=":")
+    title = f"{DOMAINS[domain].capitalize()}: how closely a model flies, adapted to {few} trajectories"
+    return legend_of(known, figure, title, "", 2)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.claims import Claim, Part, all_of
 from experiments.reporting.names import HYBRID
-from experiments.reporting.plots import COLOURS, PAGE, STYLE, Line, dots, subplots
+from experiments.reporting.plots import COLOURS, STYLE, Line, dots, subplots, titled
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval
 from experiments.reporting.tables import Table, cross_table, over_seeds, tabulate
@@ -148,13 +148,11 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
 def interval_figure(rows: Results) -> Figure:
     """Draw a panel per parameter, a line per flight; intervals wider than `WIDEST` are triangles."""
     names = rows.unique("parameter")
-    figure, panels = subplots((PAGE, 2.4), 1, len(names), sharex=True, sharey=True)
+    figure, panels = subplots(2.3, 1, len(names), sharex=True, sharey=True)
     for axes, name in zip(panels[0], names, strict=True):
         found = {flight: rows.where(parameter=name, flight=flight).numbers("half_width") for flight in FLIGHTS}
         tints = {flight: COLOURS[HYBRID] if flight == DESIGNED else "0.35" for flight in FLIGHTS}
         dots(axes, [Line(flight, own, tints[flight]) for flight, own in found.items()], WIDEST)
-        axes.set(title=name, xlabel="half-width [% of the value; log scale]")
-    figure.suptitle(
-        f"How wide is the 95 % interval? (dot: a seed, bar: median, ▷: above {WIDEST:g} %; lower is better)"
-    )
-    return figure
+        axes.set(title=name)
+    figure.supxlabel("half-width [% of the value] (log scale; lower is better)", fontsize="medium")
+    return titled(figure, f"How wide is the 95 % interval? (dot: a seed, bar: median, ▷: above {WIDEST:g} %)")

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from experiments.flying.scenario import REFERENCES
 from experiments.online.agents import AGENTS, CHANGE_NAMES
 from experiments.online.results import SETTLED, error
-from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, subplots, tick_errors
+from experiments.reporting.plots import METHODS, STYLE, legend_below, name_lines, subplots, tick_errors, wrapped
 from experiments.reporting.results import Results
 
 MARKS = {  # colour and marker of each agent
@@ -34,9 +34,9 @@ def errors(rows: Results, reference: str) -> Figure:
     """Draw the mean over seeds of each agent on one reference, a line for each change, without flights that crash."""
     own = rows.where(reference=reference)
     changes, agents = own.unique("change"), [name for name in MARKS if name in own.unique("agent")]
-    figure, (panels,) = subplots((PAGE, 1.3 + 0.42 * len(changes)), 1, len(TIMES), sharey=True)
+    figure, (panels,) = subplots(1.5 + 0.46 * len(changes), 1, len(TIMES), sharey=True)
     for axes, (column, when) in zip(panels, TIMES.items(), strict=True):
-        axes.set(xscale="log", title=when, xlabel="RMS distance [cm] (log scale)")
+        axes.set(xscale="log", title=wrapped(when, 24), xlabel="RMS distance [cm]\n(log scale)")
         for y, change in enumerate(changes):
             for i, agent in enumerate(agents):
                 found = own.where(change=change, agent=agent).numbers(error(column))

@@ -17,7 +17,7 @@ from experiments.paper.lanes import MODELS, Cell, adapted_sizes, by_domain, cell
 from experiments.paper.tables import value_label
 from experiments.reporting import plots
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
-from experiments.reporting.plots import DRAWABLE, PAGE, STYLE, Line, colour, note, subplots
+from experiments.reporting.plots import DRAWABLE, STYLE, Line, colour, note, subplots
 from experiments.reporting.results import Column, Results
 
 DASHES = {FINE_TUNED: "-", TARGET_ONLY: "--", SOURCE_ONLY: ":"}
@@ -45,7 +45,7 @@ _Curves = dict[tuple[str, str], _Curve]  # by model and mode
 @mpl.rc_context(STYLE)
 def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     """Figs. 3 and 5: test error, above the attainable floor, and ρ against N; mean ± std over seeds."""
-    figure, ((left, right),) = subplots((PAGE, 3.9), 1, 2)
+    figure, ((left, right),) = subplots(3.8, 1, 2)
     errors, gains = _curves(rows, "test_mse"), _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain)
     _draw_errors(left, errors, floor)
     home = rows.where(lambda row: "source_mse" in row)
@@ -56,26 +56,21 @@ def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
             left.set_ylim(bottom=min(left.get_ylim()[0], error / 2))
     lows = [low for curve in gains.values() for low in curve.mean - curve.std if np.isfinite(low)]
     right.axhline(0.0, color="0.4", linestyle=":")
-    right.set(ylabel="gain ρ (1 is perfect, ▽: off the scale)")
+    right.set(ylabel="gain ρ (1 is perfect; ▽: off the scale)")
     _draw(right, gains, max(LOWEST_RHO, min([*lows, 0.0])) - 0.1, 1.08, lost_at_top=False)
     sizes = adapted_sizes(rows)
     for axes in (left, right):
-        axes.set_xlabel("N, target trajectories trained on")
+        axes.set_xlabel("N, target trajectories")
         axes.set_xticks(sizes, [str(n) for n in sizes])
     # Colours of the models, then lines of the ways to train them.
     models, modes = (dict.fromkeys(key[i] for key in errors) for i in (0, 1))
-    entries: dict[str, Artist] = {
-        plots.typeset(label(model)): Line2D([], [], color=colour(model), linewidth=4) for model in models
-    }
+    entries: dict[str, Artist] = {label(model): Line2D([], [], color=colour(model), linewidth=4) for model in models}
     style = {"color": "0.2", "markersize": 4}
     entries |= {label(mode): Line2D([], [], ls=DASHES[mode], marker=MARKERS[mode], **style) for mode in modes}
     # Lines of no model: words beside them would lie on other lines.
     others = {str(line.get_label()): line for line in left.get_lines()}
     entries |= {name: others[name] for name in (HOME, plots.FLOOR) if name in others}
-    figure.suptitle(title)
-    about = {"loc": "outside lower center", "ncols": 4, "title": "line: mean over seeds; band: standard deviation"}
-    figure.legend(entries.values(), entries.keys(), **about)
-    return figure
+    return plots.legend_of(entries, figure, title, "line: mean over seeds; band: standard deviation")
 
 
 def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProxyType({})) -> Figure:
@@ -110,8 +105,8 @@ def ablation(rows: Results, title: str, floors: Mapping[str, float]) -> Figure:
 @mpl.rc_context(STYLE)
 def _error_panels(panels: Mapping[str, Sequence[Line]], title: str, floors: Mapping[str, float]) -> Figure:
     counts = [len(lines) for lines in panels.values()]
-    height = 0.8 + sum(0.9 + 0.3 * count for count in counts)
-    figure, column = subplots((PAGE, height), len(panels), 1, height_ratios=counts)
+    height = 0.8 + sum(0.9 + 0.34 * count for count in counts)
+    figure, column = subplots(height, len(panels), 1, height_ratios=counts)
     for axes, (domain, lines) in zip(column.flat, panels.items(), strict=True):
         plots.error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
     failed = any(np.isinf(line.errors).any() for lines in panels.values() for line in lines)

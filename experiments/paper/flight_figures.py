@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.reporting.names import label
-from experiments.reporting.plots import DRAWABLE, PAGE, STYLE, colour, legend_below
+from experiments.reporting.plots import DRAWABLE, STYLE, WIDTH, colour, legend_below
 from hybrid_jax.vehicle import POSITION
 
 MIN_HALF_WIDTH = 0.2  # m, of a view: a hovering vehicle is not magnified beyond it
@@ -43,7 +43,7 @@ def _above(states: Float[np.ndarray, "t 13"]) -> np.ndarray:
 @mpl.rc_context(STYLE)
 def predictions(paths: Mapping[str, Any], title: str) -> Figure:
     """Figs. 2 and 4: a flight from above, and how the position error of all flights grows, by N and model."""
-    figure = Figure(figsize=(PAGE, 5.0), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 4.0), layout="constrained")
     grid = figure.add_gridspec(2, len(paths["sizes"]), height_ratios=(1.3, 1))
     first = None
     for column, (n, models) in enumerate(paths["sizes"].items()):

@@ -137,7 +137,7 @@ def error_table(rows: Results) -> Table:
 def error_figure(rows: Results) -> Figure:
     """Draw each change's error as a percentage of the unadapted one; lines reach from the least to the most."""
     groups = rows.group("domain")
-    figure, ((axes,),) = subplots((6.4, 1.4 + 0.36 * len(groups)), 1, 1)
+    figure, ((axes,),) = subplots(1.4 + 0.36 * len(groups), 1, 1)
     axes.axvline(100, color=METHODS["not adapted"], label="not adapted")
     for y, own in enumerate(groups.values()):
         before = of_each_case(own, "source")
@@ -148,9 +148,8 @@ def error_figure(rows: Results) -> Figure:
                 axes.plot([each.min(), each.max()], [y, y], color=colour, lw=4, alpha=0.25, solid_capstyle="round")
                 axes.plot(mean, y, marker, ms=6, color=colour, ls="", label="" if y else label)
                 note(axes, f"{mean:.0f} %", (mean, y), (0, 6), ha="center", color=colour)
-    axes.set(
-        xscale="log", xlabel="RMS prediction error over 1 s, % of that without adaptation (log scale; lower is better)"
-    )
+    about = "RMS error of predictions over 1 s [% of the error\nwithout adaptation] (log scale; lower is better)"
+    axes.set(xscale="log", xlabel=about)
     tick_errors(axes.xaxis, *axes.get_xlim(), room=3.0)
     name_lines(axes, [*map(names.label, groups)])
     return legend_below(figure, "After a change: ten seconds of one noisy flight (band: all cases)")

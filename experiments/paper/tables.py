@@ -30,6 +30,36 @@ PAPER: Mapping[str, Mapping[tuple[str, str, int], tuple[float, float | None]]] =
     names.EXTERNAL_FORCE: {TUNED: (2.64e-3, 1.56e-4), EXPERT: (4.02e-3, None), PHYSICS: (4.53e-3, None)},
 }
 
+# Words for the choices of an ablation, and for parts of their values.
+CHOICES = {
+    "residual": "what the network reads → adds to",
+    "weight": "weight of the regulariser",
+    "form": "form of the regulariser",
+    "norm": "normalisation in the network",
+    "start": "initial θ_p",
+    "source": "flights before the change",
+    "noise": "sensor noise",
+    "solver": "integrator",
+}
+VALUES = {
+    "all of x": "whole state",
+    "no p_x, p_y": "no horizontal position",
+    "seen from the body": "state seen from the body",
+    "all 13": "all derivatives",
+    "v̇, ω̇": "accelerations",
+    "trajectory correlation": "correlation of trajectories",
+    "inner product": "inner product f_p · f_d",
+    "cosine": "cosine of f_p and f_d",
+    "pearson": "Pearson correlation of f_p and f_d",
+    "residual norm": "size of f_d",
+    "batch": "over the minibatch",
+    "layer": "over the layer",
+    "× typical": "times the usual",
+    "rk4": "Runge–Kutta of order 4",
+    "heun": "Heun",
+    "tsit5": "Tsitouras of order 5",
+}
+
 
 def error_text(rows: Results) -> str:
     """0.0123 ± 0.0004, or ∞ with the count of infinite seeds and the median of all; a star marks capped runs."""
@@ -200,13 +230,20 @@ def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> 
             for n in adapted_sizes(rows_of_choice)
             for group in rows_of_choice.group("value").values()
         }
-        title = f"{choice.capitalize()} (L_MSE, {over_seeds(rows_of_choice)}; less is better{capped(rows_of_choice)})"
-        tables.append(tabulate(title, groups, columns, ("target, N", choice)))
+        words = CHOICES[choice].capitalize()
+        title = f"{words} (L_MSE, {over_seeds(rows_of_choice)}; less is better{capped(rows_of_choice)})"
+        tables.append(tabulate(title, groups, columns, ("target, N", CHOICES[choice])))
     return tables
 
 
 def value_label(row: Row) -> str:
-    return f"{row['value']} (default)" if row["default"] else row["value"]
+    return in_words(row["value"]) + " (default)" * row["default"]
+
+
+def in_words(value: str) -> str:
+    for key, words in VALUES.items():
+        value = value.replace(key, words)
+    return value
 
 
 def run_notes(rows: Results) -> list[str]:

@@ -16,7 +16,7 @@ from experiments.reporting.names import (
     SOURCE_ONLY,
     TARGET_ONLY,
 )
-from experiments.reporting.plots import METHODS, PAGE, STYLE, Line, colour, dots, legend_below, subplots, tick_errors
+from experiments.reporting.plots import METHODS, STYLE, Line, colour, dots, legend_below, subplots, tick_errors
 from experiments.reporting.results import Results
 
 STYLES = {FINE_TUNED: "-o", TARGET_ONLY: "--s", SOURCE_ONLY: ":", LEAST_SQUARES: "-.^", AUTO: "-D"}
@@ -39,7 +39,7 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
 def forecasts(rows: Results) -> Figure:
     """Draw the error of each model, the best on top, and what APHYNITY published."""
     groups = sorted(rows.group("case").items(), key=lambda group: group[1].spread("mse").median)
-    figure, ((axes,),) = subplots((PAGE, 0.9 + 0.24 * len(groups)), 1, 1)
+    figure, ((axes,),) = subplots(1.2 + 0.28 * len(groups), 1, 1)
     lines = [Line(str(name), own.numbers("mse"), colour(_model(str(name)))) for name, own in groups]
     axes.axvline(APHYNITY, color="0.4", linestyle=":", label="published: APHYNITY, 1600 trajectories")
     dots(axes, lines)
@@ -55,7 +55,7 @@ def _model(case: str) -> str:
 def scores(rows: Results) -> Figure:
     """Draw the median error of each method, a panel for each change; a dot is a seed."""
     groups = rows.group("shift")
-    figure, axes = subplots((PAGE, 3.2), 1, len(groups), sharey=True)
+    figure, axes = subplots(3.6, 1, len(groups), sharey=True)
     for panel, (shift, own) in zip(axes[0], groups.items(), strict=True):
         sizes = sorted(set(own["n"]) - {0})
         for model, mode in WAYS:
@@ -76,4 +76,4 @@ def scores(rows: Results) -> Figure:
         panel.minorticks_off()
     axes[0, 0].set_ylabel("mean squared error\n(log scale; lower is better)")
     tick_errors(axes[0, 0].yaxis, *axes[0, 0].get_ylim())
-    return legend_below(figure, meaning="line: median over seeds; dot: a seed", columns=3)
+    return legend_below(figure, "Forecasts after a change", "line: median over seeds; dot: a seed")

@@ -14,7 +14,7 @@ from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.study import ADAPTED, BASELINES, LEARNED, MODELS, Fold
 from experiments.reporting import names, plots
 from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evaluate, every, verdict_table
-from experiments.reporting.plots import METHODS, PAGE, STYLE, Line, dots, subplots
+from experiments.reporting.plots import METHODS, STYLE, Line, dots, subplots
 from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval, spread
@@ -85,16 +85,15 @@ def error_figure(rows: Results, dt: float) -> Figure:
     horizon, most = max(int(name) for name in rows[0]["scores"] if name.isdigit()), max(rows["n_train"])
     groups = rows.where(n_train=(0, most)).group("model")
     named = {LABELS[model]: own for model, own in groups.items()}
-    figure, (panels,) = subplots((PAGE, 0.9 + 0.24 * len(named)), 1, len(UNITS), sharey=True)
-    for axes, (quantity, unit) in zip(panels, UNITS.items(), strict=True):
+    figure, panels = subplots(1.3 + 0.62 * len(named), 2, 2, sharey=True)
+    for axes, (quantity, unit) in zip(panels.flat, UNITS.items(), strict=True):
         tints = [TINTS.get(model, plots.colour(model)) for model in groups]
         scores = [own.numbers(f"scores.{horizon}.{quantity}") for own in named.values()]
         dots(axes, [Line(*line) for line in zip(named, scores, tints, strict=True)])
         axes.set(title=quantity.replace("_", " "), xlabel=f"RMSE [{unit}]")
     more = f", adapted to {most} windows" * bool(most)
     about = "dot: a flight; bar: median; log scales; lower is better"
-    figure.suptitle(f"Held-out flights after {horizon * dt:g} s{more} ({about})")
-    return figure
+    return plots.titled(figure, f"Held-out flights after {horizon * dt:g} s{more} ({about})")
 
 
 def cells(rows: Results) -> dict[Cell, Results]:

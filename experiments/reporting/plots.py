@@ -3,6 +3,7 @@
 import io
 import math
 import re
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,8 +22,9 @@ from experiments.reporting import names
 from hybrid_jax.io.files import write_atomic
 
 STYLE: dict[Any, Any] = dict(mpl.rc_params_from_file(Path(__file__).with_name("style.mplstyle"), False, False))
-COLUMN, PAGE = 3.5, 7.2  # inches: the width of a column, and of a page of text
+WIDTH = 4.2  # inches, of every figure: its letters are of 9 pixels on a phone of 400
 DPI = 200
+NAME, TITLE, LEGEND = 24, 56, 78  # letters: of a line of a name, of a title, and of a legend, with its handles
 SHADES = 160  # colours of a picture, with their shades at edges
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 COLOURS = {
@@ -59,8 +61,8 @@ def colour(model: str) -> str:
     return COLOURS.get(model, OTHERS)
 
 
-def subplots(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, np.ndarray]:
-    figure = Figure(figsize=size, layout="constrained")
+def subplots(height: float, rows: int, columns: int, **options: Any) -> tuple[Figure, np.ndarray]:
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
@@ -83,9 +85,22 @@ def legend_below(
     shown = dict(entries or {})
     for axes in figure.axes:
         shown |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    return legend_of(shown, figure, title, meaning, columns)
+
+
+def legend_of(entries: Mapping[str, Artist], figure: Figure, title: str, meaning: str, columns: int = 3) -> Figure:
+    """Draw a title, and a legend of these entries alone, in fewer columns if their words need the room."""
+    words = [_even(label, LEGEND // min(len(entries), columns, 2) - 8) for label in entries]
+    longest = max((len(line) for lines in words for line in lines), default=1)
+    columns = max(1, min(columns, LEGEND // (longest + 8)))
+    about = {"loc": "outside lower center", "ncols": columns, "title": wrapped(meaning, TITLE) or None}
+    figure.legend(entries.values(), [typeset("\n".join(lines)) for lines in words], **about)
+    return titled(figure, title)
+
+
+def titled(figure: Figure, title: str) -> Figure:
     if title:
-        figure.suptitle(typeset(title))
-    figure.legend(shown.values(), map(typeset, shown), loc="outside lower center", ncols=columns, title=meaning or None)
+        figure.suptitle(wrapped(title, TITLE))
     return figure
 
 
@@ -93,7 +108,7 @@ def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.
     """Draw the lines, the first on top, and the attainable error (`floor`), if it is not 0."""
     limits = _limits([line.errors for line in lines], floor)
     axes.set(xscale="log", xlim=limits, title=title)
-    axes.set_xlabel("mean squared error, state in SI units (log scale; lower is better)")
+    axes.set_xlabel("mean squared error, state in SI units\n(log scale; lower is better)")
     name_lines(axes, [line.name for line in lines])
     tick_errors(axes.xaxis, *limits, room=2.2)
     for y, line in enumerate(lines):
@@ -131,7 +146,7 @@ def dots(axes: Axes, lines: Sequence[Line], largest: float = math.inf) -> None:
 def name_lines(axes: Axes, names: Sequence[str]) -> None:
     """Label a line for each name, the first on top, at y = 0, 1, …"""
     axes.set(ylim=(len(names) - 0.4, -0.6))
-    axes.set_yticks(range(len(names)), [*map(typeset, names)])
+    axes.set_yticks(range(len(names)), [wrapped(name, NAME) for name in names])
 
 
 def typeset(text: str) -> str:
@@ -139,9 +154,21 @@ def typeset(text: str) -> str:
     return re.sub(r"[θfp]_[pdxy]", lambda found: f"${found[0].replace('θ', chr(92) + 'theta')}$", text)
 
 
+def wrapped(text: str, letters: int) -> str:
+    """Break a label into even lines of at most so many letters, and write its symbols as mathematics."""
+    return typeset("\n".join(_even(text, letters)))
+
+
+def _even(text: str, letters: int) -> list[str]:
+    def wrap(width: int) -> list[str]:
+        return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
+
+    return next(lines for width in range(1, letters + 1) if len(lines := wrap(width)) <= len(wrap(letters)))
+
+
 def note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[float, float], **style: Any) -> None:
     """Draw small words beside a point, also outside the axes, on white; the offset is in points."""
-    style = {"fontsize": 6, "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.4}} | style
+    style = {"fontsize": 7, "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.4}} | style
     axes.annotate(words, at, offset, textcoords="offset points", annotation_clip=False, **style)
 
 
@@ -150,7 +177,7 @@ def tick_errors(axis: Axis, low: float, high: float, room: float = 0.0) -> None:
     decades = math.log10(high / low)
     room = room or (2.2 if low > LONG_NUMBER else 1.5)
     subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if decades < 0.8 else (1.0, 2.0, 5.0) if decades < room else (1.0,)
-    axis.set_major_locator(MaxNLocator(5) if decades < 0.5 else LogLocator(subs=subs))
+    axis.set_major_locator(MaxNLocator(3) if decades < 0.5 else LogLocator(subs=subs))
     powers = decades > 2 and low < SMALL
     axis.set_major_formatter(LogFormatterMathtext() if powers else FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.claims import Claim, Part, Undecided, all_of, every
 from experiments.reporting.names import label
-from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, subplots, tick_errors
+from experiments.reporting.plots import METHODS, STYLE, legend_below, name_lines, subplots, tick_errors
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval, share_interval
 from experiments.reporting.tables import EMPTY, Table, tabulate
@@ -103,14 +103,14 @@ def method_table(rows: Results) -> Table:
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
     """Draw the error over the source's in each case, for each world and draw."""
     worlds, names = rows.unique("world"), [*dict.fromkeys(case[1:] for case in _cases(rows))]
-    figure, (panels,) = subplots((PAGE, 1.2 + 0.2 * len(names)), 1, len(worlds), sharey=True, sharex=True)
+    figure, (panels,) = subplots(1.3 + 0.3 * len(names), 1, len(worlds), sharey=True, sharex=True)
     for axes, world in zip(panels, worlds, strict=True):
         axes.axvline(1.0, color="0.4", linestyle=":", label="not adapted")
         for (_, *case), own in _cases(rows.where(world=world)).items():
             ratio = own.numbers("ratio")
             y = np.full(len(ratio), names.index(tuple(case)))
             axes.plot(ratio, y, "o", ms=4, alpha=0.7, color=METHODS["adapted"], label="adapted, each flight")
-        axes.set(xscale="log", title=label(str(world)), xlabel="error over the source's (log scale)")
+        axes.set(xscale="log", title=label(str(world)), xlabel="error over the source's\n(log scale)")
         tick_errors(axes.xaxis, *axes.get_xlim(), room=2.2)
     name_lines(panels[0], [label(*case) for case in names])
     caption = "Error of the adapted model over the source's, by the change and the flight that it adapted to"
