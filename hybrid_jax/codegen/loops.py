@@ -32,65 +32,58 @@ class Tables:
         return name
 
 
-def is_contiguous(entries: np.ndarray) -> bool:
-    """Whether all entries are numbers or contiguous in one array."""
-    if all(isinstance(one, float) for one in entries):
-        return True
-    places = _places(entries)
-    return places is not None and bool((np.diff(places) == 1).all())
+def address(tables: Tables, array: np.ndarray) -> Address | None:
+    """Return where entries begin if they are contiguous in an array, or numbers, which become a table."""
+    if _are_numbers(array):
+        return Address(tables.table(array.ravel()))
+    places = _places(array)
+    contiguous = places is not None and (np.diff(places.ravel()) == 1).all()
+    return Address(array.flat[0].name, array.flat[0].index) if contiguous else None
 
 
-def address(tables: Tables, entries: np.ndarray) -> Address:
-    """Return the start of contiguous entries."""
-    first = entries[0]
-    return (
-        Address(first.name, first.index or 0, first.logical)
-        if isinstance(first, Entry)
-        else Address(tables.table(entries))
-    )
-
-
-def indexed(tables: Tables, entries: np.ndarray, shape: tuple[int, ...]) -> Expression | None:
-    """Return the entry at indices i0, i1, … of an array of this shape, or None if its place is not linear in them."""
-    first = entries[0]
-    if all(one == first for one in entries):
+def indexed(tables: Tables, array: np.ndarray) -> Expression | None:
+    """Return the entry at indices i0, i1, …, or None if its place is not linear in them."""
+    first = array.flat[0]
+    if all(one == first for one in array.flat):
         return first
-    if all(isinstance(one, float) for one in entries):  # a table, with one entry along axes that do not matter
-        grid = entries.astype(float).reshape(shape)
-        kept = [bool((grid != grid.take([0], axis)).any()) for axis in range(grid.ndim)]
-        core = grid[tuple(slice(None) if keep else slice(0, 1) for keep in kept)]
+    if _are_numbers(array):  # a table, with one entry along axes that do not matter
+        kept = [bool((array != array.take([0], axis)).any()) for axis in range(array.ndim)]
+        core = array[tuple(slice(None) if keep else slice(0, 1) for keep in kept)]
         strides = np.array(_strides(core.shape)) * kept
-        return Entry(tables.table(core.ravel()), 0, steps=tuple(strides.tolist()))
-    if (places := _places(entries)) is None:
+        return Entry(tables.table(core.ravel()), 0, tuple(strides.tolist()))
+    if (places := _places(array)) is None:
         return None
-    grid = places.reshape(shape)
-    corner = int(grid.flat[0])
-    steps = [int(grid.take(1, axis).flat[0]) - corner if size > 1 else 0 for axis, size in enumerate(shape)]
-    linear = (grid == corner + np.tensordot(steps, np.indices(shape), 1)).all()
-    return Entry(first.name, corner, steps=tuple(steps)) if linear else None
+    corner = int(places.flat[0])
+    steps = [int(places.take(1, axis).flat[0]) - corner if size > 1 else 0 for axis, size in enumerate(array.shape)]
+    linear = (places == corner + np.tensordot(steps, np.indices(array.shape), 1)).all()
+    return Entry(first.name, corner, tuple(steps)) if linear else None
 
 
 def _strides(shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(int(np.prod(shape[axis + 1 :])) for axis in range(len(shape)))
 
 
-def _places(entries: np.ndarray) -> np.ndarray | None:
+def _are_numbers(array: np.ndarray) -> bool:
+    return all(isinstance(one, float | bool) for one in array.flat)
+
+
+def _places(array: np.ndarray) -> np.ndarray | None:
     """Return the indices of entries of one array."""
-    name = entries[0].name if isinstance(entries[0], Entry) else None
-    if any(not isinstance(one, Entry) or one.name != name or one.index is None for one in entries):
+    first = array.flat[0]
+    if any(not isinstance(one, Entry) or one.name != first.name or one.index is None for one in array.flat):
         return None
-    return np.array([one.index for one in entries])
+    return np.array([one.index for one in array.flat]).reshape(array.shape)
 
 
 def mapping(out: str, value: Expression, shape: tuple[int, ...]) -> Statement:
     """Set each entry of an array of this shape to a value that depends on its indices."""
-    return nested(shape, Assign(Entry(out, 0, steps=_strides(shape)), value))
+    return nested(shape, Assign(Entry(out, 0, _strides(shape)), value))
 
 
 def folding(out: str, name: str, operand: Expression, shape: tuple[int, int]) -> Statement:
     """Reduce the entries of each row by a binary operation."""
     first = replace(operand, steps=operand.steps[:1]) if isinstance(operand, Entry) else operand
-    total = Entry(out, 0, steps=(1,))
+    total = Entry(out, 0, (1,))
     more = Loop("i1", shape[1], (Assign(total, Operation(name, (total, operand))),), start=1)
     return nested(shape[:1], Assign(total, first), more)
 
@@ -101,8 +94,8 @@ def stores(out: str, entries: np.ndarray, begin: int = 0) -> tuple[Statement, ..
     while i < len(entries):
         first, (run, step) = entries[i], _run(entries[i:])
         if run >= LOOPED:
-            source = Entry(first.name, first.index, steps=(step,)) if step else first
-            statements.append(nested((run,), Assign(Entry(out, begin + i, steps=(1,)), source)))
+            source = Entry(first.name, first.index, (step,)) if step else first
+            statements.append(nested((run,), Assign(Entry(out, begin + i, (1,)), source)))
         else:
             run = 1
             statements.append(Assign(Entry(out, begin + i), first))

@@ -12,14 +12,10 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Entry:
-    """A variable, or the entry of an array at index + Σ steps[k] ik, in loops with counters ik.
-
-    A logical one is an int (0 or 1) instead of a real.
-    """
+    """A variable, or the entry of an array at index + Σ steps[k] ik, in loops with counters ik; 0 or 1 if logical."""
 
     name: str
     index: int | None = None
-    logical: bool = False
     steps: tuple[int, ...] = ()
 
 
@@ -44,7 +40,6 @@ class Variable:
 
     name: str
     value: Expression
-    logical: bool = False
 
 
 @dataclass(frozen=True)
@@ -53,7 +48,6 @@ class Array:
 
     name: str
     size: int
-    logical: bool = False
 
 
 @dataclass(frozen=True)
@@ -148,7 +142,7 @@ def arranged(steps: Sequence[Step], results: frozenset[str], end: Sequence[State
     spare, body = list[Array](), list[Statement]()
     for i, step in reversed(kept):
         if (array := step.array) is not None:
-            fitting = [one for one in spare if one.logical == array.logical and one.size >= array.size]
+            fitting = [one for one in spare if one.size >= array.size]
             place = places[step.makes] = min(fitting, key=lambda one: one.size, default=array)
             if fitting:
                 spare.remove(place)

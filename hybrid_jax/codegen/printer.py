@@ -10,10 +10,8 @@ from hybrid_jax.codegen import nodes
 from hybrid_jax.codegen.loops import Tables
 from hybrid_jax.codegen.nodes import Address, Entry, Operation
 
-_INFIX = {
-    **{"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&&", "or": "||"},
-    **{"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="},
-}
+LOGIC = {"and": "&&", "or": "||", "lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="}
+_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", **LOGIC}
 _MATH = (
     *("floor", "ceil", "sqrt", "exp", "expm1", "log", "log1p", "erf", "erfc", "exp2", "cbrt"),
     *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
@@ -93,9 +91,9 @@ class CPrinter:
                 return str(int(node))
             case float():
                 return self.number(node)
-            case Address(name, index, _, steps):
+            case Address(name, index, steps):
                 return f"{name} + {_place(index or 0, steps)}" if index or any(steps) else name
-            case Entry(name, index, _, steps):
+            case Entry(name, index, steps):
                 return name if index is None else f"{name}[{_place(index, steps)}]"
             case Operation(name, operands):
                 return self.operations[name].format(*map(self._operand, operands), f="" if self.double else "f")
@@ -107,10 +105,11 @@ class CPrinter:
 
     def statement(self, node: nodes.Statement) -> str:
         match node:
-            case nodes.Variable(name, value, logical):
-                return f"const {_kind(logical)} {name} = {self.expression(value)};"
-            case nodes.Array(name, size, logical):
-                return f"{_kind(logical)} {name}[{size}];"
+            case nodes.Variable(name, value):
+                kind = "int" if isinstance(value, Operation) and value.name in (*LOGIC, "not") else "real"
+                return f"const {kind} {name} = {self.expression(value)};"
+            case nodes.Array(name, size):
+                return f"real {name}[{size}];"
             case nodes.Assign(target, value):
                 return f"{self.expression(target)} = {self.expression(value)};"
             case nodes.Call(function, arguments):
@@ -133,11 +132,12 @@ class CPrinter:
         return [self.table(name, numbers) for name, numbers in tables.numbers.items() if name in read]
 
     def function(self, one: nodes.Function) -> str:
-        given = [f"const {_kind(array.logical)} *{array.name}" for array in one.inputs]
-        given += [f"{_kind(array.logical)} *{array.name}" for array in one.outputs]
-        unused = "".join(
-            f"    (void){array.name};\n" for array in one.inputs if array.name not in nodes.names(one.body)
-        )
+        given = [
+            *(f"const real *{array.name}" for array in one.inputs),
+            *(f"real *{array.name}" for array in one.outputs),
+        ]
+        read = nodes.names(one.body)
+        unused = "".join(f"    (void){array.name};\n" for array in one.inputs if array.name not in read)
         return f"static void {one.name}({', '.join(given)}) {{\n{unused}{self.body(one.body)}\n}}\n"
 
     def file(self, tables: Tables, names: Iterable[str]) -> str:
@@ -152,10 +152,6 @@ class CPrinter:
         helpers = [text for name, text in HELPERS.items() if name in used]
         numbers = self.tables(tables, tuple(one.body for one in printed))
         return "\n".join([*numbers, "", *helpers, *map(self.function, printed)])
-
-
-def _kind(logical: bool) -> str:
-    return "int" if logical else "real"
 
 
 def _place(corner: int, steps: Sequence[int]) -> str:

@@ -1,75 +1,55 @@
 """Walk a JAX program operation by operation to translate it into another language.
 
-A value that does not depend on the arguments is a NumPy array. Any other value is a shape and a column of its entries
-in row-major order; each language defines its columns (`Translation`).
+Every value is a NumPy array of its shape: of numbers, or, if it depends on the arguments, of objects, which are numbers
+and what stands for a number in the language.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Sequence
-from functools import reduce
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from functools import partial, reduce
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-Column = TypeVar("Column")
 
-
-class Entries(NamedTuple):
-    """A value that depends on the arguments."""
-
-    column: Any
-    shape: tuple[int, ...]
-
-
-Value = np.ndarray | Entries
-
-
-class Translation(ABC, Generic[Column]):
-    """Operations of a program on the columns of a language."""
+class Translation(ABC):
+    """Operations of a program in a language."""
 
     language: ClassVar[str]
-    operations: ClassVar[Container[str]]  # that are applied entry by entry
+    operations: ClassVar[Container[str]]  # on numbers, by the names in JAX
 
     @abstractmethod
-    def known(self, array: np.ndarray) -> Column:
-        """Make a column of numbers."""
+    def scalar(self, name: str, *operands: Any) -> Any:
+        """Apply one of the operations to numbers."""
+
+    def entrywise(self, name: str, *arrays: np.ndarray) -> np.ndarray:
+        """Apply one of the operations to the entries of arrays that broadcast as in NumPy."""
+        return applied(partial(self.scalar, name), *arrays)
+
+    def fold(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """Reduce along the first axis by sum, product, maximum or minimum."""
+        return reduce(partial(self.entrywise, name), rows)
 
     @abstractmethod
-    def join(self, columns: Sequence[Column]) -> Column:
-        """Concatenate columns."""
+    def matrix_product(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Multiply A (m × k) by B (k × n)."""
 
-    @abstractmethod
-    def take(self, column: Column, places: Sequence[int]) -> Column:
-        """Select entries by index."""
-
-    @abstractmethod
-    def entrywise(self, name: str, columns: Sequence[Column], shape: tuple[int, ...], exponent: int = 0) -> Column:
-        """Apply an operation, of which integer_pow has an exponent, to columns of this shape, or of one entry."""
-
-    @abstractmethod
-    def fold(self, name: str, rows: Sequence[Column]) -> Column:
-        """Reduce the rows entrywise by sum, product, maximum or minimum."""
-
-    @abstractmethod
-    def matrix_product(self, left: Column, right: Column, sizes: tuple[int, int, int]) -> Column:
-        """Multiply A (m × k) by B (k × n), sizes (m, k, n)."""
-
-    def scan(self, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    def scan(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Apply one program to each of several arrays; unsupported by most languages here."""
         raise self._refusal(equation)
 
-    def run(self, program: ClosedJaxpr, arguments: Sequence["Value"]) -> list[Column]:
-        """Translate a program and return its results as columns; raise ValueError for an unknown operation."""
-        return [self._column(value) for value in self._run(program.jaxpr, program.consts, arguments)]
+    def run(self, program: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Translate a program and return its results; raise ValueError for an unknown operation."""
+        return list(map(objects, self._run(program.jaxpr, program.consts, arguments)))
 
-    def _run(self, program: Jaxpr, constants: Sequence[Any], arguments: Sequence[Value]) -> list[Value]:
-        values: dict[Any, Value] = dict(zip(program.constvars, map(np.asarray, constants), strict=True))
+    def _run(self, program: Jaxpr, constants: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+        values: dict[Any, np.ndarray] = dict(zip(program.constvars, map(np.asarray, constants), strict=True))
         values.update(zip(program.invars, arguments, strict=True))
 
-        def read(atom) -> Value:
+        def read(atom) -> np.ndarray:
             return np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
 
         for equation in filter(lambda one: one.outvars, program.eqns):  # a derivative may leave calls of nothing
@@ -77,113 +57,116 @@ class Translation(ABC, Generic[Column]):
             values.update(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in program.outvars]
 
-    def _results(self, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        name, shape = equation.primitive.name, tuple(equation.outvars[0].aval.shape)  # type: ignore
+    def _results(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        name = equation.primitive.name
         if name in CALLS:
             inner = equation.params["jaxpr" if "jaxpr" in equation.params else "call_jaxpr"]
             closed = isinstance(inner, ClosedJaxpr)
             return self._run(inner.jaxpr if closed else inner, inner.consts if closed else (), inputs)
-        if not any(isinstance(value, Entries) for value in inputs):
+        if not any(map(depends, inputs)):
             return _evaluated(equation, inputs)
         if name in MOVES:
             return self._moved(equation, inputs)
         if name == "scan":
             return self.scan(equation, inputs)
+        if name in COMPOSED:
+            return [COMPOSED[name](self.entrywise, equation.params, *map(objects, inputs))]
         if name in self.operations:
-            made = self._entrywise(equation, inputs, shape)
-        elif name in LINEAR:
-            made = self._linear(equation, inputs)
-        elif name in FOLDS:
-            made = self._folded(inputs[0], equation.params["axes"], FOLDS[name])
-        elif name == "dot_general":
-            made = self._product(inputs[0], inputs[1], equation.params["dimension_numbers"])
-        else:
-            raise self._refusal(equation)
-        return [Entries(made, shape)]
+            return [self._entrywise(equation, inputs)]
+        if name in LINEAR:
+            return [self._linear(equation, inputs)]
+        if name in FOLDS:
+            rows = np.moveaxis(objects(inputs[0]), axes := equation.params["axes"], range(len(axes)))
+            shape = rows.shape[len(axes) :]
+            return [self.fold(FOLDS[name], rows.reshape(-1, int(np.prod(shape)))).reshape(shape)]
+        if name == "dot_general":
+            return [self._product(equation.params["dimension_numbers"], *map(objects, inputs))]
+        raise self._refusal(equation)
 
     def _refusal(self, equation: JaxprEqn, why: str = "") -> ValueError:
         name = equation.primitive.name
         return ValueError(f"field: its operation {name!r}{why} has no counterpart in {self.language}")
 
-    def _column(self, value: Value) -> Column:
-        return value.column if isinstance(value, Entries) else self.known(np.asarray(value).ravel())
-
-    def _entrywise(self, equation: JaxprEqn, inputs: list[Value], shape: tuple[int, ...]) -> Column:
-        name, (first, *_) = equation.primitive.name, equation.invars
-        if name in ("and", "or", "not") and first.aval.dtype != bool:  # type: ignore
+    def _entrywise(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> np.ndarray:
+        name, first = equation.primitive.name, equation.invars[0].aval.dtype  # type: ignore
+        if name in ("and", "or", "not") and first.kind != "b":
             raise self._refusal(equation, " of integers")
         if name == "select_n" and len(inputs) != 3:
             raise self._refusal(equation, f" of {len(inputs) - 1} cases")
-        if name == "convert_element_type" and not jnp.issubdtype(equation.params["new_dtype"], jnp.floating):
-            raise self._refusal(equation, f" to {equation.params['new_dtype']}")
-        return self.entrywise(
-            name, [self._spread(value, shape) for value in inputs], shape, equation.params.get("y", 0)
-        )
+        if name == "convert_element_type":
+            if not jnp.issubdtype(equation.params["new_dtype"], jnp.floating):
+                raise self._refusal(equation, f" to {equation.params['new_dtype']}")
+            if first.kind != "b":
+                return inputs[0]
+        return self.entrywise(name, *map(objects, inputs))
 
-    def _spread(self, value: Value, shape: tuple[int, ...]) -> Column:
-        """Broadcast a value to a shape as in NumPy; single entries stay single."""
-        column = self._column(value)
-        if value.shape == shape or np.prod(value.shape) == 1:
-            return column
-        return self.take(column, np.broadcast_to(_places(value), shape).ravel().tolist())
-
-    def _moved(self, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    def _moved(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Translate operations that only move entries, by applying them to indices in JAX."""
-        columns, sent, count = [], list(inputs), 0
+        entries, sent = list[Any](), list(inputs)
         for i in range(len(inputs))[MOVES[equation.primitive.name]]:
-            places = _places(inputs[i])
-            columns.append(self._column(inputs[i]))
-            sent[i] = (count + places).astype(float)  # of the type of the entries, which JAX checks
-            count += places.size
-        if any(isinstance(value, Entries) for value in sent):
+            places = len(entries) + np.arange(inputs[i].size, dtype=float)  # of the entries' type, which JAX checks
+            sent[i] = places.reshape(inputs[i].shape)
+            entries += objects(inputs[i]).ravel().tolist()
+        if any(map(depends, sent)):
             raise self._refusal(equation, " at a place that depends on x or u")
-        column = self.join(columns)
+        moved, all_of_them = _evaluated(equation, sent), array_of(entries)
+        if not all(np.isfinite(places).all() for places in moved):
+            raise self._refusal(equation, " beyond the end of an array")
+        return [all_of_them[places.astype(int).ravel()].reshape(places.shape) for places in moved]
 
-        def entries(places: np.ndarray) -> Value:
-            if not np.isfinite(places).all():
-                raise self._refusal(equation, " beyond the end of an array")
-            return Entries(self.take(column, places.astype(int).ravel().tolist()), places.shape)
-
-        return [entries(places) for places in _evaluated(equation, sent)]
-
-    def _linear(self, equation: JaxprEqn, inputs: list[Value]) -> Column:
-        """Translate operations that are linear in their data, as a matrix times each column."""
+    def _linear(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> np.ndarray:
+        """Translate operations that are linear in their data, as a matrix times each."""
         data = LINEAR[equation.primitive.name]
-        if any(isinstance(value, Entries) for i, value in enumerate(inputs) if i not in data):
+        if any(depends(value) for i, value in enumerate(inputs) if i not in data):
             raise self._refusal(equation, " at a place that depends on x or u")
         zeros = [jnp.zeros(value.shape) if i in data else jnp.asarray(value) for i, value in enumerate(inputs)]
 
-        def part(i: int) -> Column:
+        def part(i: int) -> np.ndarray:
             def of_one(entries):
                 return equation.primitive.bind(*zeros[:i], entries, *zeros[i + 1 :], **equation.params).ravel()
 
             matrix = np.asarray(jax.jacfwd(of_one)(zeros[i])).reshape(-1, zeros[i].size)
-            return self.matrix_product(self.known(matrix.ravel()), self._column(inputs[i]), (*matrix.shape, 1))
+            return self.matrix_product(objects(matrix), objects(inputs[i]).reshape(-1, 1))
 
-        shape = tuple(equation.outvars[0].aval.shape)  # type: ignore
-        return reduce(lambda a, b: self.entrywise("add", (a, b), shape), map(part, data))
+        return reduce(partial(self.entrywise, "add"), map(part, data)).reshape(equation.outvars[0].aval.shape)  # type: ignore
 
-    def _folded(self, value: Value, axes: Sequence[int], name: str) -> Column:
-        places = np.moveaxis(_places(value), axes, range(len(axes)))
-        rows = places.reshape(int(np.prod(places.shape[: len(axes)])), -1)
-        column = self._column(value)
-        return self.fold(name, [self.take(column, row.tolist()) for row in rows])
-
-    def _product(self, left: Value, right: Value, dimension_numbers) -> Column:
+    def _product(self, dimension_numbers, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """dot_general: the result's axes are the batch axes, then the left's, then the right's."""
         (of_left, of_right), (common_left, common_right) = dimension_numbers
-        rows, m, k = self._matrices(left, of_left, common_left, last=True)
-        columns, n, _ = self._matrices(right, of_right, common_right, last=False)
-        return self.join([self.matrix_product(a, b, (m, k, n)) for a, b in zip(rows, columns, strict=True)])
+        rows, free = _matrices(left, of_left, common_left)
+        columns, others = _matrices(right, of_right, common_right)
+        products = [self.matrix_product(a, b.T) for a, b in zip(rows, columns, strict=True)]
+        return np.reshape(products, (*(left.shape[axis] for axis in common_left), *free, *others))
 
-    def _matrices(self, value: Value, contracted, common, last: bool) -> tuple[list[Column], int, int]:
-        """Return a matrix per batch index, contracted axes last or first, and the sizes of its axes."""
-        free = [axis for axis in range(len(value.shape)) if axis not in (*contracted, *common)]
-        inner = (*free, *contracted) if last else (*contracted, *free)
-        batches, m, k = (int(np.prod([value.shape[axis] for axis in axes])) for axes in (common, free, contracted))
-        places = np.transpose(_places(value), (*common, *inner)).reshape(batches, m * k)
-        column = self._column(value)
-        return [self.take(column, one.tolist()) for one in places], m, k
+
+def _matrices(value: np.ndarray, contracted: Sequence[int], common: Sequence[int]) -> tuple[np.ndarray, list[int]]:
+    """Return a matrix per batch index, with contracted axes last, and the sizes of the other axes."""
+    free = [axis for axis in range(value.ndim) if axis not in (*contracted, *common)]
+    batches, m, k = (int(np.prod([value.shape[axis] for axis in axes])) for axes in (common, free, contracted))
+    matrices = value.transpose((*common, *free, *contracted)).reshape(batches, m, k)
+    return matrices, [value.shape[axis] for axis in free]
+
+
+def depends(value: np.ndarray) -> bool:
+    """Whether a value depends on the arguments."""
+    return value.dtype == object
+
+
+def objects(value: np.ndarray) -> np.ndarray:
+    """Return a value as objects: floats, and bools."""
+    return value if depends(value) else (value if value.dtype == bool else value.astype(float)).astype(object)
+
+
+def array_of(entries: Sequence[Any]) -> np.ndarray:
+    made = np.empty(len(entries), object)
+    made[:] = entries
+    return made
+
+
+def applied(function: Callable, *arrays: np.ndarray) -> np.ndarray:
+    """Apply a function of objects entry by entry to arrays that broadcast."""
+    shape = np.broadcast_shapes(*(one.shape for one in arrays))
+    return np.frompyfunc(function, len(arrays), 1)(*map(np.atleast_1d, arrays)).reshape(shape)
 
 
 def _evaluated(equation: JaxprEqn, inputs: Sequence[Any]) -> list[Any]:
@@ -218,12 +201,6 @@ _BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
     "concatenate": lambda params, *parts: np.concatenate(parts, params["dimension"]),
 }
 
-
-def _places(value: Value) -> np.ndarray:
-    """Return the index in its column of each entry, in the value's shape."""
-    return np.arange(int(np.prod(value.shape))).reshape(value.shape)
-
-
 # Operations that call another program. Custom derivatives are replaced by those of the language.
 CALLS = ("jit", "closed_call", "remat2", "custom_jvp_call", "custom_vjp_call")
 _OF_ONE = (
@@ -239,3 +216,22 @@ MOVES = {
 }
 LINEAR = {"scatter-add": (0, 2), "cumsum": (0,)}
 FOLDS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
+
+
+def _power(of: Callable, params: dict, base: np.ndarray) -> np.ndarray:
+    exponent = abs(params["y"])
+    power = (
+        reduce(partial(of, "mul"), [base] * exponent)
+        if 0 < exponent < 5
+        else of("pow", base, objects(np.array(exponent)))
+    )
+    return of("div", objects(np.array(1)), power) if params["y"] < 0 else power
+
+
+# Name → what it is made of, by a function that applies operations of the language.
+COMPOSED: dict[str, Callable[..., np.ndarray]] = {
+    **dict.fromkeys(("copy", "copy_p", "stop_gradient"), lambda of, params, a: a),
+    "add_any": lambda of, params, a, b: of("add", a, b),
+    "clamp": lambda of, params, low, a, high: of("min", of("max", a, low), high),
+    "integer_pow": _power,
+}

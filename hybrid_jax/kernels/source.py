@@ -10,13 +10,13 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from hybrid_jax.codegen import loops, nodes
 from hybrid_jax.codegen.loops import Tables
 from hybrid_jax.codegen.nodes import Expression, Loop, Operation, Statement
-from hybrid_jax.codegen.operations import LOGICAL, CTranslation, entries, is_zero
-from hybrid_jax.codegen.printer import OPERATIONS, CPrinter
+from hybrid_jax.codegen.operations import CTranslation, entries, is_zero
+from hybrid_jax.codegen.printer import LOGIC, OPERATIONS, CPrinter
 from hybrid_jax.kernels.library import width
 from hybrid_jax.kernels.trace import Shape, Split, outputs_of, split, traced, with_factors
 
 LONGEST = 4000  # statements of a function: GCC takes long for more, and a program of XLA does as well
-CHEAP = {"add", "sub", "mul", "neg", "max", "min", "select_n", "convert_element_type", *LOGICAL}
+CHEAP = {"add", "sub", "mul", "neg", "max", "min", "not", "select_n", "convert_element_type", *LOGIC}
 INLINED = 12  # operations of an entry that are done again wherever it is needed, at most
 LARGEST = 8192  # numbers in a function's arrays per sample
 
@@ -31,13 +31,13 @@ class SampleTranslation(CTranslation):
     def scan(self, equation, inputs):
         raise self._refusal(equation)
 
-    def _mapped(self, value, shape, logical):
+    def _mapped(self, value, shape):
         """Cheap values are computed again in loops over entries, instead of being read from an array."""
         value = self._inlined(value, shape)
-        made = super()._mapped(value, shape, logical)
+        made = super()._mapped(value, shape)
         operations = [one.name for one in nodes.walk(value) if isinstance(one, Operation)]
         if len(operations) <= INLINED and CHEAP.issuperset(operations):
-            self._cheap[shape, loops.indexed(self.tables, made, shape)] = value
+            self._cheap[shape, loops.indexed(self.tables, made)] = value
         return made
 
     def _inlined(self, value: Expression, shape: tuple[int, ...]) -> Expression:
@@ -62,8 +62,8 @@ class SamplePrinter(CPrinter):
 
     operations: ClassVar[dict[str, str]] = OPERATIONS | {
         "select_n": "choose({0}, {2}, {1})",
-        "convert_element_type": "number({0})",
-        "sign": "number({0} > 0) - number({0} < 0)",
+        "convert_element_type": "wide({0})",
+        "sign": "wide({0} > 0) - wide({0} < 0)",
     }
 
     def number(self, value: float) -> str:
@@ -73,8 +73,8 @@ class SamplePrinter(CPrinter):
         match node:
             case nodes.Variable(name, value):
                 return f"const auto {name} = {self.expression(value)};"
-            case nodes.Array(name, size, logical):
-                return f"HELD {'logical' if logical else 'real'} {name}[{size}];"
+            case nodes.Array(name, size):
+                return f"HELD real {name}[{size}];"
             case nodes.Assign(target, value):  # sums over samples begin at zero
                 return (
                     f"{self.expression(target)} {'+=' if target.name == 's' else '='} wide({self.expression(value)});"
@@ -139,7 +139,7 @@ class Source:
         arguments = [entries(array, one.shape, first) for (array, first), one in pairs]
         translation = SampleTranslation(self.tables)
         pairs = zip(outputs, translation.run(program, arguments), strict=True)
-        written = [(*out, one) for out, one in pairs if len(one) and not (out[0] == "s" and is_zero(one))]
+        written = [(*out, one) for out, one in pairs if one.size and not (out[0] == "s" and is_zero(one))]
         outs, begins, results = zip(*written, strict=True) if written else ((), (), ())
         body = translation.body(results, outs, begins)
         held = sum(one.size for one in nodes.walk(body) if isinstance(one, nodes.Array))

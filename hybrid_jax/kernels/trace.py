@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+from jax.interpreters.partial_eval import dce_jaxpr
 
 Shape = jax.ShapeDtypeStruct
 Products = dict[int, list[tuple[int, int]]]  # output → rows and columns of each product in its sum
-_NAMELESS = jax.make_jaxpr(lambda: ())().jaxpr.debug_info
 
 
 class Split(NamedTuple):
@@ -55,13 +55,8 @@ def _variables(atoms: Sequence[Any]) -> list[Var]:
 
 
 def _program(equations: Sequence[JaxprEqn], inputs: Sequence[Var], outputs: Sequence[Any], of: ClosedJaxpr):
-    wanted, kept = set(_variables(outputs)), []
-    for equation in reversed(equations):
-        if wanted & set(equation.outvars):
-            kept.append(equation)
-            wanted.update(_variables(equation.invars))
-    jaxpr = Jaxpr(of.jaxpr.constvars, list(inputs), list(outputs), kept[::-1], debug_info=_NAMELESS)
-    return ClosedJaxpr(jaxpr, of.consts)
+    jaxpr = of.jaxpr.replace(invars=list(inputs), outvars=list(outputs), eqns=list(equations))
+    return ClosedJaxpr(dce_jaxpr(jaxpr, True, instantiate=True)[0], of.consts)
 
 
 def split(program: ClosedJaxpr, parameters: int) -> Split:

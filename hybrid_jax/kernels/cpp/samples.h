@@ -5,17 +5,19 @@
 namespace {
 
 using real = Vec;
-using logical = Places;  // -1 where it is true
+using logical = Places;  // -1 where it is true; 1 in arrays
 
 INLINE Vec wide(Vec v) { return v; }
 INLINE Vec wide(float v) { return v - Vec{}; }
-INLINE logical wide(logical v) { return v; }
+INLINE Vec wide(logical v) { return v ? wide(1.0f) : Vec{}; }
 
+INLINE bool truth(float v) { return v; }
+INLINE logical truth(Vec v) { return v != Vec{}; }
+INLINE logical truth(logical v) { return v; }
 template <class Mask, class A, class B>
 INLINE Vec choose(Mask which, A a, B b) {
-  return which ? wide(a) : wide(b);
+  return truth(which) ? wide(a) : wide(b);
 }
-template <class Mask> INLINE Vec number(Mask which) { return choose(which, 1.0f, 0.0f); }
 
 // NaN, if one is NaN; beside a number that the compiler knows, as in ReLU, one comparison is enough.
 template <class B> INLINE bool is_known(B b) { return __builtin_constant_p(b) && b == b; }
