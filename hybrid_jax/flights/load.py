@@ -16,7 +16,7 @@ from hybrid_jax.flights.conversion import DT, flight_at, own_rows
 from hybrid_jax.flights.formats.blackbox import read_blackbox
 from hybrid_jax.flights.formats.column_map import load_column_map, read_mapped
 from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
-from hybrid_jax.flights.formats.raw import GZIP, readable, record, unpacked
+from hybrid_jax.flights.formats.raw import GZIP, readable, record
 from hybrid_jax.flights.formats.rosbag import read_rosbag
 from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.log import FlightLog, unevenness
@@ -208,7 +208,8 @@ def read_recording(
         elif kind == ROSBAG:
             parts = read_rosbag(path, topics or {})
         else:
-            parts = {ULOG: read_ulog, CRAZYFLIE: read_crazyflie, BLACKBOX: read_blackbox}[kind](unpacked(path))
+            with readable(path) as file:
+                parts = {ULOG: read_ulog, CRAZYFLIE: read_crazyflie, BLACKBOX: read_blackbox}[kind](file.read())
         found = record(path, *parts)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

@@ -94,12 +94,6 @@ def readable(path: str | Path, unpack: bool = True) -> Iterator[IO[bytes]]:
         raise ValueError(f"cannot be read: {error.strerror or error}") from error
 
 
-def unpacked(path: str | Path) -> bytes:
-    """Return the bytes of a file, plain or gzip; raises like `readable`."""
-    with readable(path) as file:
-        return file.read()
-
-
 def record(
     path: str | Path,
     parts: Mapping[str, Samples],
