@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import equinox as eqx
 import jax
 import matplotlib as mpl
 import numpy as np
@@ -27,6 +28,7 @@ __all__ = ["Options", "run"]
 WINDOW, HALF, WELL = 10, 1.96, 0.1  # intervals; standard errors of half an interval; share of a value
 MAIN = 5  # intervals that are not folded
 MEANS = "A flight like this gives these intervals where the model is right, with a constant force and torque unknown."
+CHANGING = "The errors that the model predicts from its past count as a force and torque that change as much."
 HEADER = "t,px,py,pz,yaw,vx,vy,vz"
 BOX = FlightBounds()
 
@@ -75,18 +77,19 @@ class Options:
 def run(options: Options) -> int:
     model = load(options.model)
     dt, field = model.about.get("dt", 0.01), with_disturbance(hold_corrections(without_past(model.field)))
+    planned = eqx.tree_at(without_past, model.field, field)
     box = FlightBounds(options.low, options.high, options.speed, options.tilt, options.yaw, options.rotor_speed)
     search = {name: getattr(options, name) for name in ("seconds", "bandwidth", "starts", "steps")}
     search |= {"noise": options.noise or None, "window": WINDOW * dt, "dt": dt}
     with step("searching for the flight, a minute or two"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = excitation(field, options.learn or None, box, jax.random.key(options.seed), **search)
+        found = excitation(planned, options.learn or None, box, jax.random.key(options.seed), **search)
     place, yaw = jax.vmap(found.reference)(found.t)
     points = np.column_stack([found.t, place, yaw, found.states[:, VELOCITY]])
     lines = [HEADER, *(",".join(f"{number:.5g}" for number in row) for row in points)]
     write_atomic(options.output, ("\n".join(lines) + "\n").encode())
     values = {name: float(value) for name, value in named_parameters(field).items()}
-    said = [str(each.message).removeprefix("excitation: ") for each in caught]
+    said = [CHANGING] * (planned is not field) + [str(each.message).removeprefix("excitation: ") for each in caught]
     told = {"standard_errors": found.standard_errors, "margins": found.margins, "set_points": options.output}
     page.write(options.out, "plan", _page(options, found, points, values, field.parameter_units, said), told)
     return 0

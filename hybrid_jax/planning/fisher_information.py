@@ -1,22 +1,27 @@
 """Predict the least-squares covariance of the parameters for a planned trajectory."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
+from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.estimation.least_squares import Solver, ravel_parameters
-from hybrid_jax.estimation.normal_equations import inverse
+from hybrid_jax.estimation.normal_equations import inverse, inverses
 from hybrid_jax.integrate import compact, rollout
+from hybrid_jax.vehicle import SENSOR_NOISE, STATE_SIZE
 
 
 class Information(NamedTuple):
     """Sums over all windows, of errors over the noise's standard deviation; J = ∂x̂/∂θ_p."""
 
     gram: Float[Array, "p p"]  # JᵀJ, the Gauss–Newton information if the first samples were exact
-    noise: Float[Array, "p p"]  # the covariance of Jᵀ(x − x̂), with the noise of first samples
+    noise: Float[Array, "p p"]  # the covariance of Jᵀ(x − x̂), with the noise of first samples and a past's disturbance
 
     def covariance(self, free: Bool[Array, " p"]) -> Float[Array, "p p"]:
         """The covariance of the free parameters by least squares, infinite if not identifiable; zero for the others."""
@@ -31,27 +36,57 @@ def information_of(
     u: Float[Array, "n m"],
     dt: float,
     steps: int,
-    noise: Float[Array, " d"],
+    noise: Float[Array, " s"],
     solver: Solver = None,
+    past: DisturbanceModel | None = None,
 ) -> Information:
     """Return the information in true states x every `dt` [s], cut into windows of `steps` intervals.
 
-    Each window is a rollout from its first sample, whose noise acts on the whole window and on the previous one.
+    Each window is a rollout from its first sample, whose noise acts on the whole window and on the previous one. Only
+    the first s states are measured; the others are unknown at the start of each window. The disturbance of which
+    `past` knows is as large as in its data, and forgotten within its time constants.
     """
-    count = len(u) // steps
+    count, measured = len(u) // steps, len(noise)
     starts, inputs = x[: count * steps : steps], u[: count * steps].reshape(count, steps, -1)
     theta, unravel = ravel_parameters(field)
+    sizes = jnp.zeros(0) if past is None else past.sizes[: len(past.weights)]
 
     def one(x0, u):
-        def predicted(theta, start):
-            return rollout(unravel(theta), x0 + noise * start, u, dt, compact(solver)) / noise
+        def predicted(theta, start, e):
+            own = unravel(theta)
+            own = own if past is None else DisturbanceModel(own, e[:, None], jnp.ones(1), (), ())  # constant
+            moved = x0 + jnp.concatenate([noise, jnp.ones(len(x0) - measured)]) * start
+            return rollout(own, moved, u, dt, compact(solver))[:, :measured] / noise
 
-        return jax.jacfwd(predicted, argnums=(0, 1))(theta, jnp.zeros_like(x0))
+        return jax.jacfwd(predicted, argnums=(0, 1, 2))(theta, jnp.zeros_like(x0), jnp.zeros_like(sizes))
 
-    effects, of_start = jax.vmap(one)(starts, inputs)  # (n, t, d, p) and (n, t, d, d)
-    first = -jnp.einsum("ntdp,ntde->nep", effects, of_start)  # what the noise of each first sample does to Jᵀ(x − x̂)
+    # (n, t, s, p), (n, t, s, d) and (n, t, s, e)
+    effects, of_start, disturbed = jax.vmap(one)(starts, inputs)
+    if as_field(field).hidden:  # what other hidden states could do as well tells nothing
+        other = of_start[..., measured:]
+        back = inverses(jnp.einsum("ntdh,ntdk->nhk", other, other)).matrix
+        effects = effects - jnp.einsum("ntdh,nhk,nsek,nsep->ntdp", other, back, other, effects)
+    first = -jnp.einsum("ntdp,ntde->nep", effects, of_start[..., :measured])  # of the noise of each first sample
     zero = jnp.zeros_like(first[:1])
     shared = jnp.concatenate([zero, effects[:, -1]]) + jnp.concatenate([first, zero])
     alone = effects[:, :-1].reshape(-1, theta.size)
     shared = shared.reshape(-1, theta.size)
-    return Information(jnp.einsum("ntdp,ntdq->pq", effects, effects), alone.T @ alone + shared.T @ shared)
+    noisy = alone.T @ alone + shared.T @ shared
+    if past is not None:
+        pushed = jnp.einsum("ntdp,ntde->npe", effects, disturbed) * sizes
+        apart = dt * steps * jnp.abs(jnp.arange(count)[:, None] - jnp.arange(count))
+        alike = jnp.mean(jnp.stack([jnp.exp(-apart / tau) for tau in past.time_constants]), axis=0)
+        noisy = noisy + jnp.einsum("npe,nm,mqe->pq", pushed, alike, pushed)
+    return Information(jnp.einsum("ntdp,ntdq->pq", effects, effects), noisy)
+
+
+def noise_of(noise: Sequence[float] | None, states: int) -> Float[np.ndarray, " s"]:
+    """Return the noise of each measured state, by default of motion capture; ValueError for other numbers."""
+    if noise is None:
+        if states != STATE_SIZE:
+            raise ValueError(f"noise must be given: the standard deviation of each of {states} measured states")
+        return np.repeat(np.array(SENSOR_NOISE, np.float32), (3, 4, 3, 3))
+    sizes = np.asarray(checks.finite("noise", checks.real_array("noise", noise)), np.float32)
+    if sizes.shape != (states,) or not (sizes > 0).all():
+        raise ValueError(f"noise must be {states} positive numbers, got {checks.short_repr(noise)}")
+    return sizes

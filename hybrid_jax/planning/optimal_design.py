@@ -16,12 +16,13 @@ import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, state_space
 from hybrid_jax.dynamics.disturbance import sized
+from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
 from hybrid_jax.estimation.least_squares import ravel_parameters, rounding
 from hybrid_jax.estimation.uncertainty import named_parameters
-from hybrid_jax.planning.fisher_information import Information, information_of
+from hybrid_jax.planning.fisher_information import Information, information_of, noise_of
 from hybrid_jax.planning.input_designs import (
     RAMP,
     Coefficients,
@@ -34,7 +35,7 @@ from hybrid_jax.planning.input_designs import (
 )
 from hybrid_jax.runtime import FAST_COMPILE, entry
 from hybrid_jax.trajectories import windows_of
-from hybrid_jax.vehicle import SENSOR_NOISE, STATE_SIZE
+from hybrid_jax.vehicle import STATE_SIZE
 
 SPARE = 0.98  # share of each limit that is used at most, as limits are looked at between samples only
 SHRUNK = 1 - np.arange(64) / 64  # factors on a series, the first of which that keeps the limits is taken
@@ -98,13 +99,17 @@ def excitation(
     the result satisfies them and is at least as informative as any start. Note that the standard errors are predicted
     for the plan, which the vehicle will not follow exactly.
 
+    Hidden states count as unmeasured, and unknown at the start of each window. Of a model from `fit_disturbance`, you
+    learn the parameters of its field, under a disturbance as large and as lasting as in its past.
+
     Args:
         model: any field with a guess of its parameters: a multirotor with `FlightBounds`, another with `InputBounds`.
         parameters: names as in `intervals`; by default all except a disturbance.
         bounds: the limits of the plan. You should leave room, since the vehicle follows it with an error.
         key: random key of the initial series.
         seconds: the duration of the plan [s].
-        noise: the standard deviation of each state's white noise; for a multirotor by default as in motion capture.
+        noise: the standard deviation of the white noise of each state that is not hidden; for a multirotor by default
+            as in motion capture.
         window: the length of the windows [s], a multiple of `dt`.
         dt: the interval between samples, over which an input is held [s].
         bandwidth: the highest frequency of the series [Hz].
@@ -115,16 +120,17 @@ def excitation(
         ValueError: if a parameter is unknown, bounds are of the wrong kind, the vehicle at rest violates them, or no
             start distinguishes the parameters. You get a warning with the name of a parameter that no input excites.
     """
-    design = _design(model, bounds, seconds, window, dt, bandwidth)
+    past = model if isinstance(model, DisturbanceModel) else None
+    design = _design(model if past is None else past.field, bounds, seconds, window, dt, bandwidth)
     for name, value in (("starts", starts), ("steps", steps)):
         checks.count(name, value, least=int(name == "starts"))
     checks.key("key", key)
     states = STATE_SIZE if isinstance(design, FlatOutputs) else len(bounds.start)  # pyright: ignore
-    model = sized(model, states)
-    wanted = _wanted(model, parameters)
-    search = coarse = _Search(design, model, jnp.asarray(_noise(noise, states)), round(window / dt))
+    model = sized(model if past is None else past.field, states)
+    wanted, measured = _wanted(model, parameters), states - as_field(model).hidden
+    search = coarse = _Search(design, model, jnp.asarray(noise_of(noise, measured)), round(window / dt), past)
     if search.window % 2 == 0:
-        coarse = _Search(replace(design, dt=2 * dt), model, search.noise, search.window // 2)
+        coarse = replace(search, design=replace(design, dt=2 * dt), window=search.window // 2)
     begun = _begun(search, starts, key)
     asked, seen = _excited(search, begun, wanted)
     found = jnp.concatenate([begun, coarse.improved(begun, asked, seen, steps)])
@@ -136,8 +142,9 @@ def excitation(
 class _Search(eqx.Module):
     design: Design
     model: AbstractVectorField
-    noise: Float[Array, " d"]
+    noise: Float[Array, " s"]
     window: int = eqx.field(static=True)
+    past: DisturbanceModel | None
 
     @eqx.filter_jit
     def planned(self, coefficients: Coefficients) -> Trajectory:
@@ -145,7 +152,7 @@ class _Search(eqx.Module):
 
     @eqx.filter_jit
     def information(self, x: Float[Array, "n+1 d"], u: Float[Array, "n m"]) -> Information:
-        return information_of(self.model, x, u, self.design.dt, self.window, self.noise)
+        return information_of(self.model, x, u, self.design.dt, self.window, self.noise, past=self.past)
 
     def value(self, x, u, asked: Bool[Array, " p"], seen: Bool[Array, " p"]) -> Float[Array, ""]:
         covariance = self.information(x, u).covariance(seen)
@@ -219,17 +226,6 @@ def _design(model, bounds, seconds: float, window: float, dt: float, bandwidth: 
     return FlatOutputs(vehicle, bounds, *numbers)
 
 
-def _noise(noise: Sequence[float] | None, states: int) -> Float[np.ndarray, " d"]:
-    if noise is None:
-        if states != STATE_SIZE:
-            raise ValueError(f"noise must be given: the standard deviation of each of {states} states")
-        return np.repeat(np.array(SENSOR_NOISE, np.float32), (3, 4, 3, 3))
-    sizes = np.asarray(checks.finite("noise", checks.real_array("noise", noise)), np.float32)
-    if sizes.shape != (states,) or not (sizes > 0).all():
-        raise ValueError(f"noise must be {states} positive numbers, got {checks.short_repr(noise)}")
-    return sizes
-
-
 def _wanted(model: AbstractVectorField, parameters: Sequence[str] | None) -> tuple[str, ...]:
     known = named_parameters(model)
     if parameters is None:
@@ -256,8 +252,8 @@ def _excited(search: _Search, begun, wanted: tuple[str, ...]) -> tuple[Bool[Arra
     each = [search.information(*flown) for flown in found]
     gram = np.max([np.diagonal(one.gram) for one in each], axis=0)
     x, u = (np.asarray(part) for part in found[0])
-    least = float(rounding(windows_of(x, u, search.design.dt, steps=search.window), search.noise)) ** 2
-    seen = jnp.asarray(gram > least)
+    windows = windows_of(x[:, : len(search.noise)], u, search.design.dt, steps=search.window)
+    seen = jnp.asarray(gram > float(rounding(windows, search.noise)) ** 2)
     for name in (name for name, known in zip(names, seen, strict=True) if not known):
         warnings.warn(f"excitation: no input excites {name}; it is left out", stacklevel=4)
     asked = jnp.asarray([name in wanted for name in names]) & seen

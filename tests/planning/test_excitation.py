@@ -8,6 +8,8 @@ from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax.control.references import reference_state
+from hybrid_jax.dynamics import DisturbanceModel, Lag
+from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.planning.fisher_information import information_of
 from hybrid_jax.trajectories import windows_of
 
@@ -81,6 +83,32 @@ def test_predicted_errors_are_those_of_least_squares():
 
     spread = np.std(jax.jit(jax.vmap(fit))(jax.random.split(jax.random.key(0), 300)), axis=0)
     assert spread == pytest.approx([found.standard_errors[name] for name in "ab"], rel=0.12)
+
+
+def test_hidden_states_are_unknown_at_the_start_of_each_window():
+    """Their starts count as parameters, so what is left is what another value of theirs cannot explain."""
+    field = hj.with_hidden(Pushed(a=jnp.array(1.5)), Lag(jnp.log(jnp.array([0.1])), places=(0,)))
+    u, (theta, unravel) = jax.random.normal(jax.random.key(0), (20, 1)), ravel_parameters(field)
+    x = jnp.concatenate([jnp.zeros((1, 2)), hj.rollout(field, jnp.zeros(2), u, DT)])
+    gram = information_of(field, x, u, DT, 5, jnp.array([NOISE])).gram
+
+    def predicted(both):
+        starts = jnp.stack([x[:-1:5, 0], both[2:]], axis=1)
+        return hj.rollout_batch(unravel(both[:2]), starts, u.reshape(4, 5, 1), DT)[..., 0].ravel() / NOISE
+
+    jacobian = np.asarray(jax.jacfwd(predicted)(jnp.concatenate([theta, x[:-1:5, 1]])), float)
+    expected = np.linalg.inv(jacobian.T @ jacobian)[:2, :2]
+    np.testing.assert_allclose(np.linalg.inv(gram), expected, rtol=1e-2)
+
+
+def test_a_past_adds_what_its_disturbance_does_to_a_gain():
+    """ẋ = b u + e with u = 1: an estimate of b is wrong by the mean of e, which a fifth of a second forgets."""
+    past = DisturbanceModel(GAIN, jnp.zeros((1, 2)), jnp.array([0.3, 1.0]), (0.2,), ())
+    x, u = DT * 0.7 * jnp.arange(101)[:, None], jnp.ones((100, 1))
+    quiet, found = (information_of(GAIN, x, u, DT, 5, jnp.array([NOISE]), past=each) for each in (None, past))
+    apart = 0.1 * np.abs(np.subtract.outer(range(20), range(20)))
+    added = found.covariance(ONE) - quiet.covariance(ONE)
+    np.testing.assert_allclose(added, 0.3**2 * np.exp(-apart / 0.2).mean(), rtol=1e-3)
 
 
 def test_a_parameter_that_nothing_excites_is_named():
