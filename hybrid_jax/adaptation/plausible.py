@@ -28,7 +28,8 @@ class Plausible:
 
     Attributes:
         theta: of each parameter of a rigid body in its own parametrisation, for example 0.3 for 30 % of a ratio.
-        relative: of a parameter of another system, relative to the source's value; one that is 0 there is free.
+        relative: of a parameter of another system, relative to the source's value; one that is 0 there is free. It is
+            absolute for a logarithm, the name of which begins with log_.
         force: constant force over the mass [m/s²].
         torque: constant torque over the inertia [rad/s²].
         drag: added drag over the mass [1/s].
@@ -58,7 +59,8 @@ class Plausible:
             field: the extended source.
             windows: windows of the changed system.
         """
-        groups, theta = groups_of(names_of(field)), ravel_parameters(field)[0]
+        names, theta = names_of(field), ravel_parameters(field)[0]
+        groups = groups_of(names)
         k = groups.count("disturbance")
         parts = k if k and windows.x0.shape[1] % k == 0 else 1  # of a grid a component is one part
         rates = (windows.x[:, -1] - windows.x0) / (windows.horizon * windows.dt)
@@ -68,7 +70,9 @@ class Plausible:
         else:
             steady = np.array(groups) == "disturbance"
             rates = jnp.broadcast_to(rates, (max(parts, k),))[np.maximum(np.cumsum(steady) - 1, 0)]
-            sizes = jnp.where(steady, self.disturbance * rates, self.relative * jnp.abs(theta))
+            logarithms = np.array([name.split(".")[-1].startswith("log_") for name in names])
+            changes = self.relative * jnp.where(logarithms, 1.0, jnp.abs(theta))
+            sizes = jnp.where(steady, self.disturbance * rates, changes)
         return jnp.where(sizes > 0, sizes, jnp.inf)
 
 

@@ -43,7 +43,7 @@ class Fit(NamedTuple):
     equations: NormalEquations  # of each window, there
     of_states: Float[Array, "d p p"]  # JᵀJ of the errors of each state, summed over windows
     noise: Float[Array, ""]  # variance of one error over scale, from differences of successive errors
-    seen: Bool[Array, " p"]  # which parameters change the predictions by more than rounding
+    seen: Bool[Array, " p"]  # which parameters the windows tell more of than rounding and the prior
     steps: Int[Array, ""]  # evaluations of the Jacobian
     status: Int[Array, ""]  # how it ended, a `Status`
 
@@ -69,9 +69,7 @@ def fit_each(
 ) -> tuple[Fit, Starts | None]:
     """Fit the free parameters of each candidate, with the prior `sizes`; also return the `smoothed` starts.
 
-    Args:
-        distinct: see `fit_and_linearise`.
-        moved: how far the field's parameters are from the centre of the prior.
+    The field's parameters are `moved` from the centre of the prior; for `distinct` see `fit_and_linearise`.
     """
     starts, noise = smoothed(field, windows, solver, scale)
     smooth, weigh = from_starts(windows, starts)
@@ -81,7 +79,9 @@ def fit_each(
         held, given = jnp.sqrt(noise) / sizes, (field, smooth, solver, max_steps, scale)
         found, jacobian, r = fit_and_linearise(*given, free, weigh, held, distinct, known, moved)
         equations = jax.vmap(equations_of)(jacobian, r)
-        seen = has_effect(equations, windows, scale)
+        # What windows tell less of than its prior could be anything, at hardly another error.
+        more = jnp.diagonal(jnp.sum(equations.gram, axis=0)) > noise / jnp.square(sizes)
+        seen = more & has_effect(equations, windows, scale)
         theta = ravel_parameters(found.field)[0]
         of_states = jnp.einsum("nsdp,nsdq->dpq", jacobian, jacobian)
         fit = Fit(theta, masked(equations, seen), of_states, noise, seen, found.steps, found.status)
