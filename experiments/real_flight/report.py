@@ -217,8 +217,8 @@ def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Map
             words.append(f"step {horizon} {quantity} {worst.text('.3f')}")
         return every(outcomes), f"error over that of the best of them: {', '.join(words)}"
 
-    text = f"{label(*cell)}, has smaller errors than {of} in every quantity"
-    return Claim(name, f"{text} (95 % interval of the geometric mean ratio, over test flights and seeds).", predicate)
+    text = f"{label(*cell)}, has smaller errors than {of} in every quantity (95 % interval of the geometric mean ratio"
+    return Claim(name, f"{text}, over test flights and, if there are several, seeds).", predicate)
 
 
 def _log_ratio(rows: Results, others: Results, column: str) -> Estimate:
@@ -227,7 +227,8 @@ def _log_ratio(rows: Results, others: Results, column: str) -> Estimate:
     pairs = [(row["flight"], row["seed"] if len(others.unique("seed")) > 1 else others[0]["seed"]) for row in rows]
     with np.errstate(all="ignore"):
         ratios = np.log(rows.numbers(column) / np.array([theirs[pair] for pair in pairs]))
-    return mean_interval(ratios, rows["seed"], rows["flight"])
+    # One seed says nothing of others, and flights are what a claim is about.
+    return mean_interval(ratios, rows["seed" if len(rows.unique("seed")) > 1 else "flight"], rows["flight"])
 
 
 def _titles() -> list[str]:
