@@ -38,8 +38,8 @@ class Options:
     """
 
     domain: Literal["source", "parameter_shift", "external_force"]
-    """source: drag and ground effect. parameter_shift: the same with Ix 0.040, Iy 0.020 kg m². external_force: the same
-    with side wind."""
+    """Which system. source: drag and ground effect. parameter_shift: the same with Ix 0.040, Iy 0.020 kg m².
+    external_force: the same with side wind."""
     out: Path
     """File to write (.npz)."""
     seed: CountFromZero = 0

@@ -1,7 +1,8 @@
-"""Write committed reports anew from what their report.json keeps: python -m experiments.redraw
+"""Write committed reports anew from their report.json: python -m experiments.redraw
 
-Those in docs/reference, or in the folders that you give. A report is a function of its record, so that neither its
-words nor its pictures can be older than the program: a test makes all of them and compares.
+It takes those in docs/reference, or in the folders that you give. A report is
+a function of its record, so that neither its words nor its pictures can be
+older than the program: a test makes all of them and compares.
 """
 
 import json
@@ -49,6 +50,9 @@ def written(folder: Path, report: Report) -> dict[str, str]:
 
 
 def main() -> None:
+    if {"-h", "--help"} & {*sys.argv[1:]}:
+        print(__doc__)
+        return
     if unknown := [each for each in sys.argv[1:] if not Path(each).is_dir()]:
         sys.exit(f"{__doc__}\nNo such folder: {', '.join(unknown)}")
     for path in sorted(found for folder in sys.argv[1:] or [REFERENCE] for found in Path(folder).rglob(JSON_NAME)):

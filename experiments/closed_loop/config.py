@@ -4,7 +4,17 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from experiments.flying.scenario import Reference, hardware
-from experiments.paper.config import QUICK, SMOKE, Config, ResidualInputs, preset_like
+from experiments.paper.config import (
+    ALL_PATIENCE,
+    ALL_RATES,
+    QUICK,
+    SMOKE,
+    AllPatience,
+    AllRates,
+    Config,
+    ResidualInputs,
+    preset_like,
+)
 from experiments.runner.options import Count, NotNegative, Positive, distinct
 from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.vehicle import IRIS
@@ -20,6 +30,8 @@ class ClosedLoopConfig(Config):
     smallest and the largest of --n-target; models that do not adapt also fly the unchanged vehicle.
     """
 
+    rates: AllRates = ALL_RATES
+    patience: AllPatience = ALL_PATIENCE
     seconds: Positive = 10.0
     """Length of a flight [s]."""
     references: tuple[Reference, ...] = get_args(Reference)

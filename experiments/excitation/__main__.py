@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -33,7 +33,7 @@ from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results, Row
 from experiments.runner import command
-from experiments.runner.options import Count, NotNegative, Positive, Run, distinct
+from experiments.runner.options import Count, Named, NotNegative, Positive, Run, distinct
 from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 from hybrid_jax import control
@@ -74,7 +74,7 @@ class ExcitationConfig(Run):
     """Length of each flight [s]."""
     change: str = "parameter_shift"
     """The change before the flight: source (nothing) or a change of `experiments.changes`."""
-    parameters: tuple[Parameter, ...] = get_args(Parameter)
+    parameters: Annotated[tuple[Parameter, ...], Named(name="learn")] = get_args(Parameter)
     """Parameters to identify."""
     noise: NotNegative = 1.0
     """Sensor noise; 1 is typical."""
@@ -91,7 +91,7 @@ class ExcitationConfig(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        distinct("--parameters", self.parameters)
+        distinct("--learn", self.parameters)
         if self.change not in CASES:
             raise ValueError(f"--change must be one of {', '.join(CASES)}, got {self.change}")
         if not self.noise:

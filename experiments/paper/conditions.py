@@ -3,7 +3,7 @@
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from experiments.paper.config import HELD_BACK, Config, Encoding, Stopping, column
+from experiments.paper.config import HELD_BACK, AllPatience, AllRates, Config, Encoding, Stopping, column
 from experiments.paper.expert_augmentation import expert_augmented
 from experiments.runner.options import NotNegative
 from hybrid_jax import rotation
@@ -77,8 +77,9 @@ def pretraining(
     model: str, fields: AbstractVectorField, config: Config, factor: float = 1.0
 ) -> tuple[FitState, RunConfig]:
     """Return one run per seed, from the seeds' fields, on all source trajectories, with all rates times a factor."""
-    patience = config.patience
-    rule = patience.no_physics_pretraining if model == "no_physics" else patience.hybrid_pretraining
+    rule = config.patience.hybrid_pretraining
+    if model == "no_physics":
+        rule = cast(AllPatience, config.patience).no_physics_pretraining
     rates = config.rates.physics, config.rates.pretraining
     plan = _plan(model, config, rates, rule, np.arange(config.source_train), config.source_train)
     plan = replace(plan, rates=jax.tree.map(lambda rate: factor * rate, plan.rates))
@@ -137,8 +138,9 @@ def held_back(subset: Int[np.ndarray, "*runs n"]) -> tuple[Int[np.ndarray, "*run
 def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[tuple[float, float], Stopping]:
     rates, patience, i = config.rates, config.patience, column(size)
     if model == "no_physics":
-        rate = rates.no_physics_target_only if mode == "target_only" else rates.no_physics[i]
-        return (0.0, rate), patience.no_physics
+        others = cast(AllRates, rates)
+        rate = others.no_physics_target_only if mode == "target_only" else others.no_physics[i]
+        return (0.0, rate), cast(AllPatience, patience).no_physics
     physics = rates.physics_fine_tuning if mode == "fine_tuned" else rates.physics
     return (physics, rates.hybrid[i]), Stopping(patience.hybrid_minimum[i], patience.hybrid_patience[i])
 

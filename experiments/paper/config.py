@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from experiments.flying.changes import CHANGES
 from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
 from experiments.runner import options
-from experiments.runner.options import Activation, Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
+from experiments.runner.options import (
+    Activation,
+    Count,
+    CountFromZero,
+    Named,
+    NotNegative,
+    Positive,
+    Run,
+    distinct,
+    factors,
+)
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.networks.mlp import NORMS
@@ -51,13 +61,19 @@ class Rates:
     """Factors: pre-training continues from its best model with all rates times each factor in turn; none by default."""
     hybrid: tuple[NotNegative, ...] = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)
     """Rate of the hybrid's θ_d, fine-tuned and target-only."""
+    offset: Positive | None = None
+    """Rate of v̇ and ω̇ in the output bias of θ_d [m/s², rad/s² a step], fine-tuned and target-only; by default the
+    rate of θ_d. Only this bias can represent a constant force; at 1e-3 you need thousands of steps, which overfit."""
+
+
+@dataclass(frozen=True)
+class AllRates(Rates):
+    """Learning rates also for experiments with a network without physics."""
+
     no_physics: tuple[NotNegative, ...] = (1e-4, 1e-4, 1e-4, 1e-4, 1e-5)
     """Rate of the network without physics, fine-tuned (the first four are not confirmed in the paper)."""
     no_physics_target_only: NotNegative = 1e-4
     """Rate of the network without physics, target-only."""
-    offset: Positive | None = None
-    """Rate of v̇ and ω̇ in the output bias of θ_d [m/s², rad/s² a step], fine-tuned and target-only; by default the
-    rate of θ_d. Only this bias can represent a constant force; at 1e-3 you need thousands of steps, which overfit."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +89,19 @@ class Patience:
     """Early stopping; a tuple has one entry for each of the sizes 100, 300, 500, 700, 1000."""
 
     hybrid_pretraining: Stopping = Stopping(100, 20)
-    no_physics_pretraining: Stopping = Stopping(300, 50)
     hybrid_minimum: tuple[CountFromZero, ...] = (100, 300, 300, 300, 100)
     hybrid_patience: tuple[CountFromZero, ...] = (20, 50, 50, 50, 20)
+
+
+@dataclass(frozen=True)
+class AllPatience(Patience):
+    """Early stopping also of a network without physics."""
+
+    no_physics_pretraining: Stopping = Stopping(300, 50)
     no_physics: Stopping = Stopping(250, 50)
+
+
+ALL_RATES, ALL_PATIENCE = AllRates(), AllPatience()
 
 
 @dataclass(frozen=True)
@@ -121,7 +146,7 @@ class Config(Run):
     """Seed of all flights."""
     hidden: Count = 64
     """Hidden units of f_d."""
-    inputs: Literal["hover", "raw"] = "hover"
+    inputs: Annotated[Literal["hover", "raw"], Named(name="rotor-scaling")] = "hover"
     """Scaling of rotor speeds for f_d. hover: (u − hover) / (hover / 10); raw: u in rad/s."""
     norm: Norm = "batch"
     """Normalisation of f_d's hidden layer."""
@@ -135,10 +160,10 @@ class Config(Run):
     and Iy act on them. rotors: also the thrust of each rotor, by one network that all rotors share."""
     residual_linear: bool = False
     """Add a linear skip connection to f_d; both start at zero."""
-    guess: tuple[float, float] = (0.8, 1.25)
+    guess: Annotated[tuple[float, float], Named(name="init-range")] = (0.8, 1.25)
     """θ_p starts at nominal times a random factor in this range."""
-    perturbed_by: Positive | None = None
-    """Instead of --guess with this value x: θ_p starts at nominal × (1 + x) or nominal / (1 + x), at random."""
+    perturbed_by: Annotated[Positive | None, Named(name="init-offset")] = None
+    """Instead of --init-range, with this value x: θ_p starts at nominal × (1 + x) or nominal / (1 + x), at random."""
     noise: NotNegative = 0.0
     """White noise on the states of training and validation flights; 1 is typical of motion capture and a gyroscope."""
     noise_on: Literal["all", "target"] = "all"
@@ -158,7 +183,7 @@ class Config(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        factors("--guess", self.guess)
+        factors("--init-range", self.guess)
         distinct("--n-target", self.sizes)
         batch = f"--batch-size {self.batch_size}"
         if min(self.sizes) < self.batch_size:
@@ -183,7 +208,7 @@ class Config(Run):
             raise ValueError(f"--pool must be at least the largest of --n-target {self.sizes}, got {self.pool}")
         for name in ("rates.hybrid", "rates.no_physics", "patience.hybrid_minimum", "patience.hybrid_patience"):
             group, entry = name.split(".")
-            if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
+            if len(getattr(getattr(self, group), entry, TABLE_SIZES)) != len(TABLE_SIZES):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
 
     def _check_draws(self) -> None:
@@ -220,6 +245,8 @@ class Config(Run):
 class AdaptationConfig(Config):
     """Pre-train on source flight, adapt to the target with N short trajectories, and test."""
 
+    rates: AllRates = ALL_RATES
+    patience: AllPatience = ALL_PATIENCE
     models: tuple[Model, ...] = MODELS
     """Which models to compare. constant_disturbance: the source's hybrid with θ_p and a constant
     disturbance fitted by least squares."""
@@ -269,6 +296,9 @@ ONE_FLIGHT: dict[str, Any] = {"noise": 1.0, "noise_on": "target", "draw": "conti
 def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:
     """Return a configuration with another's shared options, except sizes and pool, and the changes."""
     shared = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
+    for name in ("rates", "patience"):
+        own = type(kind.__dataclass_fields__[name].default)
+        shared[name] = own(**{each: getattr(shared[name], each) for each in own.__dataclass_fields__})
     return kind(**shared | changes)
 
 
@@ -289,8 +319,8 @@ SMOKE = replace(
 # Both ends of the sizes, and less source flight, learnt at rates that converge in it: under a minute on two cores.
 BOTH_ENDS = replace(
     QUICK, sizes=(100, 1000), target_only=False, source_train=3000, validation=100, max_epochs=600,
-    rates=Rates(pretraining=1e-3, no_physics_target_only=1e-3, no_physics=(1e-4, 3e-4, 3e-4, 3e-4, 5e-4)),
-    patience=Patience(
+    rates=AllRates(pretraining=1e-3, no_physics_target_only=1e-3, no_physics=(1e-4, 3e-4, 3e-4, 3e-4, 5e-4)),
+    patience=AllPatience(
         hybrid_pretraining=Stopping(70, 15), no_physics_pretraining=Stopping(100, 15), no_physics=Stopping(150, 20)
     ),
 )  # fmt: skip

@@ -14,7 +14,8 @@ from hybrid_jax import checks
 from hybrid_jax.cli.help import option_of
 from hybrid_jax.networks.mlp import ACTIVATIONS
 
-Target = tyro.conf.arg(name="n-target")  # N, the same option of all commands
+Named = tyro.conf.arg
+Target = Named(name="n-target")  # N, the same option of all commands
 # Numbers with a rule, which `check_numbers` applies wherever an option's type mentions them.
 Count = Annotated[int, checks.count]
 CountFromZero = Annotated[int, partial(checks.count, least=0)]
@@ -50,15 +51,15 @@ class Run:
     """Results are written to --out. Flights and finished stages are kept in --cache and reused by later runs."""
 
     preset: Literal["paper", "quick", "smoke"] = "paper"
-    """Protocol: the paper's takes hours, quick a few minutes, smoke only shows that everything works."""
+    """Protocol; the paper's takes hours, quick minutes, and smoke only shows that it works."""
     out: Path = Path("runs")
     """Folder of reports, in which one named after the experiment is created."""
     cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))
     """Folder for flights and finished stages. Compiled programs are kept in the user's cache folder, or in
     JAX_COMPILATION_CACHE_DIR."""
-    fresh: Annotated[bool, tyro.conf.arg(name="restart")] = False
+    fresh: Annotated[bool, Named(name="restart")] = False
     """Start again, with earlier results in --out and unfinished sweeps moved to a backup. Nothing is deleted."""
-    saving: float = 0.02
+    saving: Annotated[float, Named(name="checkpoint-share")] = 0.02
     """Largest share of a sweep's time for checkpoints; with a smaller share you lose more work if the run is killed."""
     seeds: Count = 10
     """Trials of each condition. Seeds differ in initialisation, order of minibatches, and the N trajectories."""
@@ -78,7 +79,7 @@ class Run:
         if not self.distributed and (self.coordinator, self.processes, self.process_id) != (None, None, None):
             raise ValueError("--coordinator, --processes and --process-id need --distributed")
         if not 0 < self.saving <= 1:
-            raise ValueError(f"--saving must be a share above 0 and at most 1, got {self.saving}")
+            raise ValueError(f"--checkpoint-share must be above 0 and at most 1, got {self.saving}")
         check_numbers("--", self)
 
     def described(self) -> dict[str, Any]:

@@ -182,7 +182,7 @@ REFUSED = [
     ({"batch_size": 1}, "--batch-size must be at least 2 with --norm batch, got 1"),
     ({"source_train": 50}, "--source-train"),
     ({"seeds": 0}, "--seeds"),
-    *(({"guess": box}, "--guess must be two factors") for box in ((1.2, 0.8), (-1.0, 0.8), (0.8, math.inf))),
+    *(({"guess": box}, "--init-range must be two factors") for box in ((1.2, 0.8), (-1.0, 0.8), (0.8, math.inf))),
     ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
     ({"draw": "contiguous", "pool": 2000}, "--pool is for --draw random: leave it out"),
     ({"rates": replace(PAPER.rates, hybrid=(1e-3,))}, "--rates.hybrid"),

@@ -16,7 +16,7 @@ KILLS = int(os.environ.get("HYBRID_JAX_KILLS", "3"))
 EPOCHS = "300"
 TRIES = 5
 SMALL = [
-    "--preset", "smoke", "--models", "hybrid", "--saving", "1", "--max-epochs", EPOCHS,
+    "--preset", "smoke", "--models", "hybrid", "--checkpoint-share", "1", "--max-epochs", EPOCHS,
     "--patience.hybrid-pretraining.minimum", EPOCHS, "--patience.hybrid-minimum", *[EPOCHS] * 5,
 ]  # fmt: skip
 MOMENTS = ("checkpoint", "pre-training", "adaptation", "data", "report")
