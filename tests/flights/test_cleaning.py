@@ -149,21 +149,16 @@ def hop() -> Recording:
 
 
 def test_a_vehicle_flies_while_it_is_clear_of_where_it_stood(hop):
+    """Without height it flies from the power that carries it to shortly before its motors stop."""
     np.testing.assert_allclose(airborne(hop), [(CLIMBS, LANDS)], atol=0.02)
-
-
-def test_without_height_it_flies_from_the_power_that_carries_it_to_shortly_before_its_motors_stop(hop):
     blind = replace(hop, signals={"command": hop.signals["command"]})
     np.testing.assert_allclose(airborne(blind), [(CARRIES, STOPS - MARGIN)], atol=0.02)
 
 
-def test_a_log_that_begins_and_ends_in_flight_is_all_flight(hop):
+def test_a_log_that_begins_and_ends_in_flight_is_all_flight_and_a_short_dip_of_power_ends_none(hop):
     inside = (T > 4) & (T < 8)
     part = {name: replace(each, t=each.t[inside], values=each.values[inside]) for name, each in hop.signals.items()}
     np.testing.assert_allclose(airborne(Recording("part", part)), [(4, 8)], atol=0.02)
-
-
-def test_a_short_dip_of_the_power_ends_no_flight(hop):
     dipped = np.array(hop.signals["command"].values)
     dipped[(T > 6) & (T < 6.3)] = 0.05
     signals = {"command": replace(hop.signals["command"], values=dipped)}
