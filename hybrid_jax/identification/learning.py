@@ -1,5 +1,6 @@
 """Learn a vehicle from flights, with physics only or with a network, adapt it after a change, and score predictions."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -33,6 +34,7 @@ TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows a
 ENOUGH = 10  # windows for each parameter that is learned by default, or its error exceeds its effect
 NAMES = "position", "velocity", "attitude", "body rates"  # of a rigid body's quantities, in the order of `UNITS`
 FOLDS = 3  # at most so many groups of flights are left out in turn
+STRETCHES = 5  # of flights after a change, which are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
 PHYSICS, OUTPUTS = "theta_least_squares", "accelerations"
 PAST = " with its past"  # of a candidate that also predicts its disturbance from the errors before
@@ -129,48 +131,59 @@ def adapted(
     """
     windows = cut_windows(logs, STEPS, STEPS, most)
     found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)
-    if not isinstance(field, DisturbanceModel):
-        return found.field, found
-    moved = eqx.tree_at(lambda model: model.field, field, found.field)
-    counted = counting_past(found.expected, moved, logs, most * STEPS // 2)
-    return with_past(moved, logs, most * STEPS), replace(found, expected=counted)
+    moved = eqx.tree_at(without_past, field, found.field)
+    if not isinstance(moved, DisturbanceModel):
+        return moved, found
+    seen = expected_with_past(moved, logs, [*found.expected], most * STEPS)
+    return with_past(moved, logs, most * STEPS), replace(found, expected=seen)
 
 
-def counting_past(
-    expected: Expected, model: DisturbanceModel, logs: Sequence[FlightLog], most: int | None = None
+def expected_with_past(
+    model: DisturbanceModel, logs: Sequence[FlightLog], horizons: Sequence[str], most: int | None = None
 ) -> Expected:
-    """Multiply errors to expect without a past by what a past changes that was learned from the other halves of logs.
+    """Return the errors to expect of a past that is learned from logs, by stretches of them that are left out in turn.
+
+    A stretch is a flight, or a part of one that is longer than what a past remembers. Each is predicted by what the
+    others teach, but with what was measured before it. Another flight is assumed to differ from all of these as much
+    as one stretch from another.
 
     Args:
-        expected: as in `Adaptation`.
         model: the model with its past before these logs.
-        logs: the logs that `expected` is from.
-        most: the largest number of intervals of each half to learn from.
+        logs: flights after a change.
+        horizons: as in `Adaptation.expected`, for example "0.1 s".
+        most: the largest number of intervals to learn from.
     """
-    found: dict[str, Any] = dict(expected)
-    halves = [[log[: len(log) // 2] for log in logs], [log[len(log) // 2 :] for log in logs]]
-    if not all(sequences(half, 2 * STEPS) for half in halves):
-        return found
-    models = [with_past(model, half, most) for half in reversed(halves)]
-    for horizon, errors in expected.items():
-        steps = round(float(horizon.split()[0]) / logs[0].dt)
-        long = [(one, log) for one, half in zip(models, halves, strict=True) for log in half if sequences([log], steps)]
-        if long:
-            own = np.concatenate([errors_of(one, log, steps) for one, log in long])
-            alone = np.concatenate([errors_of(model.field, log, steps) for _, log in long])
-            shares: dict[str, float] = dict(zip(NAMES, (rmse(own) / rmse(alone))[-1].tolist(), strict=True))
-            found[horizon] = {name: tuple(shares[name] * value for value in values) for name, values in errors.items()}
-    return found
+    flights = sequences(logs, 2 * STEPS)
+    found: dict[str, list[Float[np.ndarray, " 4"]]] = {horizon: [] for horizon in horizons}
+    for i, one in enumerate(flights):
+        x, u = np.concatenate([one.x0, one.x[0]]), np.asarray(one.u[0])
+        count = max(1, min(-(-STRETCHES // len(flights)), int(one.horizon * one.dt / (2 * max(model.time_constants)))))
+        for begin, end in itertools.pairwise(np.linspace(0, one.horizon, count + 1).astype(int)):
+            rest = [(a, b) for a, b in ((0, begin), (end, one.horizon)) if b - a > 2 * STEPS]
+            own = [windows_of(x[a : b + 1], u[a:b], one.dt, steps=b - a) for a, b in rest]
+            others = _first([*flights[:i], *own, *flights[i + 1 :]], most)
+            past = fit_disturbance(model, others, steps=STEPS) if others else model
+            seen = observe(past, one)[0, begin : end + 1]
+            for horizon, errors in found.items():
+                if (steps := round(float(horizon.split()[0]) / one.dt)) <= end - begin:
+                    windows = windows_of(seen, u[begin:end], one.dt, steps=steps)
+                    errors.append(rmse(np.stack(flight_errors(past, windows), axis=-1))[-1])
+    of_flights = {name: expected(np.log(each), flights=len(flights)) for name, each in found.items() if each}
+    return {name: dict(zip(NAMES, map(tuple, each.T.tolist()), strict=True)) for name, each in of_flights.items()}
 
 
 def with_past(field: AbstractVectorField, logs: Sequence[FlightLog], most: int | None = None) -> DisturbanceModel:
     """Add a model of the disturbance, learned from at most `most` intervals of flights."""
-    kept, left = [], most or sum(map(len, logs))
-    for each in sequences(logs, 2 * STEPS):
+    return fit_disturbance(field, _first(sequences(logs, 2 * STEPS), most), steps=STEPS)
+
+
+def _first(flights: Sequence[Trajectories], most: int | None) -> list[Trajectories]:
+    kept, left = [], most or sum(each.horizon for each in flights)
+    for each in flights:
         if left > 2 * STEPS:
             kept.append(split(each, left)[0] if left < each.horizon else each)
             left -= each.horizon
-    return fit_disturbance(field, kept, steps=STEPS)
+    return kept
 
 
 def without_past(field: AbstractVectorField) -> AbstractVectorField:
@@ -229,12 +242,19 @@ def choose(scores: Mapping[str, Float[np.ndarray, " flights"]]) -> str:
     return next(name for name, each in worse.items() if each.mean() <= error[name])
 
 
-def expected(logs: Float[np.ndarray, "flights ..."], level: float = LEVEL) -> Float[np.ndarray, "3 ..."]:
-    """Return the expected error on another flight and its interval, by Student's t of the flights' log-errors."""
-    n, middle = len(logs), logs.mean(axis=0)
+def expected(
+    logs: Float[np.ndarray, "n ..."], level: float = LEVEL, flights: int | None = None
+) -> Float[np.ndarray, "3 ..."]:
+    """Return the expected error on another flight and its interval, by Student's t of the flights' log-errors.
+
+    They may be log-errors of parts of fewer `flights`, of which the means differ as much as the parts.
+    """
+    n, middle = len(logs), np.mean(logs, axis=0)
     if n < 2:
         return np.stack([np.exp(middle), np.zeros_like(middle), np.full_like(middle, np.inf)])
-    half = scipy.special.stdtrit(n - 1, (1 + level) / 2) * logs.std(axis=0, ddof=1) * (1 + 1 / n) ** 0.5
+    half = (
+        scipy.special.stdtrit(n - 1, (1 + level) / 2) * np.std(logs, axis=0, ddof=1) * (1 + 1 / (flights or n)) ** 0.5
+    )
     return np.exp([middle, middle - half, middle + half])
 
 

@@ -42,14 +42,15 @@ def test_a_push_that_the_model_lacks_is_predicted_from_the_errors_before():
     assert after < 0.3 * before
 
 
-def test_errors_to_expect_count_the_past():
+def test_errors_to_expect_of_a_past_are_of_flights_that_it_was_not_learned_from():
     model, flown = learning.with_past(LACKING, LOGS[:6]), LOGS[6:]
-    ones = {horizon: dict.fromkeys(learning.NAMES, (1.0, 0.5, 2.0)) for horizon in ("0.1 s", "0.8 s")}
-    found = learning.counting_past(ones, model, flown)
-    share = found["0.1 s"]["velocity"][0]
-    np.testing.assert_allclose(found["0.1 s"]["velocity"], share * np.array([1.0, 0.5, 2.0]), rtol=1e-5)
-    assert share < 0.8 < found["0.1 s"]["attitude"][0]  # the force that it lacks does not turn it
-    assert found["0.8 s"] == ones["0.8 s"]  # half a flight is shorter
+    found = learning.expected_with_past(model, flown, ["0.1 s", "2 s"])
+    pasts = [learning.with_past(model, flown[:i] + flown[i + 1 :]) for i in range(3)]
+    ends = [learning.rmse(errors(past, log))[-1] for past, log in zip(pasts, flown, strict=True)]
+    assert [*found] == ["0.1 s"]  # the flights are shorter than 2 s
+    np.testing.assert_allclose(np.transpose([*found["0.1 s"].values()]), learning.expected(np.log(ends)), rtol=1e-4)
+    one = learning.expected_with_past(model, flown[:1], ["0.1 s"])["0.1 s"]["velocity"]
+    assert one[1:] == (0.0, np.inf)  # one stretch, since it is not longer than what a past remembers
 
 
 def test_weights_of_zero_have_the_errors_of_the_field_in_the_same_windows():
