@@ -96,11 +96,6 @@ def attitude_error(reference: Quaternion, q: Quaternion) -> Vector:
     return rotation_vector(multiply(conjugate(reference), q))
 
 
-def canonicalize_quaternion(q: Quaternion) -> Quaternion:
-    """q or −q, the same rotation, with a positive first nonzero entry: the networks were trained near w > 0."""
-    return q * jnp.sign(q[jnp.argmax(q != 0)])
-
-
 def tilt(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
     """The angle [rad] between the body's z axis and the vertical, for unit quaternions."""
     of = jnp if isinstance(q, jax.Array) else np

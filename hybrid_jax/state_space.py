@@ -80,6 +80,14 @@ class Quantity:
         """
         return x
 
+    def canonical(self, x: Float[Array, " n *b"], own: Float[Array, " n *b"]) -> Float[Array, " n *b"]:
+        """Return x, or a derivative there, in the representation that networks read.
+
+        Args:
+            own: x itself or a derivative (n), which changes as x does.
+        """
+        return own
+
     def continuous(self, path: Float[np.ndarray, "t n"]) -> Float[np.ndarray, "t n"]:
         """Return a sequence of values without jumps between representations.
 
@@ -143,6 +151,9 @@ class Attitude(Quantity):
 
     def nearest(self, x, to):
         return jnp.where(jnp.sum(x * to) < 0, -x, x)
+
+    def canonical(self, x, own):
+        return jnp.where(x[0] < 0, -own, own)
 
     def continuous(self, path):
         turned = np.sum(path[..., 1:, :] * path[..., :-1, :], axis=-1) < 0
@@ -249,6 +260,16 @@ class StateSpace:
         for part, one in self._curved():
             x = x.at[part].set(one.nearest(x[part], to[part]))
         return x
+
+    def canonical(self, x: Float[Array, " d *b"], own: Float[Array, " d *b"]) -> Float[Array, " d *b"]:
+        """Return x, or a derivative there, in the representation that networks read: of q and −q, that with w ≥ 0.
+
+        Args:
+            own: x itself or a derivative (d), which changes as x does.
+        """
+        for part, one in self._curved():
+            own = jnp.concatenate([own[: part.start], one.canonical(x[part], own[part]), own[part.stop :]])
+        return own
 
     def continuous(self, x0: Numbers, x: Numbers) -> Numbers:
         """Return trajectories without jumps between representations; traced ones stay unchanged.

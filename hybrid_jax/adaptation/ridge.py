@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.least_squares import Solver
 from hybrid_jax.integrate import checked, integrate
@@ -45,11 +45,11 @@ def last_layer(
     network = field.residual if isinstance(field, Hybrid) else field
     if not isinstance(network, ResidualNetwork):
         raise ValueError(f"last_layer needs a field whose residual is a ResidualNetwork, got {type(network).__name__}")
-    before, u, after = transitions(windows)
+    (before, u, after), canonical = transitions(windows), jax.vmap(state_space(field).canonical)
     activations = jax.vmap(network.activations)
-    middle = (activations(before, u) + activations(after, u)) / 2
+    middle = (activations(canonical(before, before), u) + activations(canonical(after, after), u)) / 2
     scale = network.scaling.outputs(jnp.ones_like(network.bias_out))
-    weight, bias = ridge(middle, defects(field, windows, solver) / scale, penalty)
+    weight, bias = ridge(middle, canonical(before, defects(field, windows, solver)) / scale, penalty)
     output = (network.weight_out + weight, network.bias_out + bias)
     changed = eqx.tree_at(lambda network: (network.weight_out, network.bias_out), network, output)
     return Hybrid(field.physics, changed) if isinstance(field, Hybrid) else changed
@@ -59,10 +59,10 @@ def linear_residual(
     field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> Hybrid:
     """Add a linear map of the standardised [x, u], regressed on the defects; raises as `last_layer`."""
-    before, u, after = transitions(windows)
-    z = jnp.concatenate([(before + after) / 2, u], axis=1)
+    (before, u, after), canonical = transitions(windows), jax.vmap(state_space(field).canonical)
+    z = jnp.concatenate([canonical(before, (before + after) / 2), u], axis=1)
     mean, scale = mean_and_scale(z)
-    weight, bias = ridge((z - mean) / scale, defects(field, windows, solver), penalty)
+    weight, bias = ridge((z - mean) / scale, canonical(before, defects(field, windows, solver)), penalty)
     return Hybrid(field, LinearResidual(weight / scale, bias - weight @ (mean / scale)))
 
 

@@ -9,8 +9,8 @@ from hybrid_jax.control.cost import Scalar
 from hybrid_jax.control.sensitivities import advance
 from hybrid_jax.dynamics import ConstantDisturbance, DisturbanceModel, Hybrid
 from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, as_field
-from hybrid_jax.rotation import canonicalize_quaternion
-from hybrid_jax.vehicle import BODY_RATES, QUATERNION, VELOCITY, State
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.vehicle import BODY_RATES, VELOCITY, State
 
 MOTION = slice(VELOCITY.start, BODY_RATES.stop)
 
@@ -44,7 +44,7 @@ class Observer(AbstractEstimator):
         return Watched(jnp.zeros_like(x, shape=6), x)
 
     def update(self, state, x, u):
-        before = state.x.at[QUATERNION].set(canonicalize_quaternion(state.x[QUATERNION]))
+        before = RIGID_BODY_SPACE.canonical(state.x, state.x)
         error = (x - advance(self.model(state), before, u, self.period))[MOTION] / self.period
         return Watched(state.disturbance - jnp.expm1(-self.bandwidth * self.period) * error, x)
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns, ravel_learned
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns, ravel_learned, state_space
 from hybrid_jax.dynamics.batching import AbstractInferenceOnly, batch_norms, moments_of
 
 
@@ -73,6 +73,8 @@ class AbstractComposite(AbstractVectorField):
 class Hybrid(AbstractComposite):
     """A hybrid model ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus a residual for what it lacks (paper, Eq. 4).
 
+    Quaternions q and −q are one attitude, and the model is the same for both: the residual reads the one with w ≥ 0.
+
     Attributes:
         physics: f_p, any field.
         residual: f_d, a network or any other field. Physics may transform its output; see `apply_residual`.
@@ -85,22 +87,26 @@ class Hybrid(AbstractComposite):
     def inside(self) -> tuple[AbstractVectorField, AbstractVectorField]:
         return self.physics, self.residual
 
+    def read(self, x):
+        return state_space(self.physics).canonical(x, x)
+
     def write(self, x, *inside):
-        slope, added = inside[0], self.apply_residual(x, inside[1])
+        slope, added = inside[0], self.apply_residual(self.read(x), inside[1])
         if jnp.shape(added) != jnp.shape(slope):
             raise ValueError(f"the residual must return {jnp.shape(slope)}, as physics does, got {jnp.shape(added)}")
-        return slope + added
+        return state_space(self.physics).canonical(x, slope + added)
 
     def apply_residual(self, x, residual):
         return as_field(self.physics).apply_residual(x, residual)
 
     def parameter_columns(self, x, u):
-        physics, residual = self._parts
-        value, columns = residual(x, u), residual.parameter_columns(x, u)
-        moved = jvp_columns(lambda value: self.apply_residual(x, value), (value,), (columns,))[1]
+        (physics, residual), seen = self._parts, self.read(x)
+        value, columns = residual(seen, u), residual.parameter_columns(seen, u)
+        moved = jvp_columns(lambda value: self.apply_residual(seen, value), (value,), (columns,))[1]
         theta, at = ravel_learned(self.physics)
-        mapped = jax.jacfwd(lambda theta: as_field(at(theta)).apply_residual(x, value))(theta)
-        return jnp.concatenate([physics.parameter_columns(x, u) + mapped, moved], axis=1)
+        mapped = jax.jacfwd(lambda theta: as_field(at(theta)).apply_residual(seen, value))(theta)
+        columns = jnp.concatenate([physics.parameter_columns(seen, u) + mapped, moved], axis=1)
+        return state_space(self.physics).canonical(x, columns)
 
 
 class AbstractWrapper(AbstractComposite):

@@ -52,7 +52,7 @@ class GaussNewtonFit(eqx.Module):
 def residual_norm(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
     """f_d along the predicted trajectory, whose mean square is `loss.residual_norm` (Yin et al. 2021)."""
     x, u = jnp.concatenate([window.x0[None], predicted[:-1]]), window.u
-    parts = jax.vmap(field.residual)(x, jnp.asarray(u))
+    parts = jax.vmap(lambda x, u: field.residual(field.read(x), u))(x, jnp.asarray(u))
     return parts.ravel() / len(u) ** 0.5
 
 

@@ -100,7 +100,7 @@ REGULARISERS: dict[str, Regulariser] = {
 
 def _parts(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> list[Float[Array, "d s"]]:
     x, u = along(batch.x0, predicted, batch.u)
-    return [as_field(part).train_batch(x, u) for part in (field.physics, field.residual)]
+    return [as_field(part).train_batch(field.read(x), u) for part in (field.physics, field.residual)]
 
 
 def _unit(columns: Float[Array, "d b"]) -> Float[Array, "d b"]:

@@ -30,7 +30,8 @@ def source(seed=0):
 def flown(truth, count=100, seed=0, dt=0.01, steps=3):
     rng = np.random.default_rng(seed)
     x0 = rng.normal(size=(count, 13))
-    x0[:, QUATERNION] /= np.linalg.norm(x0[:, QUATERNION], axis=1, keepdims=True)
+    x0[:, QUATERNION] += [3.0, 0.0, 0.0, 0.0]  # not half a turn, where a network reads the other quaternion
+    x0[:, QUATERNION] *= rng.choice([-1, 1], (count, 1)) / np.linalg.norm(x0[:, QUATERNION], axis=1, keepdims=True)
     x0, u = jnp.asarray(x0, float), jnp.asarray(IRIS.hover_speed + 40 * rng.normal(size=(count, steps, 4)), float)
     return Trajectories(x0, u, _rolled(truth, x0, u, jnp.asarray(dt)), dt)
 

@@ -76,3 +76,11 @@ def test_a_load_moves_the_centre_of_mass_and_adds_to_the_inertia():
     added = hj.IRIS.mass * mass / LOADED.mass * (place @ place - place**2)
     np.testing.assert_allclose(np.asarray(LOADED.inertia) - hj.IRIS.inertia, added, rtol=1e-9)
     np.testing.assert_allclose(loaded(hj.IRIS, 0.5, (0.0, 0.0, 0.0)).inertia, hj.IRIS.inertia)
+
+
+def test_a_hybrid_model_is_the_same_for_both_quaternions_of_an_attitude():
+    hybrid = hj.Hybrid(changed(), hj.residual_network(13, 4, jax.random.key(0)))
+    x, other = moving(), jnp.ones(13).at[3:7].set(-1.0)
+    np.testing.assert_array_equal(hybrid(other * x, U), other * hybrid(x, U))
+    columns = [hybrid.parameter_columns(at, U) for at in (x, other * x)]
+    np.testing.assert_array_equal(columns[1], other[:, None] * columns[0])
