@@ -127,7 +127,7 @@ def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:
 class Posterior(NamedTuple):
     """The posterior of c candidates."""
 
-    theta: Float[Array, "c p"]  # the parameters, to first order
+    theta: Float[Array, "c p"]  # to first order
     probability: Float[Array, " c"]  # of each change
     naive: Float[Array, " c"]  # the same probability if the source had no errors
     taken: Int[Array, ""]  # index of the chosen candidate
@@ -227,12 +227,15 @@ def left_out_thetas(found: Fit, free: Bool[Array, " p"], sizes, start, blocks) -
 
 
 def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) -> Bool[Array, ""]:
-    """Whether a change lowers the mean error of blocks that were left out by more than `SURELY` standard errors.
+    """Whether a change lowers the logarithm of the error of blocks left out by more than `SURELY` standard errors.
 
-    Evidence assumes independent errors; where physics lacks something they are not. See `left_out_thetas`.
+    Evidence assumes independent errors; where physics lacks something they are not. The logarithm is the likelihood of
+    a block of unknown variance, in which no block outweighs the others. See `left_out_thetas`.
     """
     after = jax.vmap(lambda theta, place: found.at(theta).square[place])(thetas, blocks[0])
-    gain = jnp.sum((still.equations.square[blocks[0]] - after) * blocks[1], axis=1)
+    before, after = (jnp.sum(square * blocks[1], axis=1) for square in (still.equations.square[blocks[0]], after))
+    least = jnp.maximum(jnp.finfo(before.dtype).eps * before, TINY)
+    gain = jnp.log(jnp.maximum(before, least)) - jnp.log(jnp.maximum(after, least))
     return jnp.array(True) if len(gain) < ENOUGH else _surely_positive(gain)
 
 
