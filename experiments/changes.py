@@ -31,10 +31,10 @@ from experiments.runner.run_record import record_of
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate
-from hybrid_jax.adaptation.expectation import expected_errors
+from hybrid_jax.adaptation.expectation import errors_at_ends, expected_errors
 from hybrid_jax.adaptation.methods import scale_of
 from hybrid_jax.adaptation.plausible import extended
-from hybrid_jax.adaptation.selection import BLOCKS, alike, blocks_of, errors_at_ends, fit_each
+from hybrid_jax.adaptation.selection import BLOCKS, alike, blocks_of, fit_each
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.io.datasets import Dataset

@@ -23,6 +23,7 @@ from hybrid_jax.adaptation.anchored import (
     with_change,
     without_network,
 )
+from hybrid_jax.adaptation.expectation import errors_at_ends
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, extended, groups_of, names_of
 from hybrid_jax.adaptation.results import NETWORK
@@ -34,7 +35,6 @@ from hybrid_jax.adaptation.selection import (
     Unchanged,
     alike,
     blocks_of,
-    errors_at_ends,
     fit_each,
     left_out_thetas,
     posterior,

@@ -1,15 +1,23 @@
-"""Estimate the error on an unseen flight from blocks of windows that were left out of the fit."""
+"""The error on an unseen flight, from blocks of windows that were left out of the fit."""
 
 import warnings
 from collections.abc import Mapping
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy  # not scipy.stats, which takes half a second to import
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
+from hybrid_jax.adaptation.selection import blocks_of
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.estimation.least_squares import Solver
+from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.state_space import StateSpace
+from hybrid_jax.trajectories import Trajectories, errors_of
 
 LEVEL = 0.8
+JOINED = 10  # windows that touch, at most so many, are predicted as one
 ALIKE = 2  # so many blocks of one flight count as one: neighbours are alike, and another flight differs more
 Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
 
@@ -52,3 +60,40 @@ def lines_of(expected: Expected, units: Mapping[str, str]) -> list[str]:
         f"  after {horizon}: {', '.join(text(name, *errors) for name, errors in found.items())}"
         for horizon, found in expected.items()
     ]
+
+
+def errors_at_ends(
+    field: AbstractVectorField, block: Trajectories, counted: Bool[Array, " m"], solver: Solver = None
+) -> Float[Array, "2 d"]:
+    """Return the mean squared error of each state at the end of single windows and of joined windows.
+
+    It is NaN for a state that was not measured at any of these ends.
+    """
+
+    def one(carry, item):
+        end, recorded = carry
+        window, counted, i = item
+        touches = counted & jnp.all(window.x0 == recorded) & (i % JOINED > 0)
+        begin = jnp.stack([window.x0, jnp.where(touches, end, window.x0)])
+        alone, joined = jax.vmap(lambda x0: rollout(field, x0, window.u, block.dt, compact(solver))[-1])(begin)
+        square = jnp.square(errors_of(jnp.stack([alone, joined]), window.x[-1]))
+        return (joined, window.x[-1]), (jnp.where(jnp.isnan(square), jnp.inf, square), touches)
+
+    nowhere = jnp.full_like(block.x0[0], jnp.nan)  # touches nothing
+    _, (ends, touches) = jax.lax.scan(one, (nowhere, nowhere), (block, counted, jnp.arange(len(counted))))
+    last = counted & ~jnp.roll(touches, -1).at[-1].set(False)  # windows after which no other goes on
+    weights = jnp.stack([counted, last], axis=1)[..., None] & ~jnp.isnan(block.x[:, -1:])
+    return jnp.sum(jnp.where(weights, ends, 0), axis=0) / jnp.sum(weights, axis=0)
+
+
+def longest_chain(windows: Trajectories, blocks: int) -> int:
+    """Return the most adjacent windows that are joined."""
+    x0, x, longest = np.asarray(windows.x0), np.asarray(windows.x), 1
+    for places, counted in zip(*blocks_of(len(windows), blocks), strict=True):
+        own = places[counted]
+        touches = (x0[own[1:]] == x[own[:-1], -1]).all(axis=1)
+        length = 1
+        for i, touch in enumerate(touches, 1):
+            length = length + 1 if touch and i % JOINED else 1
+            longest = max(longest, length)
+    return longest

@@ -22,8 +22,7 @@ from hybrid_jax.estimation.normal_equations import (
     steps_without,
 )
 from hybrid_jax.estimation.starts import Starts, from_starts, smoothed
-from hybrid_jax.integrate import compact, rollout
-from hybrid_jax.trajectories import RANGE, Trajectories, errors_of
+from hybrid_jax.trajectories import RANGE, Trajectories
 
 BLOCKS = 10
 CLUSTERS = 5  # of windows of one flight, for intervals: in gusts, errors a second apart are still correlated
@@ -32,7 +31,6 @@ SHIFTS = 20  # other windows that each is compared with
 SURELY = 2.0  # standard errors by which one model must predict better to replace another
 ENOUGH = 5  # blocks, to know a standard error
 STRONG = 20.0  # odds against no change from which one is believed (Kass and Raftery 1995)
-JOINED = 10  # windows that touch, at most so many, are predicted as one
 TINY = float(np.finfo(np.float32).tiny)
 
 
@@ -178,8 +176,9 @@ def dispersion(found: Fit, sizes) -> Float[Array, ""]:
     score = jnp.sum(found.equations.score[places] * counted[..., None], axis=1)
     total = jnp.sum(found.equations.gram, axis=0)
     # A parameter of unit effect; what is not identifiable stays at the source.
-    unit = 1 / jnp.sqrt(jnp.diagonal(total) + found.noise / jnp.square(sizes))
-    held = unit[:, None] * (total + jnp.diag(found.noise / jnp.square(sizes))) * unit
+    prior = found.noise / jnp.square(sizes)
+    unit = 1 / jnp.sqrt(jnp.diagonal(total) + prior)
+    held = unit[:, None] * (total + jnp.diag(prior)) * unit
     matrix = inverse(held).matrix
     spread = jnp.einsum("bp,pq,bq->", score * unit, matrix, score * unit) * len(places) / max(len(places) - 1, 1)
     return jnp.maximum(spread / jnp.maximum(jnp.sum(matrix * unit[:, None] * total * unit), TINY), found.noise)
@@ -235,36 +234,12 @@ def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) ->
     after = jax.vmap(lambda theta, place: found.at(theta).square[place])(thetas, blocks[0])
     before, after = (jnp.sum(square * blocks[1], axis=1) for square in (still.equations.square[blocks[0]], after))
     least = jnp.maximum(jnp.finfo(before.dtype).eps * before, TINY)
-    gain = jnp.log(jnp.maximum(before, least)) - jnp.log(jnp.maximum(after, least))
-    return jnp.array(True) if len(gain) < ENOUGH else _surely_positive(gain)
+    gain = jnp.log(jnp.maximum(before, least) / jnp.maximum(after, least))
+    return _surely_positive(gain) if len(gain) >= ENOUGH else jnp.array(True)
 
 
 def _surely_positive(gain: Float[Array, " n"]) -> Bool[Array, ""]:
-    return jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / jnp.sqrt(len(gain))
-
-
-def errors_at_ends(
-    field: AbstractVectorField, block: Trajectories, counted: Bool[Array, " m"], solver: Solver = None
-) -> Float[Array, "2 d"]:
-    """Return the mean squared error of each state at the end of single windows and of joined windows.
-
-    It is NaN for a state that was not measured at any of these ends.
-    """
-
-    def one(carry, item):
-        end, recorded = carry
-        window, counted, i = item
-        touches = counted & jnp.all(window.x0 == recorded) & (i % JOINED > 0)
-        begin = jnp.stack([window.x0, jnp.where(touches, end, window.x0)])
-        alone, joined = jax.vmap(lambda x0: rollout(field, x0, window.u, block.dt, compact(solver))[-1])(begin)
-        square = jnp.square(errors_of(jnp.stack([alone, joined]), window.x[-1]))
-        return (joined, window.x[-1]), (jnp.where(jnp.isnan(square), jnp.inf, square), touches)
-
-    nowhere = jnp.full_like(block.x0[0], jnp.nan)  # touches nothing
-    _, (ends, touches) = jax.lax.scan(one, (nowhere, nowhere), (block, counted, jnp.arange(len(counted))))
-    last = counted & ~jnp.roll(touches, -1).at[-1].set(False)  # windows after which no other goes on
-    weights = jnp.stack([counted, last], axis=1)[..., None] & ~jnp.isnan(block.x[:, -1:])
-    return jnp.sum(jnp.where(weights, ends, 0), axis=0) / jnp.sum(weights, axis=0)
+    return jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / len(gain) ** 0.5
 
 
 def correlated(windows: Trajectories) -> int:
@@ -288,16 +263,3 @@ def _follow(starts: Float[np.ndarray, "n d"], ends: Float[np.ndarray, "n d"]) ->
 
 def overlap(windows: Trajectories) -> bool:
     return bool((np.asarray(windows.x0)[1:, None] == np.asarray(windows.x)[:-1, :-1]).all(axis=-1).any())
-
-
-def longest_chain(windows: Trajectories, blocks: int) -> int:
-    """Return the most adjacent windows that are joined."""
-    x0, x, longest = np.asarray(windows.x0), np.asarray(windows.x), 1
-    for places, counted in zip(*blocks_of(len(windows), blocks), strict=True):
-        own = places[counted]
-        touches = (x0[own[1:]] == x[own[:-1], -1]).all(axis=1)
-        length = 1
-        for i, touch in enumerate(touches, 1):
-            length = length + 1 if touch and i % JOINED else 1
-            longest = max(longest, length)
-    return longest

@@ -8,8 +8,7 @@ import pytest
 from pendulum import LENGTH, flown, hybrid, pendulum, swings
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.expectation import expected_errors, lines_of
-from hybrid_jax.adaptation.selection import errors_at_ends, longest_chain
+from hybrid_jax.adaptation.expectation import errors_at_ends, expected_errors, lines_of, longest_chain
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.state_space import StateSpace
