@@ -48,7 +48,7 @@ class LeastSquaresFit(eqx.Module):
         steps: the number of evaluations of the residuals and their Jacobian.
         status: how the fit ended.
         discretisation: by how many standard errors half the solver's step would change a parameter at most; 0 if
-            surely by less than 0.5, and -1 under `jit`, where this is not computed.
+            surely by less than 0.5, or if predictions change by rounding only; -1 under `jit`, where it is unknown.
     """
 
     field: AbstractVectorField
@@ -118,7 +118,7 @@ def discretisation(field: AbstractVectorField, windows: Trajectories, solver: So
     measured, parts = ~np.isnan(some.x), (halved[:, 1::2] - errors, errors, some.x - some.x0[:, None])
     change, errors, moved = (np.where(measured, each / (1 if scale is None else scale), 0) for each in parts)
     noise = (np.linalg.norm(errors) + FINE * np.linalg.norm(moved)) / (measured.sum() * n / len(some)) ** 0.5
-    if np.linalg.norm(change) <= COARSE * noise:
+    if np.linalg.norm(change) <= max(COARSE * noise, 2 * rounding(some, scale)):  # of both predictions
         return 0.0
     return float(_standard_errors(field, some, solver, scale, change)) / noise
 
