@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from hybrid_jax.cli import page
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.help import RARE
+from hybrid_jax.dynamics import DisturbanceModel
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.dynamics.rigid_body import hold_corrections
 from hybrid_jax.estimation.uncertainty import named_parameters
@@ -89,7 +90,8 @@ def run(options: Options) -> int:
     lines = [HEADER, *(",".join(f"{number:.5g}" for number in row) for row in points)]
     write_atomic(options.output, ("\n".join(lines) + "\n").encode())
     values = {name: float(value) for name, value in named_parameters(field).items()}
-    said = [CHANGING] * (planned is not field) + [str(each.message).removeprefix("excitation: ") for each in caught]
+    said = [CHANGING] * isinstance(model.field, DisturbanceModel)
+    said += [str(each.message).removeprefix("excitation: ") for each in caught]
     told = {"standard_errors": found.standard_errors, "margins": found.margins, "set_points": options.output}
     page.write(options.out, "plan", _page(options, found, points, values, field.parameter_units, said), told)
     return 0
