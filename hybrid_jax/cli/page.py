@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from hybrid_jax.cli.command import printable
 from hybrid_jax.io.files import json_text, json_value, write_atomic
 
-WIDTH = 80  # columns
+WIDTH, ROWS = 80, 5  # columns and rows on a terminal
 FORMAT = 1  # of report.json
 STYLE: dict[Any, Any] = {"axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.3}
 # Okabe and Ito's colours, which colour-blind readers can distinguish.
@@ -64,11 +64,12 @@ def counted(several: Sized, what: str) -> str:
 
 
 def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
-    """Write report.html and report.json (`found`, for programs) into a folder, and print where they are."""
+    """Write report.html and report.json (`found`, for programs) into a folder; print the answer and where they are."""
     record = {"format": FORMAT, "verb": verb, "answer": page.answer, "notes": list(page.notes)} | found
     write_atomic(out / "report.json", json_text(json_value(record)).encode())
     write_atomic(out / "report.html", document(page).encode())
-    lines = page.answer, *(f"- {line}" for line in (*page.meaning, *page.todo)), f"page: {out / 'report.html'}"
+    rows = _rows(page.table) if page.table and verb != "inspect" else []  # `inspect` has printed its lines
+    lines = page.answer, *rows, *(f"- {line}" for line in (*page.meaning, *page.todo)), f"page: {out / 'report.html'}"
     for line in lines:
         say(line)
 
@@ -77,6 +78,16 @@ def say(line: str) -> None:
     """Print a line, on a terminal in whole words of `WIDTH` columns."""
     line = printable(line)
     print(textwrap.fill(line, WIDTH, subsequent_indent="  ") if sys.stdout.isatty() else line)
+
+
+def _rows(table: Table) -> list[str]:
+    """Return a table's title, header and first rows in columns, as many as a terminal has room for."""
+    rows = [table.header, *table.lines[:ROWS]]
+    widths = [max(len(str(cell)) for cell in column) + 2 for column in zip(*rows, strict=True)]
+    while sum(widths) > WIDTH - 2:
+        widths.pop()
+    texts = ("".join(f"{cell!s:{width}}" for cell, width in zip(row, widths, strict=False)) for row in rows)
+    return [f"{table.title}:", *(f"  {text.rstrip()}" for text in texts)]
 
 
 def document(page: Page) -> str:
