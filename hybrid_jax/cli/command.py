@@ -9,7 +9,9 @@ import re
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from itertools import takewhile
 from typing import Any, TypeVar, cast, get_type_hints
@@ -148,6 +150,7 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a letter ends no run
         setattr(sys, name, stream)
+    before, warnings.showwarning = warnings.showwarning, partial(_warn, program)
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
@@ -161,9 +164,16 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
         lines, code = [interrupted], 128 + (stop.args[0] if stop.args else signal.SIGINT)
     else:
         return
+    finally:
+        warnings.showwarning = before
     for line in lines:
         print(f"{program}:", "\n".join(map(printable, line.split("\n"))), file=sys.stderr)
     sys.exit(code)
+
+
+def _warn(program: str, message: Warning | str, *_: Any) -> None:
+    """Print a warning as one line for the user, without the place in the library where it was raised."""
+    print(f"{program}: warning:", printable(" ".join(str(message).split())), file=sys.stderr)
 
 
 def printable(text: str) -> str:
