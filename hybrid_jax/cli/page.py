@@ -2,6 +2,7 @@
 
 import base64
 import io
+import re
 import sys
 import textwrap
 from collections.abc import Sequence, Sized
@@ -29,7 +30,7 @@ h1, p { overflow-wrap: anywhere }
 .scroll { overflow-x: auto } table { border-collapse: collapse; font-size: .9rem }
 td, th { padding: .25rem .6rem; text-align: left; border-bottom: 1px solid #ddd; vertical-align: top }
 @media (max-width: 30rem) { body { padding: .5rem } table { font-size: .8rem } td, th { padding: .25rem .3rem } }
-figure { margin: 1rem 0 } img { max-width: 100% } figcaption { font-size: .9rem; color: #555 }
+figure { margin: 1rem 0 } img { max-width: min(100%, 40rem) } figcaption { font-size: .9rem; color: #555 }
 details { margin: .5rem 0 } summary { cursor: pointer } li { overflow-wrap: anywhere }
 @media (prefers-color-scheme: dark) { body { background: #161616; color: #e6e6e6 } td, th { border-color: #444 }
 img { filter: invert(1) hue-rotate(180deg); mix-blend-mode: screen } figcaption { color: #aaa } }
@@ -125,7 +126,8 @@ def _table(table: Table) -> str:
 
 
 def _list(lines: Sequence[str]) -> str:
-    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+    items = (re.sub("`([^`]*)`", r"<code>\1</code>", escape(line)) for line in lines)
+    return f"<ul>{''.join(f'<li>{item}</li>' for item in items)}</ul>"
 
 
 def _folded(title: str, content: str) -> str:
