@@ -31,9 +31,9 @@ class Call(NamedTuple):
         return self.run("forward", [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes], *arrays)
 
     def run(self, way: str, results: list, *arrays: Array) -> Sequence[Array]:
-        """Call the kernel on arrays, which it does not check; `vmap` makes one call."""
+        """Call the kernel on arrays, which it does not check; `vmap` calls it for each lane in turn."""
         numbers = np.array([self.dt, self.kernel.epsilon, self.windows], np.float32)
-        call = jax.ffi.ffi_call(f"hybrid_jax_{way}", results, vmap_method="broadcast_all")
+        call = jax.ffi.ffi_call(f"hybrid_jax_{way}", results, vmap_method="sequential")
         return call(*arrays, kernel=self.kernel.name, numbers=numbers)
 
 

@@ -18,29 +18,6 @@ constexpr int UNITS = 16;  // of the layer at a time
 constexpr int64_t SLOTS = 28;  // of factors, which wait for their products: those of a step of a hundred windows
 constexpr int64_t U = H ? H | 1 : 0;  // vectors from one n to the next: an even number may put all into the same lines of the cache
 
-// A lane of a call of XLA: the lanes of a sweep are the first axes of all arrays. These are in single precision, and the
-// caller in Python keeps to number and shapes. By the interface in C: GCC takes longer for the other than for the kernels.
-struct Call {
-  const XLA_FFI_CallFrame* frame;
-  int64_t lane = 0, lanes = 1;
-  const float* numbers = static_cast<const float*>(static_cast<const XLA_FFI_Array*>(frame->attrs.attrs[1])->data);
-
-  int64_t size(int i, int64_t axis) const {  // of an argument; the last axis is −1
-    auto* array = static_cast<const XLA_FFI_Buffer*>(frame->args.args[i]);
-    return array->dims[array->rank + axis];
-  }
-  static int64_t count(const void* array) {
-    int64_t n = 1, *dims = static_cast<const XLA_FFI_Buffer*>(array)->dims;
-    for (int64_t i = static_cast<const XLA_FFI_Buffer*>(array)->rank; i--;) n *= dims[i];
-    return n;
-  }
-  float* part(const void* array) const {
-    return static_cast<float*>(static_cast<const XLA_FFI_Buffer*>(array)->data) + lane * (count(array) / lanes);
-  }
-  float* argument(int i) const { return part(frame->args.args[i]); }
-  float* result(int i) const { return part(frame->rets.rets[i]); }
-};
-
 // Arguments: the weights, x0 (d, b) and u (t, m, b), on the way back also those of the kernels there, what was kept, and
 // the derivatives with respect to the states.
 enum Argument { WEIGHTS, X0, INPUTS, BACK, KEPT, D_STATES };
@@ -53,18 +30,28 @@ INLINE void scatter(const Vec* from, int64_t rows, int64_t b, float* to) {
   for (int64_t r = 0; r < rows; ++r) store(to + r * b, from[r]);
 }
 
+// A call of XLA with arrays in single precision; the caller in Python keeps to number and shapes. By the interface in C:
+// GCC takes longer for the other than for the kernels.
+INLINE const XLA_FFI_Buffer& array(const void* of) { return *static_cast<const XLA_FFI_Buffer*>(of); }
+INLINE float* data(const void* of) { return static_cast<float*>(array(of).data); }
+
 // b windows of `steps` intervals, of which `own` are no copies that fill the last vector, and what is kept of each
 // evaluation for the way back, or nothing: x, h and q.
-struct Lane {
-  const Call& call;
+struct Windows {
+  const XLA_FFI_CallFrame* call;
   Vec* kept;
-  const int64_t steps = call.size(INPUTS, -3), b = call.size(INPUTS, -1), blocks = b / V, own = int64_t(call.numbers[2]);
+  float* argument(int i) const { return data(call->args.args[i]); }
+  float* result(int i) const { return data(call->rets.rets[i]); }
+
+  const float* numbers = static_cast<const float*>(static_cast<const XLA_FFI_Array*>(call->attrs.attrs[1])->data);
+  const int64_t* shape = array(call->args.args[INPUTS]).dims;
+  const int64_t steps = shape[0], b = shape[2], blocks = b / V, own = int64_t(numbers[2]);
   const int64_t group = H ? blocks : 1, n = group * D;  // vectors of windows, and of their states
   const int64_t size = group * (D + U) + (H + V - 1) / V;  // of what is kept of an evaluation
   // What each stage's slope counts for in the step, and how far along it the next point lies.
-  const float dt = call.numbers[0], share[STAGES] = {dt / 6, dt / 3, dt / 3, dt / 6}, ahead[STAGES] = {dt / 2, dt / 2, dt, 0};
-  const float epsilon = call.numbers[1], *w = call.argument(WEIGHTS);
-  float *x0 = call.argument(X0), *u = call.argument(INPUTS);
+  const float dt = numbers[0], share[STAGES] = {dt / 6, dt / 3, dt / 3, dt / 6}, ahead[STAGES] = {dt / 2, dt / 2, dt, 0};
+  const float epsilon = numbers[1], *w = argument(WEIGHTS);
+  float *x0 = argument(X0), *u = argument(INPUTS);
   mutable Room room{};
 
   Vec* point(int64_t first, int64_t t, int stage) const { return kept + ((first * steps + t) * STAGES + stage) * size; }
@@ -80,43 +67,43 @@ struct Through {
   INLINE Vec operator[](int64_t i) const { return dh[i] = scale[i] * dn[i] + through_q[i] * h[i]; }
 };
 
-// The layer that couples all windows of a lane: z less its mean, n of a block of windows, and the derivatives. z and the
+// The layer that couples all windows: z less its mean, n of a block of windows, and the derivatives. z and the
 // derivatives with respect to h wait for their products until a step's stages are done.
 struct Coupling {
-  const Lane& lane;
-  const int64_t blocks = lane.group;
-  Vec *zs = lane.room(STAGES * blocks * Z), *dhs = lane.room(STAGES * blocks * U), *dn = lane.room(blocks * U), *dz = lane.room(blocks * Z);
-  float *scale = reinterpret_cast<float*>(lane.room(U)), *through_q = reinterpret_cast<float*>(lane.room(U));
+  const Windows& all;
+  const int64_t blocks = all.group;
+  Vec *zs = all.room(STAGES * blocks * Z), *dhs = all.room(STAGES * blocks * U), *dn = all.room(blocks * U), *dz = all.room(blocks * Z);
+  float *scale = reinterpret_cast<float*>(all.room(U)), *through_q = reinterpret_cast<float*>(all.room(U));
 
   void centre(Vec* z) const {
     in_tiles<Z, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
-      Vec all[R] = {};
+      Vec total[R] = {};
       for (int64_t j = 0; j < blocks; ++j)
-        UNROLL for (int r = 0; r < R; ++r) all[r] += z[j * Z + i + r] = first(z[j * Z + i + r], lane.own - j * V);
-      UNROLL for (int r = 0; r < R; ++r) all[r] = wide(sum(all[r]) / float(lane.own));
+        UNROLL for (int r = 0; r < R; ++r) total[r] += z[j * Z + i + r] = first(z[j * Z + i + r], all.own - j * V);
+      UNROLL for (int r = 0; r < R; ++r) total[r] = wide(sum(total[r]) / float(all.own));
       for (int64_t j = 0; j < blocks; ++j)
-        UNROLL for (int r = 0; r < R; ++r) z[j * Z + i + r] = first(z[j * Z + i + r] - all[r], lane.own - j * V);
+        UNROLL for (int r = 0; r < R; ++r) z[j * Z + i + r] = first(z[j * Z + i + r] - total[r], all.own - j * V);
     });
   }
   // z, and unless these are known h and q, some units at a time, so that these stay in the first cache.
   void evaluate(int stage, const Vec* x, const Vec* u, Vec* h, float* q, bool known) const {
     Vec* z = zs + stage * blocks * Z;
-    for (int64_t j = 0; j < blocks; ++j) read(lane.w, x + j * D, u + j * M, z + j * Z);
+    for (int64_t j = 0; j < blocks; ++j) read(all.w, x + j * D, u + j * M, z + j * Z);
     centre(z);
     if (!known) in_tiles<H, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
       Vec squares[R] = {};
       for (int64_t j = 0; j < blocks; ++j) {
         Vec* block = h + j * U + i;
-        dense<R, Z>(lane.w + WEIGHT + i * Z, Z, 1, z + j * Z, block);
+        dense<R, Z>(all.w + WEIGHT + i * Z, Z, 1, z + j * Z, block);
         UNROLL for (int r = 0; r < R; ++r) squares[r] += block[r] * block[r];
       }
-      UNROLL for (int r = 0; r < R; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(lane.own) + lane.epsilon);
+      UNROLL for (int r = 0; r < R; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(all.own) + all.epsilon);
     });
-    for (int i = 0; i < H; ++i) scale[i] = lane.w[GAIN + i] * q[i];
+    for (int i = 0; i < H; ++i) scale[i] = all.w[GAIN + i] * q[i];
   }
-  Normal normal(const Vec* h) const { return {scale, lane.w + SHIFT, h}; }
+  Normal normal(const Vec* h) const { return {scale, all.w + SHIFT, h}; }
   // From dn to the derivatives with respect to h and z; adds those with respect to γ and β, of some units at a time.
   void back(int stage, const Vec* h, const float* q, Vec* sums) const {
     Vec* dh = dhs + stage * blocks * U;
@@ -127,35 +114,38 @@ struct Coupling {
         UNROLL for (int r = 0; r < R; ++r) by_scale[r] += dn[j * U + i + r] * h[j * U + i + r], by_shift[r] += dn[j * U + i + r];
       UNROLL for (int r = 0; r < R; ++r) {
         sums[GAIN + i + r] += q[i + r] * by_scale[r], sums[SHIFT + i + r] += by_shift[r];
-        through_q[i + r] = -scale[i + r] * q[i + r] * q[i + r] * sum(by_scale[r]) / float(lane.own);
+        through_q[i + r] = -scale[i + r] * q[i + r] * q[i + r] * sum(by_scale[r]) / float(all.own);
       }
     });
     for (int64_t j = 0; j < blocks; ++j)
-      dense<Z, H>(lane.w + WEIGHT, 1, Z, Through{scale, through_q, dn + j * U, h + j * U, dh + j * U}, dz + j * Z);
+      dense<Z, H>(all.w + WEIGHT, 1, Z, Through{scale, through_q, dn + j * U, h + j * U, dh + j * U}, dz + j * Z);
     centre(dz);
   }
 };
 
+}  // namespace
+
 // Results: the states and what is kept, of no size if nothing is.
-void forward_lane(const Call& call) {
-  const Lane lane{call, Call::count(call.frame->rets.rets[1]) ? vectors(call.result(1)) : nullptr};
-  const int64_t group = lane.group, n = lane.n, b = lane.b;
-  Vec *x = lane.room(n), *slopes = lane.room(n), *total = lane.room(n), *u = lane.room(group * M), *passing = lane.room(lane.size);
-  const Coupling coupling{lane};
-  for (int64_t first = 0; first < lane.blocks; first += group) {
-    for (int64_t j = 0; j < group; ++j) gather(lane.x0 + (first + j) * V, D, b, x + j * D);
-    for (int64_t t = 0; t < lane.steps; ++t) {
-      for (int64_t j = 0; j < group; ++j) gather(lane.u + t * M * b + (first + j) * V, M, b, u + j * M);
+extern "C" void forward(const XLA_FFI_CallFrame* call) {
+  const void* kept = call->rets.rets[1];
+  const Windows all{call, array(kept).dims[0] ? vectors(data(kept)) : nullptr};
+  const int64_t group = all.group, n = all.n, b = all.b;
+  Vec *x = all.room(n), *slopes = all.room(n), *total = all.room(n), *u = all.room(group * M), *passing = all.room(all.size);
+  const Coupling coupling{all};
+  for (int64_t first = 0; first < all.blocks; first += group) {
+    for (int64_t j = 0; j < group; ++j) gather(all.x0 + (first + j) * V, D, b, x + j * D);
+    for (int64_t t = 0; t < all.steps; ++t) {
+      for (int64_t j = 0; j < group; ++j) gather(all.u + t * M * b + (first + j) * V, M, b, u + j * M);
       for (int stage = 0; stage < STAGES; ++stage) {
-        Vec *point = lane.kept ? lane.point(first, t, stage) : passing, *h = lane.h(point);
-        for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + lane.ahead[stage - 1] * slopes[i] : x[i];
-        if (H) coupling.evaluate(0, point, u, h, lane.q(point), false);
+        Vec *point = all.kept ? all.point(first, t, stage) : passing, *h = all.h(point);
+        for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + all.ahead[stage - 1] * slopes[i] : x[i];
+        if (H) coupling.evaluate(0, point, u, h, all.q(point), false);
         for (int64_t j = 0; j < group; ++j)
-          slope(lane.w, point + j * D, u + j * M, coupling.normal(h + j * U), slopes + j * D);
-        for (int64_t i = 0; i < n; ++i) total[i] = (stage ? total[i] : x[i]) + lane.share[stage] * slopes[i];
+          slope(all.w, point + j * D, u + j * M, coupling.normal(h + j * U), slopes + j * D);
+        for (int64_t i = 0; i < n; ++i) total[i] = (stage ? total[i] : x[i]) + all.share[stage] * slopes[i];
       }
       std::swap(x, total);
-      for (int64_t j = 0; j < group; ++j) scatter(x + j * D, D, b, call.result(0) + t * D * b + (first + j) * V);
+      for (int64_t j = 0; j < group; ++j) scatter(x + j * D, D, b, all.result(0) + t * D * b + (first + j) * V);
     }
   }
 }
@@ -163,35 +153,35 @@ void forward_lane(const Call& call) {
 #if TRAINING
 // Results: the derivatives with respect to the weights, x0 and u. Those with respect to weights are summed over windows
 // within each place of a vector; their factors wait in slots for the products.
-void backward_lane(const Call& call) {
-  const Lane lane{call, vectors(call.argument(KEPT))};
-  const int64_t group = lane.group, n = lane.n, b = lane.b;
-  const float *back = call.argument(BACK), *d_states = call.argument(D_STATES);
-  float *d_x0 = call.result(X0), *d_u = call.result(INPUTS);
-  Vec *dx = lane.room(n), *next = lane.room(n), *d_slope = lane.room(n), *d_point = lane.room(n);
-  Vec *u = lane.room(group * M), *du = lane.room(group * M), *more = lane.room(D), *more_u = lane.room(M);
-  Vec *sums = lane.room(P), *factors = lane.room(F * SLOTS);
+extern "C" void backward(const XLA_FFI_CallFrame* call) {
+  const Windows all{call, vectors(data(call->args.args[KEPT]))};
+  const int64_t group = all.group, n = all.n, b = all.b;
+  const float *back = all.argument(BACK), *d_states = all.argument(D_STATES);
+  float *d_x0 = all.result(X0), *d_u = all.result(INPUTS);
+  Vec *dx = all.room(n), *next = all.room(n), *d_slope = all.room(n), *d_point = all.room(n);
+  Vec *u = all.room(group * M), *du = all.room(group * M), *more = all.room(D), *more_u = all.room(M);
+  Vec *sums = all.room(P), *factors = all.room(F * SLOTS);
   int64_t used = 0;
-  const Coupling c{lane};
+  const Coupling c{all};
   std::fill_n(sums, P, Vec{});
-  for (int64_t first = 0; first < lane.blocks; first += group) {
+  for (int64_t first = 0; first < all.blocks; first += group) {
     std::fill_n(dx, n, Vec{});
-    for (int64_t t = lane.steps; t--;) {
+    for (int64_t t = all.steps; t--;) {
       for (int64_t j = 0; j < group; ++j) {
-        gather(lane.u + t * M * b + (first + j) * V, M, b, u + j * M), gather(d_states + t * D * b + (first + j) * V, D, b, more);
+        gather(all.u + t * M * b + (first + j) * V, M, b, u + j * M), gather(d_states + t * D * b + (first + j) * V, D, b, more);
         for (int i = 0; i < D; ++i) dx[j * D + i] += more[i];
       }
       std::copy_n(dx, n, next), std::fill_n(du, group * M, Vec{});
       for (int stage = STAGES; stage--;) {
-        Vec *point = lane.point(first, t, stage), *h = lane.h(point);
-        for (int64_t i = 0; i < n; ++i) d_slope[i] = lane.share[stage] * next[i] + (stage < STAGES - 1 ? lane.ahead[stage] * d_point[i] : Vec{});
-        if (H) c.evaluate(stage, point, u, h, lane.q(point), true);
+        Vec *point = all.point(first, t, stage), *h = all.h(point);
+        for (int64_t i = 0; i < n; ++i) d_slope[i] = all.share[stage] * next[i] + (stage < STAGES - 1 ? all.ahead[stage] * d_point[i] : Vec{});
+        if (H) c.evaluate(stage, point, u, h, all.q(point), true);
         for (int64_t j = 0; j < group; ++j) {
           if (used == SLOTS) products(sums, factors, used), used = 0;
           slope_back(back, point + j * D, u + j * M, c.normal(h + j * U), d_slope + j * D, d_point + j * D, more_u, c.dn + j * U, sums, factors + F * used++);
           for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
         }
-        if (H) c.back(stage, h, lane.q(point), sums);
+        if (H) c.back(stage, h, all.q(point), sums);
         for (int64_t j = 0; j < group && H; ++j) {
           read_back(back, point + j * D, u + j * M, c.dz + j * Z, more, more_u, sums);
           for (int i = 0; i < D; ++i) d_point[j * D + i] += more[i];
@@ -205,18 +195,6 @@ void backward_lane(const Call& call) {
     for (int64_t j = 0; j < group; ++j) scatter(dx + j * D, D, b, d_x0 + (first + j) * V);
   }
   products(sums, factors, used);
-  for (int64_t i = 0; i < P; ++i) call.result(WEIGHTS)[i] = sum(sums[i]);
+  for (int64_t i = 0; i < P; ++i) all.result(WEIGHTS)[i] = sum(sums[i]);
 }
-#endif
-
-void each_lane(const XLA_FFI_CallFrame* frame, void (*run)(const Call&)) {
-  const int64_t lanes = Call::count(frame->args.args[X0]) / (D * Call{frame}.size(X0, -1));
-  for (int64_t lane = 0; lane < lanes; ++lane) run({frame, lane, lanes});
-}
-
-}  // namespace
-
-extern "C" void forward(const XLA_FFI_CallFrame* frame) { each_lane(frame, forward_lane); }
-#if TRAINING
-extern "C" void backward(const XLA_FFI_CallFrame* frame) { each_lane(frame, backward_lane); }
 #endif

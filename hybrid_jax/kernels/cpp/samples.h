@@ -31,36 +31,28 @@ EXTREME(larger, >) EXTREME(smaller, <)
 
 // Of glibc's library of vectors, within four units in the last place; and number by number.
 #if V == 16
-#define OF_VECTORS(NAME) _ZGVeN16v_##NAME
-#define OF_PAIRS(NAME) _ZGVeN16vv_##NAME
+#define OF_GLIBC "_ZGVeN16"
 #else
-#define OF_VECTORS(NAME) _ZGVdN8v_##NAME
-#define OF_PAIRS(NAME) _ZGVdN8vv_##NAME
+#define OF_GLIBC "_ZGVdN8"
 #endif
 typedef float Whole __attribute__((vector_size(4 * V)));
-#define OF_ONE(NAME)                                 \
-  extern "C" Whole OF_VECTORS(NAME)(Whole);          \
-  template <class A> INLINE Vec NAME(A a) { return OF_VECTORS(NAME)(wide(a)); }
-#define OF_TWO(NAME)                                 \
-  extern "C" Whole OF_PAIRS(NAME)(Whole, Whole);     \
-  template <class A, class B> INLINE Vec NAME(A a, B b) { return OF_PAIRS(NAME)(wide(a), wide(b)); }
-#define EACH(NAME, OF)                               \
-  template <class A> INLINE Vec NAME(A a) {          \
-    float each[V];                                   \
-    store(each, wide(a));                            \
-    for (int j = 0; j < V; ++j) each[j] = OF(each[j]); \
-    return load(each);                               \
+#define OF_VECTORS(NAME, PLACES, ...)                                                   \
+  extern "C" Whole of_##NAME(__VA_ARGS__) __asm__(OF_GLIBC PLACES "_" #NAME);           \
+  template <class... A> INLINE Vec NAME(A... a) { return of_##NAME(wide(a)...); }
+#define OF_ONE(NAME) OF_VECTORS(NAME, "v", Whole)
+#define OF_TWO(NAME) OF_VECTORS(NAME, "vv", Whole, Whole)
+#define EACH(NAME)                                                                      \
+  template <class A, class... B> INLINE Vec NAME(A a, B... b) {                         \
+    float each[V];                                                                      \
+    store(each, wide(a));                                                               \
+    for (int j = 0; j < V; ++j) each[j] = ::NAME(each[j], wide(b)[j]...);               \
+    return load(each);                                                                  \
   }
 OF_ONE(expf) OF_ONE(expm1f) OF_ONE(logf) OF_ONE(log1pf) OF_ONE(erff) OF_ONE(erfcf) OF_ONE(exp2f) OF_ONE(cbrtf)
 OF_ONE(sinf) OF_ONE(cosf) OF_ONE(tanf) OF_ONE(asinf) OF_ONE(acosf) OF_ONE(atanf)
 OF_ONE(sinhf) OF_ONE(coshf) OF_ONE(tanhf) OF_ONE(asinhf) OF_ONE(acoshf) OF_ONE(atanhf)
 OF_TWO(atan2f) OF_TWO(powf)
-EACH(sqrtf, std::sqrt) EACH(floorf, std::floor) EACH(ceilf, std::ceil) EACH(fabsf, std::fabs)
-template <class A, class B> INLINE Vec fmodf(A a, B b) {
-  Vec l = wide(a), r = wide(b);
-  for (int j = 0; j < V; ++j) l[j] = std::fmod(l[j], r[j]);
-  return l;
-}
+EACH(sqrtf) EACH(floorf) EACH(ceilf) EACH(fabsf) EACH(fmodf)
 
 // The result of batch normalisation, γ q h + β.
 struct Normal {
