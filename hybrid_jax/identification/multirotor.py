@@ -66,14 +66,11 @@ class Multirotor(eqx.Module):
         return x0, u[self.ahead :]
 
     def output(self, name, x, u):
-        if name == "rotor_speed":
-            found = self.field.field.speeds(x[: len(x) - len(PUSHED)], u)
-        else:
-            found = measure(name, self.field, x, u)
-        return found[np.array(self.axes[name])]
+        rotors = self.field.field, x[: len(x) - len(PUSHED)]
+        return measure(name, *(rotors if name == "rotor_speed" else (self.field, x)), u)[np.array(self.axes[name])]
 
     def error(self, name, predicted, y):
-        return -difference(name, y, predicted)
+        return -rotation.attitude_error(predicted, jnp.asarray(y)) if name == "attitude" else predicted - y
 
 
 def measure(
@@ -86,9 +83,3 @@ def measure(
         return field.speeds(x, u)  # pyright: ignore[reportAttributeAccessIssue]
     vector = x[VELOCITY] if quantity == "body_velocity" else field(x, u)[VELOCITY].at[2].add(gravity)
     return rotation.rotate(rotation.conjugate(rotation.normalise(x[QUATERNION])), vector)
-
-
-def difference(quantity: str, y: Float[Array | np.ndarray, " k"], predicted: Float[Array, " k"]) -> Float[Array, " e"]:
-    """y minus its prediction; for attitudes, the rotation vector between them [rad, body frame] (3)."""
-    y = jnp.asarray(y)
-    return rotation.attitude_error(predicted, y) if quantity == "attitude" else y - predicted
