@@ -1,9 +1,7 @@
-"""Minutes of hover in two worlds, then a side wind: is adapting in the air ever worse than not adapting?
+"""Minutes of hover in two worlds, then a side wind: is adapting in the air ever worse than not adapting?"""
 
-python -m experiments.online.hover [SECONDS], by default 600.
-"""
-
-import sys
+from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -13,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from experiments.flying.scenario import hardware
+from experiments.runner import command
 from experiments.worlds.rotorpy import HUMMINGBIRD, ROTORPY, advance, decide
 from experiments.worlds.world import DT, Reference
 from hybrid_jax import control
@@ -126,9 +125,17 @@ def hover(
     return jax.vmap(flight)(gusts, keys)
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Options:
+    """Is adapting in the air ever worse than not adapting? Minutes of hover in two worlds, then a side wind."""
+
+    seconds: float = 600.0
+    """Length of the hover [s]."""
+
+
+def run(options: Options) -> None:
     configure()
-    blocks = round(float(sys.argv[1] if sys.argv[1:] else 600) / DT / BLOCK)
+    blocks = round(options.seconds / DT / BLOCK)
     gusts, keys = jnp.array([0.0, 1.0]), jax.random.split(jax.random.key(7))
     print("filter, noise, world, gusts | error of v, ω over the first model's | v from 1 s after a wind |")
     print("its error is halved after [s] | alarm after [s] | largest change of Ix, Iy, k [%] |")
@@ -149,6 +156,8 @@ def main() -> None:
                 flush=True,
             )
 
+
+main = partial(command.call, "online.hover", Options, run)
 
 if __name__ == "__main__":
     main()
