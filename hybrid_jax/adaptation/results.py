@@ -147,10 +147,9 @@ class Adaptation:
             yield from (f"  {name:<{width}}  {parameter}" for name, parameter in self.parameters.items())
             told = [name for name, one in self.parameters.items() if one.has_interval and one.high < np.inf]
             effective = [name for name, one in self.parameters.items() if one.effective]
-            rest = [name for name in self.parameters if name not in told and name not in effective]
-            if rest and self.chosen is not None:
-                names = f"{', '.join(told + effective) or 'no parameter'}, and not {', '.join(rest)}"
-                yield f"These windows identify {names}; hj.excitation plans an experiment for all of them."
+            if len(told + effective) < len(self.parameters) and self.chosen is not None:
+                names = f"only {', '.join(told + effective)}" if told + effective else "no parameter"
+                yield f"These windows identify {names}; hj.excitation plans an experiment for the others."
             for reason in dict.fromkeys(self.parameters[name].effective for name in effective):
                 names = ", ".join(name for name in effective if self.parameters[name].effective == reason)
                 yield f"Effective, so without an interval: {names}: {reason}."
