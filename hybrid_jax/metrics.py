@@ -15,13 +15,7 @@ from hybrid_jax.trajectories import Trajectories, check, errors_of
 CHUNK = 1000  # windows predicted at once
 
 
-def predict(
-    field: AbstractVectorField,
-    x0: Float[Array | np.ndarray, "n d"],
-    u: Float[Array | np.ndarray, "n t m"],
-    dt: float,
-    solver: Solver | None = None,
-) -> Float[Array, "n t d"]:
+def predict(field: AbstractVectorField, x0, u, dt: float, solver: Solver | None = None) -> Float[Array, "n t d"]:
     """`rollout_batch` by the kernels where available; equal to rounding, with the same errors."""
     by_kernels = np.ndim(u) == 3 and np.shape(u)[1] <= LONG  # they do not project, see `integrate.projection`
     states = kernels.predicted(field, x0, u, dt, RK4() if solver is None else solver) if by_kernels else None
