@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, ravel_learned, state_space
 from hybrid_jax.dynamics.disturbance import physics_of
-from hybrid_jax.runtime import jit_by_size
+from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.state_space import Attitude, Quantity, StateSpace, last_measured
 from hybrid_jax.trajectories import Trajectories, check
 
@@ -78,11 +78,11 @@ def _warn_of_units(field: AbstractVectorField, space: StateSpace, windows: Traje
             warnings.warn(f"{rate}: check their units, and dt", stacklevel=3)
 
 
-@jit_by_size()
+@jit_by_size(UNOPTIMISED)
 def _slopes(field: AbstractVectorField, x: Float[Array, "n d"], u: Float[Array, "n m"]):
     """Return ẋ with these and with other parameters: what is a rate for both is one by its meaning."""
     theta, at = ravel_learned(field)
-    return jnp.stack([jax.vmap(each)(x, u) for each in (field, at(1.3 * theta + 0.1))])
+    return jax.lax.map(lambda theta: jax.vmap(at(theta))(x, u), jnp.stack([theta, 1.3 * theta + 0.1]))
 
 
 def _steps(space: StateSpace, path: Float[np.ndarray, "*n t d"]) -> Float[np.ndarray, "*n t-1 e"]:

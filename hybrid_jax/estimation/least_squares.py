@@ -111,14 +111,15 @@ def warn_of_steps(moved: float, remedy: str = REMEDY) -> None:
 
 def discretisation(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> float:
     """Return that of a fit at a field; no parameter moves by more standard errors than all predictions together."""
-    n = len(windows)
+    n, unit = len(windows), 1 if scale is None else np.asarray(scale)
     some = windows if n <= MANY else windows[np.linspace(0, n - 1, CHUNK).astype(int)]
     fine = replace(some, x=np.repeat(some.x, 2, axis=1), u=np.repeat(some.u, 2, axis=1), dt=some.dt / 2)
     errors, halved = (np.asarray(errors_in(each, field, compact(solver))) for each in (some, fine))
-    measured, parts = ~np.isnan(some.x), (halved[:, 1::2] - errors, errors, some.x - some.x0[:, None])
-    change, errors, moved = (np.where(measured, each / (1 if scale is None else scale), 0) for each in parts)
+    parts, measured = (halved[:, 1::2] - errors, errors, some.x - some.x0[:, None], some.x), ~np.isnan(some.x)
+    change, errors, moved, states = (np.where(measured, np.asarray(each) / unit, 0) for each in parts)
     noise = (np.linalg.norm(errors) + FINE * np.linalg.norm(moved)) / (measured.sum() * n / len(some)) ** 0.5
-    if np.linalg.norm(change) <= max(COARSE * noise, 2 * rounding(some, scale)):  # of both predictions
+    rounded = 2 * np.finfo(errors.dtype).eps * np.linalg.norm(states)  # both predictions
+    if np.linalg.norm(change) <= max(COARSE * noise, rounded):
         return 0.0
     return float(_standard_errors(field, some, solver, scale, change)) / noise
 
