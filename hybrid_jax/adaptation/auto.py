@@ -150,12 +150,13 @@ class Auto(Method):
             chosen, nothing, move, rows = judge(larger, train, found, every, source, learned_from, effect, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
                 (_, found, starts), fitted = fits(larger, move, train, rows, *options), rows
-                if not traced and found.status == Status.DIVERGED:
+                if not traced and int(found.status) == Status.DIVERGED:
                     _, found, starts = fits(larger, still, train, rows, *options)
-        found, starts, chosen = confirm(self, larger, (found, starts), (first[0], first[2]), chosen, sizes)
+        found, starts, chosen, left_out = confirm(self, larger, (found, starts), (first[0], first[2]), chosen, sizes)
         if self.networks and network:
             step = anchor(larger, train, starts, found, solver, scale, nothing.error, self.blocks)
-        return conclude(self, field, larger, train, (found, chosen, source, nothing, effect, step), options[:2])
+        outcome = found, chosen, left_out, source, nothing, effect, step
+        return conclude(self, field, larger, train, outcome, options[:2])
 
 
 class OfSource(NamedTuple):
@@ -201,14 +202,18 @@ def _judge(
     return found, nothing, jnp.where(rows[1], every.theta - start, 0.0).astype(sizes.dtype), rows
 
 
-def _confirm(method: Auto, larger, changed, still, chosen: Posterior, sizes) -> tuple[Fit, Any, Posterior]:
-    """Return the fit and the starts of the chosen change, or those of none if left-out blocks do not confirm it."""
+def _confirm(method: Auto, larger, changed, still, chosen: Posterior, sizes) -> tuple[Fit, Any, Posterior, Array]:
+    """Return the fit and the starts of the chosen change, or those of none if left-out blocks do not confirm it.
+
+    The last are the parameters fitted without each block.
+    """
     free, start = jnp.stack([*free_parameters(larger).values()])[chosen.taken], ravel_parameters(larger)[0]
     blocks = blocks_of(len(still[0].equations.score), method.blocks)
     thetas = left_out_thetas(changed[0], free, sizes, start, blocks)
     sure = (chosen.taken == 0) | surely_lower(changed[0], still[0], thetas, blocks)
     found, starts = jax.tree.map(partial(jnp.where, sure), changed, still)
-    return found, starts, chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
+    chosen = chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
+    return found, starts, chosen, jnp.where(sure, thetas, found.theta)
 
 
 def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale, error, blocks: int) -> Anchored:
@@ -219,7 +224,7 @@ def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale, erro
 
 def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options) -> Solution:
     """Add the network's change if it is probable, and compute the errors of left-out blocks."""
-    (found, chosen, source, nothing, effect, step), (sizes, solver) = outcome, options
+    (found, chosen, left_out, source, nothing, effect, step), (sizes, solver) = outcome, options
     start, unravel = ravel_parameters(larger)
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
@@ -232,7 +237,6 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
         of_source = jnp.where(alone, sandwich_of_repeated(own.equations, len(start), distinct), of_source)
         degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
     inherited = spread(found.equations, free[taken] & found.seen, of_source)
-    left_out = left_out_thetas(found, free[taken], sizes, start, blocks)
     changes = jnp.zeros((len(left_out), 0))
     if step is not None:
         removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, if physics replaced it
