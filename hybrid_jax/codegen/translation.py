@@ -171,35 +171,26 @@ def applied(function: Callable, *arrays: np.ndarray) -> np.ndarray:
 
 def _evaluated(equation: JaxprEqn, inputs: Sequence[Any]) -> list[Any]:
     """Evaluate an operation on numbers, with NumPy if frequent, because JAX compiles each call."""
-    if (move := _BY_NUMPY.get(equation.primitive.name)) is not None:
-        return [move(equation.params, *map(np.asarray, inputs))]
-    found = equation.primitive.bind(*map(jnp.asarray, inputs), **equation.params)
+    inputs = list(map(np.asarray, inputs))
+    params, shape = equation.params, equation.outvars[0].aval.shape  # type: ignore
+    match equation.primitive.name:
+        case "reshape" | "squeeze" | "expand_dims":
+            return [inputs[0].reshape(shape)]
+        case "transpose":
+            return [inputs[0].transpose(params["permutation"])]
+        case "broadcast_in_dim":
+            added = [axis for axis in range(len(shape)) if axis not in params["broadcast_dimensions"]]
+            return [np.broadcast_to(np.expand_dims(inputs[0], added), shape)]
+        case "slice":
+            bounds = params["start_indices"], params["limit_indices"], params["strides"] or (1,) * len(shape)
+            return [inputs[0][tuple(map(slice, *bounds))]]
+        case "split":
+            return np.split(inputs[0], np.cumsum(params["sizes"])[:-1], params["axis"])
+        case "concatenate":
+            return [np.concatenate(inputs, params["dimension"])]
+    found = equation.primitive.bind(*map(jnp.asarray, inputs), **params)
     return [np.asarray(one) for one in (found if equation.primitive.multiple_results else [found])]
 
-
-def _broadcast(params, a: np.ndarray) -> np.ndarray:
-    added = [axis for axis in range(len(params["shape"])) if axis not in params["broadcast_dimensions"]]
-    return np.broadcast_to(np.expand_dims(a, added), params["shape"])
-
-
-def _padded(params, a: np.ndarray, value: np.ndarray) -> np.ndarray:
-    pads = params["padding_config"]
-    if any(low < 0 or high < 0 or inner for low, high, inner in pads):
-        return np.asarray(jax.lax.pad(a, value, pads))
-    return np.pad(a, [(low, high) for low, high, _ in pads], constant_values=value)
-
-
-_BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
-    "slice": lambda params, a: a[
-        tuple(map(slice, params["start_indices"], params["limit_indices"], params["strides"] or (1,) * a.ndim))
-    ],
-    "broadcast_in_dim": _broadcast,
-    "squeeze": lambda params, a: a.squeeze(params["dimensions"]),
-    "reshape": lambda params, a: a.reshape(params["new_sizes"]),
-    "transpose": lambda params, a: a.transpose(params["permutation"]),
-    "pad": _padded,
-    "concatenate": lambda params, *parts: np.concatenate(parts, params["dimension"]),
-}
 
 # Operations that call another program. Custom derivatives are replaced by those of the language.
 CALLS = ("jit", "closed_call", "remat2", "custom_jvp_call", "custom_vjp_call")
@@ -219,13 +210,10 @@ FOLDS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce
 
 
 def _power(of: Callable, params: dict, base: np.ndarray) -> np.ndarray:
-    exponent = abs(params["y"])
-    power = (
-        reduce(partial(of, "mul"), [base] * exponent)
-        if 0 < exponent < 5
-        else of("pow", base, objects(np.array(exponent)))
-    )
-    return of("div", objects(np.array(1)), power) if params["y"] < 0 else power
+    exponent, number = abs(params["y"]), lambda a: objects(np.array(a))
+    written_out = 0 < exponent < 5
+    power = reduce(partial(of, "mul"), [base] * exponent) if written_out else of("pow", base, number(exponent))
+    return of("div", number(1), power) if params["y"] < 0 else power
 
 
 # Name → what it is made of, by a function that applies operations of the language.
