@@ -140,8 +140,8 @@ class Auto(Method):
         if learned_from is not None:
             distinct, learned_from = jnp.array(min(len(learned_from), len(train))), alike(learned_from, train)
             own = fits(larger, still, learned_from, both, *options, distinct)[0]
-            rival = None if physics is None else fits(physics, still, learned_from, both, *options, distinct)[1]
-            larger, source = replace(self, larger, own, rival, distinct)
+            rival = None if physics is None else fits(physics, still, learned_from, both, *options, distinct)[:2]
+            larger, source = replace(self, larger, own, rival, distinct, sizes)
         options = *options, jnp.array(len(train))
         (found, every, starts), fitted = first, _ = fits(larger, still, train, both, *options), None
         for _ in range(ROUNDS):
@@ -180,13 +180,17 @@ def _fits(field, move, windows: Trajectories, free, *options) -> tuple[Fit, Fit,
     return (*(jax.tree.map(itemgetter(row), found) for row in (0, 1)), starts)
 
 
-def _replace(method: Auto, larger, own: Fit, rival: Fit | None, distinct) -> tuple[Any, OfSource]:
-    """Replace the source by physics if these predict its own motion better."""
+def _replace(method: Auto, larger, own: Fit, rival: tuple[Fit, Fit] | None, distinct, sizes) -> tuple[Any, OfSource]:
+    """Replace the source by its physics if they predict its own motion better, fitted again if that is better still."""
     if rival is None:
         return larger, OfSource(own, jnp.array(False), distinct)
-    alone = rival.surely_better(own) & method.networks
-    physics = ravel_parameters(without_network(larger))[1](rival.theta)
-    larger, own = (_where(alone, *pair) for pair in ((physics, larger), (rival, own)))
+    start, unravel = ravel_parameters(without_network(larger))
+    blocks = blocks_of(len(own.equations.score), method.blocks)
+    left_out = left_out_thetas(rival[1], jnp.ones(len(start), bool), sizes, start, blocks)
+    again = surely_lower(rival[1], rival[0], left_out, blocks)
+    physics, left_out = _where(again, rival[1], rival[0]), jnp.where(again, left_out, start)
+    alone = surely_lower(physics, own, left_out, blocks) & method.networks
+    larger, own = (_where(alone, *pair) for pair in ((unravel(physics.theta), larger), (physics, own)))
     return larger, OfSource(own, alone, distinct)
 
 

@@ -49,10 +49,6 @@ class Fit(NamedTuple):
         (gram, score, square), move = self.equations, theta - self.theta
         return NormalEquations(gram, score + gram @ move, square + (2 * score + gram @ move) @ move)
 
-    def surely_better(self, other: "Fit") -> Bool[Array, ""]:
-        """Whether it predicts the same windows significantly better."""
-        return _surely_positive(other.equations.square - self.equations.square)
-
 
 def fit_each(
     field: AbstractVectorField,
@@ -235,11 +231,8 @@ def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) ->
     before, after = (jnp.sum(square * blocks[1], axis=1) for square in (still.equations.square[blocks[0]], after))
     least = jnp.maximum(jnp.finfo(before.dtype).eps * before, TINY)
     gain = jnp.log(jnp.maximum(before, least) / jnp.maximum(after, least))
-    return _surely_positive(gain) if len(gain) >= ENOUGH else jnp.array(True)
-
-
-def _surely_positive(gain: Float[Array, " n"]) -> Bool[Array, ""]:
-    return jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / len(gain) ** 0.5
+    enough = jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / len(gain) ** 0.5
+    return enough if len(gain) >= ENOUGH else jnp.array(True)
 
 
 def correlated(windows: Trajectories) -> int:
