@@ -1,27 +1,26 @@
 """How often intervals of θ_p contain the truth: python -m experiments.coverage --help"""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
+import hybrid_jax as hj
 from experiments.flying.changes import CHANGES
-from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
 from experiments.paper.known_body import coverage, known_body_table
 from experiments.paper.study import flown, pretrained, source_splits, target_splits, windows_of
 from experiments.reporting import names
-from experiments.reporting.claims import Claim, Part, all_of, verdict_table
+from experiments.reporting.claims import Claim, Part, Undecided, all_of, verdict_table
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.names import HYBRID
-from experiments.reporting.plots import METHODS, STYLE, legend_below, name_lines, note, subplots
+from experiments.reporting.plots import METHODS as COLOURS
+from experiments.reporting.plots import STYLE, legend_below, name_lines, note, subplots
 from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import EMPTY, Table, tabulate
@@ -30,31 +29,27 @@ from experiments.runner.cache import identity_of
 from experiments.runner.options import Count
 from experiments.runner.run_record import record_of
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
-from hybrid_jax.adaptation.auto import Auto
-from hybrid_jax.adaptation.pooling import SOURCES, combined
-from hybrid_jax.adaptation.selection import CLUSTERS, alike, blocks_of
+from hybrid_jax.adaptation.adapting import METHODS
+from hybrid_jax.adaptation.pooling import SOURCES
+from hybrid_jax.adaptation.results import Parameter
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
-from hybrid_jax.estimation.uncertainty import covariance_of
-from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sweep import hosts
-from hybrid_jax.training.objective import Settings
+from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 NAME = "coverage"
 LEVEL, ASKED, MOST = 0.95, 0.9, 0.99  # of the intervals, and the least and largest share that may hold the truth
 WIDEST, FEW = 2.0, 20  # times what 95 % of the errors need, of which fewer flights say nothing
-METHOD = Auto(networks=False)  # the network stays as it is: else there are no intervals
 RIGHT: tuple[Change, ...] = ("parameter_shift", "external_force", "doubled_drag", "weak_rotor", "gusty_wind")
 HEAD = """\
-Hybrids that were trained on source flight, with different seeds, adapt to the same N windows of one flight, as
-`adapt(method="auto")` does without changing the network. The interval of each of θ_p is pooled over the sources by
-`hybrid_jax.pool`: the variance of a fit, with blocks of two seconds as clusters, and the variance between the sources.
-Coverage: the share of flights whose pooled 95 % interval contains the truth. A parameter that was not fitted has no
-interval and does not count; where rotors lost thrust, their efficiencies take the place of k. One source: the share of
-intervals that are not pooled.
+Hybrids that were trained on source flight, with different seeds, adapt to the same N windows of one flight by
+`hj.adapt`, and `hj.pool` pools the interval of each of θ_p over the sources. Coverage: the share of flights whose
+pooled 95 % interval contains the truth. A parameter that was not fitted has no interval and does not count; where
+rotors lost thrust, their efficiencies take the place of k. One source: the share of intervals that are not pooled, of
+parameters that are not called effective.
 """
 
 
@@ -127,16 +122,15 @@ def adapted(
     splits = {"train": target_splits(config)["train"]}
     flights = flown(domain, splits, config, stages)
     pool = flights.splits["train"]
-    drawn, truth = windows_of(METHOD, config.sizes[0], config)[0], nominal(domain.vehicle)
+    drawn, truth = windows_of(METHODS["auto"], config.sizes[0], config)[0], nominal(domain.vehicle)
 
     def of_draw(draw: int) -> Found:
-        windows = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
-        logs, stds = jax.device_get(_fits(fields, windows, settings(config), alike(learned_from, windows[0])))
-        tags = {"domain": domain.name, "draw": draw}
-        rows = [
-            {**tags, "parameter": name, **_compared(logs[:, i], stds[:, i], np.log(truth[name] / nominal(IRIS)[name]))}
-            for i, name in enumerate(LEARNED)
-        ]
+        windows = pool[drawn[draw * config.seeds]]  # the same for all sources
+        results = [hj.adapt(lane(fields, seed), windows, learned_from=learned_from) for seed in range(config.seeds)]
+        pooled = hj.pool(results) if all(each.covariance is not None for each in results) else {}
+        tags: dict[str, Any] = {"domain": domain.name, "draw": draw}
+        own = {name: [each.parameters[name] for each in results] for name in LEARNED}
+        rows = [tags | {"parameter": name} | _compared(pooled.get(name), own[name], truth[name]) for name in LEARNED]
         return rows, {}
 
     name = f"intervals {domain.name}, noise {config.noise:g}"
@@ -144,35 +138,16 @@ def adapted(
     return rows_of(stages.kept(name, jobs, identity_of(config.described(), fields, flights)))
 
 
-@jit_with(FAST_COMPILE)
-def _fits(fields: Any, windows: Trajectories, shared: Settings, known: Trajectories):
-    """Return log θ_p of each source and their standard errors; NaN if not fitted."""
-    cluster = blocks_of(windows.x0.shape[1], CLUSTERS)[0].shape[1]  # windows of one flight are correlated
-
-    def one(run):
-        field, windows = run
-        found = METHOD.solve(field, windows, windows, shared, known)
-        free, theta = (each[found.choice.taken] for each in (found.choice.free, found.choice.theta))
-        covariance = covariance_of(found.field, windows, solver=shared.solver, free=free, cluster=cluster)
-        stds = jnp.where(free, jnp.sqrt(jnp.diagonal(covariance)), jnp.nan)
-        return theta[: len(LEARNED)], stds[: len(LEARNED)]
-
-    return jax.lax.map(one, (fields, windows))
-
-
-def _compared(logs: np.ndarray, stds: np.ndarray, true: float) -> Row:
+def _compared(pooled: Parameter | None, own: Sequence[Parameter], true: float) -> dict[str, Any]:
     """Whether pooled and single intervals contain the truth; error and half-width in %; None if not fitted."""
-    columns = ("inside", "error", "half_width", "alone")
-    if not np.isfinite(stds).all():
+    columns = ("inside", "error", "half_width", "alone", "effective")
+    if pooled is None:
         return dict.fromkeys(columns)
-    centre, away = combined(logs, stds**2, degrees=CLUSTERS - 1)
-    reach = [
-        combined(np.full(2, log), np.full(2, std**2), degrees=CLUSTERS - 1)[1]
-        for log, std in zip(logs, stds, strict=True)
-    ]
-    alone = float(np.mean(np.abs(logs - true) <= reach))
-    numbers = bool(abs(centre - true) <= away), 100 * np.expm1(centre - true), 100 * away, alone
-    return dict(zip(columns, numbers, strict=True))
+    alone = [one.low <= true <= one.high for one in own if one.has_interval]
+    half = 100 * (pooled.high - pooled.low) / (2 * true)
+    numbers = bool(pooled.low <= true <= pooled.high), 100 * (pooled.value / true - 1), half
+    effective = sum(one.effective is not None for one in own)
+    return dict(zip(columns, (*numbers, float(np.mean(alone)) if alone else None, effective), strict=True))
 
 
 def worst_table(rows: Results) -> Table:
@@ -181,33 +156,41 @@ def worst_table(rows: Results) -> Table:
     for change, group in rows.where(lambda row: row["inside"] is not None).group("domain").items():
         case, own = min(_cases(group).items(), key=lambda case: np.mean(case[1]["inside"]))
         name, _, noise = case.split(", ")
-        shares = (f"{100 * np.mean(own[column]):.0f}" for column in ("inside", "alone"))
+        shares = (percentage(own, column) for column in ("inside", "alone"))
         wide = f"{np.median(own.numbers('half_width')):.2f}"
         lines.append((names.label(change), f"{name}, {noise}", str(len(own)), *shares, wide))
     header = ("change", "lowest for", "flights", "coverage [%]", "one source [%]", "half-width [%], median")
     return Table(f"Lowest coverage of pooled 95 % intervals of {SOURCES} sources or more", header, lines)
 
 
+def percentage(rows: Results, column: str) -> str:
+    known = [row[column] for row in rows if row[column] is not None]
+    return f"{100 * np.mean(known):.0f}" if known else EMPTY
+
+
 def pooled_table(rows: Results) -> Table:
-    def text(column: str, scale: float, form: str, statistic=np.mean):
+    def text(column: str, form: str, statistic):
         def of(own: Results) -> str:
             known = [row[column] for row in own if row["inside"] is not None]
-            return f"{scale * statistic(known):{form}}" if known else EMPTY
+            return f"{statistic(known):{form}}" if known else EMPTY
 
         return of
 
     columns = {
         "flights": lambda own: str(sum(row["inside"] is not None for row in own)),
-        "coverage [%]": text("inside", 100, ".0f"),
-        "one source [%]": text("alone", 100, ".0f"),
-        "bias [%]": text("error", 1, "+.2f"),
-        "half-width [%], median": text("half_width", 1, ".2f", np.median),
+        "coverage [%]": partial(percentage, column="inside"),
+        "one source [%]": partial(percentage, column="alone"),
+        "effective": lambda own: str(sum(row["effective"] or 0 for row in own)),
+        "bias [%]": text("error", "+.2f", np.mean),
+        "half-width [%], median": text("half_width", ".2f", np.median),
     }
     title = f"Do pooled 95 % intervals of {SOURCES} sources or more contain the truth?"
     return tabulate(title, rows.group("domain", "noise", "parameter"), columns, ("change", "noise", "θ_p"))
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
+    if not any(row["inside"] is not None for row in rows):
+        return {}
     return {"coverage": (coverage_figure(rows), "Share of flights whose 95 % interval contains the true value")}
 
 
@@ -218,17 +201,18 @@ def coverage_figure(rows: Results) -> Figure:
     noises, changes = fitted.unique("noise"), fitted.unique("domain")
     figure, (panels,) = subplots(1.5 + 0.42 * len(changes), 1, len(noises), sharey=True)
     kinds = {
-        "alone": ("one source", METHODS["fine-tuned"], "s"),
-        "inside": ("three sources, pooled", METHODS["adapted"], "o"),
+        "alone": ("one source", COLOURS["fine-tuned"], "s"),
+        "inside": ("three sources, pooled", COLOURS["adapted"], "o"),
     }
     for axes, noise in zip(panels, noises, strict=True):
         axes.axvline(100 * LEVEL, color="0.4", linestyle=":", label="nominal 95 %")
         for (domain, parameter), own in fitted.where(noise=noise).group("domain", "parameter").items():
             y = changes.index(domain) + 0.22 * (LEARNED.index(parameter) - 1)
-            shares = {column: 100 * float(np.mean(own[column])) for column in kinds}
-            axes.plot([*shares.values()], [y, y], color="0.8", zorder=1)
-            for column, (label, colour, marker) in kinds.items():
-                axes.plot(shares[column], y, marker, ms=4, color=colour, label=label, clip_on=False)
+            shares = {column: float(share) for column in kinds if (share := percentage(own, column)) != EMPTY}
+            axes.plot([*shares.values()], [y] * len(shares), color="0.8", zorder=1)
+            for column, share in shares.items():
+                label, colour, marker = kinds[column]
+                axes.plot(share, y, marker, ms=4, color=colour, label=label, clip_on=False)
             note(axes, parameter, (min(shares.values()), y), (-6, 0), va="center", ha="right", color="0.4")
         axes.set(title="without noise" if noise == "none" else "with sensor noise", xlim=(60, 100.5))
         axes.set_xlabel("intervals that contain\nthe true value [%]")
@@ -249,7 +233,7 @@ def conclusion(rows: Results) -> list[str]:
     )
     return [
         f"Of {len(fitted)} pooled 95 % intervals {np.mean(fitted['inside']):.0%} contain the true value, "
-        f"of single sources {np.mean(fitted['alone']):.0%}.",
+        f"of single sources {percentage(fitted, 'alone')}%.",
         f"The fewest do for {worst}: {shares[worst]:.0%} (required: {ASKED:.0%}). {trust}",
     ]
 
@@ -266,6 +250,8 @@ def _covers(rows: Results) -> Part:
         return (False if too_often or (wide > WIDEST and n >= FEW) else holds), measured
 
     fitted = rows.where(lambda row: row["inside"] is not None)
+    if not len(fitted):
+        raise Undecided("needs a fitted parameter")
     return all_of(of(*case) for case in _cases(fitted).items())
 
 

@@ -10,6 +10,7 @@ from experiments.excitation import results as design
 from experiments.paper import regret
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
+from hybrid_jax.adaptation.results import Parameter
 from hybrid_jax.planning import FlightBounds
 
 TAGS = ("domain", "candidate", "draw", "seed")
@@ -71,13 +72,15 @@ def test_the_claim_about_intervals_fails_where_significantly_fewer_intervals_hol
     assert verdict.holds is holds
 
 
-def test_pooled_intervals_have_their_coverage_where_sources_differ_and_single_ones_have_not():
-    """Each source absorbed something else: its estimate is off by as much as the flights' noise, and more."""
-    rng = np.random.default_rng(0)
-    shifts = rng.normal(0, 0.03, (2000, 3))
-    found = [coverage._compared(row + rng.normal(0, 0.01), np.full(3, 0.01), 0.0) for row in shifts]
-    assert np.mean([row["inside"] for row in found]) > 0.93
-    assert np.mean([row["alone"] for row in found]) < 0.75
+def test_single_intervals_count_where_a_parameter_is_physical_and_the_truth_divides_errors():
+    own, pooled = (
+        [Parameter(2.0, 1.5, 2.5), Parameter(3.0, 2.5, 3.5), Parameter(4.0, effective="because")],
+        Parameter(3.0, 2.0, 4.0),
+    )
+    found = coverage._compared(pooled, own, 2.5)
+    assert found == {"inside": True, "error": pytest.approx(20), "half_width": 40, "alone": 1.0, "effective": 1}
+    assert [coverage._compared(pooled, part, at)["alone"] for part, at in ((own, 1.6), (own[2:], 4.5))] == [0.5, None]
+    assert set(coverage._compared(None, own, 2.5).values()) == {None}
 
 
 INSIDE = {"tilt [rad]": (0.5, 0.6)}
