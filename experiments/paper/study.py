@@ -103,9 +103,11 @@ def _adapted(
     return adapted(model, mode, start, config, stages, target)
 
 
-def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> Fit:
+def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset, start: Any = None) -> Fit:
+    """Train a model on source flight, from fresh fields or from others, stacked."""
     shared, name = (settings(config), source, capacity(config)), f"pre-training {model}"
-    found = stages.sweep(name, *pretraining(model, fresh_fields(model, vehicle, config), config), *shared)
+    start = fresh_fields(model, vehicle, config) if start is None else start
+    found = stages.sweep(name, *pretraining(model, start, config), *shared)
     for factor in config.rates.decay:
         lanes = pretraining(model, found.best, config, factor)
         found = stages.sweep(f"{name}, rates times {factor:g}", *lanes, *shared)

@@ -10,6 +10,7 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 import hybrid_jax as hj
+from experiments.paper.conditions import fresh_fields
 from experiments.paper.config import OneFlight
 from experiments.paper.study import pretrained
 from experiments.reporting.names import HYBRID
@@ -19,11 +20,15 @@ from experiments.runner.options import distinct
 from experiments.runner.stages import Found, Stages, rows_of
 from experiments.worlds.iris import Iris
 from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
-from experiments.worlds.methods import AUTO, METHODS, Task
+from experiments.worlds.methods import AUTO, METHODS, PHYSICS, Task
 from experiments.worlds.rotorpy import ROTORPY
 from experiments.worlds.world import CHANGES, MADE_FOR, NOTHING, World, logged
+from hybrid_jax.adaptation import LeastSquares
 from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.networks.mlp import zero_output
 from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.training import Settings
+from hybrid_jax.training.channels import scaled_loss
 
 WORLDS: dict[str, World] = {world.name: world for world in (Iris(), *ROTORPY)}
 STEPS, LONG = 10, 100  # intervals of a window to learn from, and to test on
@@ -70,6 +75,9 @@ class WorldsConfig(OneFlight):
     learn_from: tuple[FlightName, ...] = get_args(FlightName)
     """Flights to adapt to. moving: ten seconds of usual flight. Of the others one draw for each source. near_ground:
     slow. short: three seconds. noisy: sensors three times as noisy. outliers: 0.3 s of outliers."""
+    source_training: Literal["physics_first", "joint"] = "physics_first"
+    """physics_first: physics with drag and moments by least squares, then the network on what is left. joint: physics
+    without these terms and the network at once, as in the paper."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
     """How a log samples them: means over each interval, or values at its start."""
     rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
@@ -105,6 +113,20 @@ def source_flights(world: World, config: WorldsConfig, seed: int) -> Dataset:
     windows, first = log(flown, key_of(world, config, LOGGING, seed)), each * flights["train"]
     splits = {"train": windows[: numbers["train"]], "validation": windows[first : first + numbers["validation"]]}
     return Dataset(splits, {"config": {"domain": world.name}})
+
+
+def source_of(world: World, config: WorldsConfig, stages: Stages, own: Dataset) -> hj.AbstractVectorField:
+    """Train a source model on its flights."""
+    one, start = replace(config, seeds=1), None
+    if config.source_training == "physics_first":
+        windows, body = own.splits["train"], hj.rigid_body(world.vehicle, PHYSICS)
+        physics = (
+            LeastSquares(False).solve(body, windows, windows, Settings(objective=scaled_loss(body, windows))).field
+        )
+        fresh: Any = fresh_fields(HYBRID, world.vehicle, one)
+        start = hj.Hybrid(jax.tree.map(lambda leaf: leaf[None], physics), zero_output(fresh.residual))
+        one = replace(one, rates=replace(one.rates, physics=0.0))
+    return lane(pretrained(HYBRID, world.vehicle, one, stages, own, start).fields, 0)
 
 
 def flown_after(world: World, change: str, flight: str, number: int, config: WorldsConfig) -> hj.Trajectories:
@@ -145,8 +167,7 @@ def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
     Each source has flights of its own, to adapt to and to test on as well, so that sources are independent cases.
     """
     flown = [source_flights(world, config, seed) for seed in range(config.seeds)]
-    one = replace(config, seeds=1)
-    fields = [lane(pretrained(HYBRID, world.vehicle, one, stages, own).fields, 0) for own in flown]
+    fields = [source_of(world, config, stages, own) for own in flown]
 
     def of_case(change: str, flight: str) -> Found:
         compare, noise = flight == USUAL and change in config.rivals, FLIGHTS[flight].noise * config.noise

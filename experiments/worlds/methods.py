@@ -15,7 +15,7 @@ from experiments.paper.conditions import Noise
 from experiments.worlds.world import DT, World
 from hybrid_jax.adaptation import Adaptation, FineTune, Method, Parameter
 
-WHITE_BOX = "Ix", "Iy", "k", "drag"  # what physics without a network learns
+PHYSICS = "Ix", "Iy", "Iz", "k", "drag", "aerodynamic_moment", "rate_damping"  # learned without a network
 CHANGING = 1.0  # m/s² and rad/s²: the filter's prior of a disturbance
 
 
@@ -62,13 +62,13 @@ def as_in_the_paper(task: Task) -> Model:
 
 def white_box(task: Task) -> Model:
     """Fit physics without a network by least squares, from nominal values, without a source."""
-    return _of(hj.adapt(hj.rigid_body(task.world.vehicle, WHITE_BOX), task.windows, method="least_squares"))
+    return _of(hj.adapt(hj.rigid_body(task.world.vehicle, PHYSICS), task.windows, method="least_squares"))
 
 
 def kalman_filter(task: Task) -> Model:
     """Estimate the same parameters by an extended Kalman filter, sample by sample."""
     noise = task.noise * np.repeat([*asdict(Noise()).values()], [3, 4, 3, 3])
-    physics = hj.rigid_body(task.world.vehicle, WHITE_BOX)
+    physics = hj.rigid_body(task.world.vehicle, PHYSICS)
     online = hj.OnlineAdaptation(physics, DT, tuple(noise.tolist()), disturbance=CHANGING)
     x, u = (jnp.asarray(part).reshape(-1, part.shape[-1]) for part in (task.windows.x, task.windows.u))
     state = _filtered(online, jnp.asarray(task.windows.x0[0]), x, u)

@@ -15,7 +15,7 @@ from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
 
 DT = 0.01  # s, a decision of the pilot and an interval of the log
-SETTLING = 1.0  # s, flown before the log begins
+SETTLING = 3.0  # s, flown before the log begins: after a second some vehicles still turn over
 TONES = 3
 BURST, WILD = slice(400, 430), 50.0  # samples of an outlier burst, and how many times the usual noise they have
 MADE_FOR = (
