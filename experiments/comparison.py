@@ -11,19 +11,7 @@ from rich.console import Console
 from experiments.external_force import sine_floor
 from experiments.paper.claims import COMPARISON
 from experiments.paper.conditions import augmentation, settings
-from experiments.paper.config import (
-    ALL_PATIENCE,
-    ALL_RATES,
-    QUICK,
-    SMOKE,
-    TABLE_SIZES,
-    AllPatience,
-    AllRates,
-    Config,
-    Encoding,
-    Stopping,
-    preset_like,
-)
+from experiments.paper.config import QUICK, SMOKE, TABLE_SIZES, AllModels, Config, Encoding, Stopping, preset_like
 from experiments.paper.expert_augmentation import Augmentation
 from experiments.paper.figures import ranking
 from experiments.paper.lanes import Fit, fit_of, rows_of, save_models, source_of
@@ -50,13 +38,11 @@ DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 
 
 @dataclass(frozen=True)
-class ComparisonConfig(Config):
+class ComparisonConfig(AllModels):
     """Adapt one pre-trained model by every method with N trajectories, and test predictions over 0.1 s."""
 
     sizes: Annotated[tuple[int, ...], Target] = (100,)
     """N, target trajectories to adapt to; rates and patience are those of the nearest size in the paper's table."""
-    rates: AllRates = ALL_RATES
-    patience: AllPatience = ALL_PATIENCE
     methods: tuple[Method, ...] = get_args(Method)
     """Methods to compare."""
     encoding: Encoding = field(default_factory=Encoding)

@@ -4,17 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from experiments.flying.scenario import Reference, hardware
-from experiments.paper.config import (
-    ALL_PATIENCE,
-    ALL_RATES,
-    QUICK,
-    SMOKE,
-    AllPatience,
-    AllRates,
-    Config,
-    ResidualInputs,
-    preset_like,
-)
+from experiments.paper.config import QUICK, SMOKE, AllModels, Config, ResidualInputs, preset_like
 from experiments.runner.options import Count, NotNegative, Positive, distinct
 from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.vehicle import IRIS
@@ -23,15 +13,13 @@ THREE: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
 
 
 @dataclass(frozen=True)
-class ClosedLoopConfig(Config):
+class ClosedLoopConfig(AllModels):
     """Fly a model predictive controller with each model, before and after adaptation.
 
     Training is that of param_shift and external_force (their stages in --cache are reused). Models that adapt use the
     smallest and the largest of --n-target; models that do not adapt also fly the unchanged vehicle.
     """
 
-    rates: AllRates = ALL_RATES
-    patience: AllPatience = ALL_PATIENCE
     seconds: Positive = 10.0
     """Length of a flight [s]."""
     references: tuple[Reference, ...] = get_args(Reference)

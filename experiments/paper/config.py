@@ -5,19 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from experiments.flying.changes import CHANGES
+from experiments.paper.rates import AllPatience, AllRates, Patience, Rates, Stopping
 from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
 from experiments.runner import options
-from experiments.runner.options import (
-    Activation,
-    Count,
-    CountFromZero,
-    Named,
-    NotNegative,
-    Positive,
-    Run,
-    distinct,
-    factors,
-)
+from experiments.runner.options import Activation, Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.networks.mlp import NORMS
@@ -45,63 +36,6 @@ else:  # the command line offers what the registries hold
     Norm = Literal[tuple(NORMS)]
 ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "near_ground", "body"]
 ResidualOutputs = Literal["all", "accelerations", "wrench", "rotors"]
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Adam's learning rates; a tuple has one for each of the sizes 100, 300, 500, 700, 1000."""
-
-    physics: NotNegative = 1e-2
-    """Rate of θ_p in pre-training and target-only."""
-    physics_fine_tuning: NotNegative = 1e-2
-    """Rate of θ_p in fine-tuning; not confirmed in the paper. Claims C8 and C10 of param_shift are sensitive to it."""
-    pretraining: NotNegative = 1e-4
-    """Rate of θ_d in pre-training, both models."""
-    decay: tuple[Positive, ...] = ()
-    """Factors: pre-training continues from its best model with all rates times each factor in turn; none by default."""
-    hybrid: tuple[NotNegative, ...] = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)
-    """Rate of the hybrid's θ_d, fine-tuned and target-only."""
-    offset: Positive | None = None
-    """Rate of v̇ and ω̇ in the output bias of θ_d [m/s², rad/s² a step], fine-tuned and target-only; by default the
-    rate of θ_d. Only this bias can represent a constant force; at 1e-3 you need thousands of steps, which overfit."""
-
-
-@dataclass(frozen=True)
-class AllRates(Rates):
-    """Learning rates also for experiments with a network without physics."""
-
-    no_physics: tuple[NotNegative, ...] = (1e-4, 1e-4, 1e-4, 1e-4, 1e-5)
-    """Rate of the network without physics, fine-tuned (the first four are not confirmed in the paper)."""
-    no_physics_target_only: NotNegative = 1e-4
-    """Rate of the network without physics, target-only."""
-
-
-@dataclass(frozen=True)
-class Stopping:
-    """At least `minimum` epochs, then stop after `patience` epochs without a better validation loss."""
-
-    minimum: CountFromZero
-    patience: CountFromZero
-
-
-@dataclass(frozen=True)
-class Patience:
-    """Early stopping; a tuple has one entry for each of the sizes 100, 300, 500, 700, 1000."""
-
-    hybrid_pretraining: Stopping = Stopping(100, 20)
-    hybrid_minimum: tuple[CountFromZero, ...] = (100, 300, 300, 300, 100)
-    hybrid_patience: tuple[CountFromZero, ...] = (20, 50, 50, 50, 20)
-
-
-@dataclass(frozen=True)
-class AllPatience(Patience):
-    """Early stopping also of a network without physics."""
-
-    no_physics_pretraining: Stopping = Stopping(300, 50)
-    no_physics: Stopping = Stopping(250, 50)
-
-
-ALL_RATES, ALL_PATIENCE = AllRates(), AllPatience()
 
 
 @dataclass(frozen=True)
@@ -146,7 +80,7 @@ class Config(Run):
     """Seed of all flights."""
     hidden: Count = 64
     """Hidden units of f_d."""
-    inputs: Annotated[Literal["hover", "raw"], Named(name="rotor-scaling")] = "hover"
+    inputs: Annotated[Literal["hover", "raw"], options.Named(name="rotor-scaling")] = "hover"
     """Scaling of rotor speeds for f_d. hover: (u − hover) / (hover / 10); raw: u in rad/s."""
     norm: Norm = "batch"
     """Normalisation of f_d's hidden layer."""
@@ -160,9 +94,9 @@ class Config(Run):
     and Iy act on them. rotors: also the thrust of each rotor, by one network that all rotors share."""
     residual_linear: bool = False
     """Add a linear skip connection to f_d; both start at zero."""
-    guess: Annotated[tuple[float, float], Named(name="init-range")] = (0.8, 1.25)
+    guess: Annotated[tuple[float, float], options.Named(name="init-range")] = (0.8, 1.25)
     """θ_p starts at nominal times a random factor in this range."""
-    perturbed_by: Annotated[Positive | None, Named(name="init-offset")] = None
+    perturbed_by: Annotated[Positive | None, options.Named(name="init-offset")] = None
     """Instead of --init-range, with this value x: θ_p starts at nominal × (1 + x) or nominal / (1 + x), at random."""
     noise: NotNegative = 0.0
     """White noise on the states of training and validation flights; 1 is typical of motion capture and a gyroscope."""
@@ -242,11 +176,17 @@ class Config(Run):
 
 
 @dataclass(frozen=True)
-class AdaptationConfig(Config):
+class AllModels(Config):
+    """Also train a network without physics."""
+
+    rates: AllRates = AllRates()
+    patience: AllPatience = AllPatience()
+
+
+@dataclass(frozen=True)
+class AdaptationConfig(AllModels):
     """Pre-train on source flight, adapt to the target with N short trajectories, and test."""
 
-    rates: AllRates = ALL_RATES
-    patience: AllPatience = ALL_PATIENCE
     models: tuple[Model, ...] = MODELS
     """Which models to compare. constant_disturbance: the source's hybrid with θ_p and a constant
     disturbance fitted by least squares."""
