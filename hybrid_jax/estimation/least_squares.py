@@ -151,8 +151,7 @@ def _triangle(errors: Callable[[Theta, Trajectories], Array], theta: Theta, wind
         rows = jnp.where((first + jnp.arange(CHUNK) >= i * CHUNK)[:, None, None], rows, 0)
         return jnp.linalg.qr(jnp.concatenate([triangle, rows.reshape(-1, p + 1)]), mode="r")
 
-    dtype = jnp.result_type(theta, windows.x)
-    found = jax.lax.fori_loop(0, -(-n // CHUNK), add, jnp.zeros((p + 1, p + 1), dtype))
+    found = jax.lax.fori_loop(0, -(-n // CHUNK), add, jnp.zeros((p + 1, p + 1), jnp.result_type(theta, windows.x)))
     return found[None, None, :, :p], found[None, None, :, p]
 
 
@@ -247,9 +246,8 @@ def fit_and_linearise(
             moved = jnp.where(state.steps == 0, known is None or ~known[2], jnp.any(z != before))
             at, last = theta_at(z, units[0]), (jacobian, found)
             jacobian, found = jax.lax.cond(judged(state, cost)[0] & moved, linearised, lambda _: last, at)
-        own = _units(jacobian, found, windows, scale, free, held)
         first = state.steps == 0
-        units = jax.tree.map(partial(jnp.where, first), own, units)
+        units = jax.tree.map(partial(jnp.where, first), _units(jacobian, found, windows, scale, free, held), units)
         cost = cost_of(z, found, units) if compressed else jnp.where(first, cost_of(z, found, units), cost)
         return cost, (z, found, jacobian, units)
 
@@ -269,8 +267,7 @@ def fit_and_linearise(
     z, found, jacobian, (unit, _) = end.best
     mse = jnp.sum(jnp.square(found)) / (len(windows) * (windows.horizon if weigh is None else found.shape[1]))
     theta = jnp.where(jnp.isfinite(mse), theta_at(z, unit), (start - moved).astype(start.dtype))
-    fitted = True if free is None else jnp.any(free)
-    blind = fitted & jnp.all(unit == 0) & (end.status == Status.OK)  # nothing that is fitted has an effect
+    blind = (free is None or jnp.any(free)) & jnp.all(unit == 0) & (end.status == Status.OK)  # no effect at all
     status = jnp.where(blind, Status.STALLED, end.status)
     return LeastSquaresFit(unravel(theta), mse, end.steps, status), jacobian, found
 
