@@ -14,7 +14,7 @@ from experiments.paper import figures
 from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, preset_like
 from experiments.paper.lanes import rows_of
 from experiments.paper.study import adapted, assess, flown, pretrained, source_splits, target_splits
-from experiments.paper.tables import CHOICES, ablation_tables, in_words
+from experiments.paper.tables import CHOICES, ablation_tables
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, label
 from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
@@ -45,6 +45,16 @@ NOTES = [
 ]
 LITTLE = 0.05  # change of an error that counts as none
 Choice = Literal["residual", "weight", "form", "norm", "start", "source", "noise", "solver"]
+
+FORMS = {
+    "trajectory_correlation": "correlation of trajectories",
+    "inner_product": "inner product f_p · f_d",
+    "cosine": "cosine of f_p and f_d",
+    "pearson": "Pearson correlation of f_p and f_d",
+    "residual_norm": "size of f_d",
+}
+NORMS = {"batch": "over the minibatch", "layer": "over the layer", "none": "none"}
+SOLVERS = {"rk4": "Runge–Kutta of order 4", "heun": "Heun", "tsit5": "Tsitouras of order 5"}
 
 
 @dataclass(frozen=True)
@@ -80,8 +90,8 @@ PRESETS = {
 
 def varied(choice: str, config: Kind) -> dict[str, Kind]:
     """Map the name of each value of a choice to its configuration."""
-    seen = {"all": "all of x", "no_xy": "no p_x, p_y", "body": "seen from the body"}
-    added = {"all": "all 13", "accelerations": "v̇, ω̇"}
+    seen = {"all": "whole state", "no_xy": "no horizontal position", "body": "state seen from the body"}
+    added = {"all": "all derivatives", "accelerations": "accelerations"}
     low, high = config.guess
     sizes = [n for n in (300, 1000, 3000, 10_000) if config.batch_size <= n < config.source_train]
     changes: dict[str, dict[str, dict[str, Any]]] = {
@@ -89,13 +99,13 @@ def varied(choice: str, config: Kind) -> dict[str, Kind]:
             f"{seen[i]} → {added[o]}": {"residual_inputs": i, "residual_outputs": o} for o in added for i in seen
         },
         "weight": {f"λ = {weight:g}": {"regulariser_weight": weight} for weight in (0.0, 1e-4, 1e-3, 1e-2, 1e-1)},
-        "form": {form.replace("_", " "): {"regulariser": form} for form in (*REGULARISERS, "none")},
-        "norm": {norm: {"norm": norm} for norm in ("batch", "layer", "none")},
+        "form": {FORMS.get(form, form): {"regulariser": form} for form in (*REGULARISERS, "none")},
+        "norm": {words: {"norm": norm} for norm, words in NORMS.items()},
         "start": {f"random in {low:g} to {high:g}": {"perturbed_by": None}}
         | {f"off by {off:.0%}": {"perturbed_by": off} for off in (0.2, 0.5, 1.0)},
         "source": {f"{n} trajectories": {"source_train": n} for n in (*sizes, config.source_train)},
-        "noise": {f"{level:g} × typical": {"noise": level} for level in (0.0, 0.5, 1.0, 2.0)},
-        "solver": {solver: {"solver": solver} for solver in ("rk4", "heun", "tsit5")},
+        "noise": {f"{level:g} times the usual": {"noise": level} for level in (0.0, 0.5, 1.0, 2.0)},
+        "solver": {words: {"solver": solver} for solver, words in SOLVERS.items()},
     }
     return {value: replace(config, **options) for value, options in changes[choice].items()}
 
@@ -164,7 +174,7 @@ def ratio_table(rows: Results) -> list[Table]:
     """Return the effects of the first choice, of which the figure is shown: a line for each value."""
     found = {value: own for (choice, value), own in effects(rows).items() if choice == rows[0]["choice"]}
     header = (CHOICES[rows[0]["choice"]], *map(label, rows.unique("domain")))
-    lines = [(in_words(value), *(each.text(".2f") for each in own.values())) for value, own in found.items()]
+    lines = [(value, *(each.text(".2f") for each in own.values())) for value, own in found.items()]
     return [Table("Error after fine-tuning over the default's (95 % interval)", header, lines)] if lines else []
 
 
@@ -175,7 +185,7 @@ def conclusion(rows: Results) -> list[str]:
 
     def times(key: tuple[str, str]) -> str:
         ratios = ", ".join(f"{ratio.value:.2f} times ({label(domain)})" for domain, ratio in found[key].items())
-        return f"“{in_words(key[1])}” ({CHOICES[key[0]]}), with {ratios}"
+        return f"“{key[1]}” ({CHOICES[key[0]]}), with {ratios}"
 
     sentences = []
     if better:

@@ -10,15 +10,7 @@ from experiments.reporting import names
 from experiments.reporting.claims import Verdict, every
 from experiments.reporting.names import FINE_TUNED, HYBRID, NO_PHYSICS, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.results import Results, Row
-from experiments.reporting.tables import (
-    EMPTY,
-    Table,
-    cross_table,
-    mean_over_seeds,
-    over_seeds,
-    spread_text,
-    tabulate,
-)
+from experiments.reporting.tables import EMPTY, Table, cross_table, mean_over_seeds, over_seeds, spread_text, tabulate
 
 TUNED, PHYSICS = (HYBRID, FINE_TUNED, FEW), (PHYSICS_ONLY, FINE_TUNED, FEW)
 SOLVED = names.LEAST_SQUARES, names.CONSTANT_DISTURBANCE  # not trained, though their rows have the mode
@@ -30,7 +22,7 @@ PAPER: Mapping[str, Mapping[tuple[str, str, int], tuple[float, float | None]]] =
     names.EXTERNAL_FORCE: {TUNED: (2.64e-3, 1.56e-4), EXPERT: (4.02e-3, None), PHYSICS: (4.53e-3, None)},
 }
 
-# Words for the choices of an ablation, and for parts of their values.
+# Words for the choices of an ablation.
 CHOICES = {
     "residual": "what the network reads → adds to",
     "weight": "weight of the regulariser",
@@ -40,24 +32,6 @@ CHOICES = {
     "source": "flights before the change",
     "noise": "sensor noise",
     "solver": "integrator",
-}
-VALUES = {
-    "all of x": "whole state",
-    "no p_x, p_y": "no horizontal position",
-    "seen from the body": "state seen from the body",
-    "all 13": "all derivatives",
-    "v̇, ω̇": "accelerations",
-    "trajectory correlation": "correlation of trajectories",
-    "inner product": "inner product f_p · f_d",
-    "cosine": "cosine of f_p and f_d",
-    "pearson": "Pearson correlation of f_p and f_d",
-    "residual norm": "size of f_d",
-    "batch": "over the minibatch",
-    "layer": "over the layer",
-    "× typical": "times the usual",
-    "rk4": "Runge–Kutta of order 4",
-    "heun": "Heun",
-    "tsit5": "Tsitouras of order 5",
 }
 
 
@@ -237,13 +211,7 @@ def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> 
 
 
 def value_label(row: Row) -> str:
-    return in_words(row["value"]) + " (default)" * row["default"]
-
-
-def in_words(value: str) -> str:
-    for key, words in VALUES.items():
-        value = value.replace(key, words)
-    return value
+    return row["value"] + " (default)" * row["default"]
 
 
 def run_notes(rows: Results) -> list[str]:
