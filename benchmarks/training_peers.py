@@ -78,10 +78,7 @@ class Preset:
     turns: int
 
 
-PRESETS = {
-    "full": Preset(100, 10, 20, "inductor", turns=10),
-    "smoke": Preset(100, 2, 2, "aot_eager", turns=2),
-}
+PRESETS = {"full": Preset(100, 10, 20, "inductor", turns=10), "smoke": Preset(100, 2, 2, "aot_eager", turns=2)}
 
 
 class ThreeEighths(diffrax.AbstractERK):

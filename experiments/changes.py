@@ -85,11 +85,7 @@ PRESETS = {
     "paper": ChangesConfig(),
     "quick": preset_like(ChangesConfig, replace(QUICK, **ONE_FLIGHT, draws=4)),
     "smoke": preset_like(
-        ChangesConfig,
-        replace(SMOKE, **ONE_FLIGHT),
-        sizes=(20,),
-        changes=("external_force",),
-        compared=("fine_tune",),
+        ChangesConfig, replace(SMOKE, **ONE_FLIGHT), sizes=(20,), changes=("external_force",), compared=("fine_tune",)
     ),
 }
 
@@ -210,8 +206,7 @@ def _candidates(
     def of_flight(field, flight):
         blocks = jax.tree.map(lambda leaf: leaf[places[0]], flight), jnp.asarray(places[1])
         return jnp.mean(
-            jax.lax.map(lambda block: errors_at_ends(field, block[0], block[1], shared.solver), blocks),
-            axis=0,
+            jax.lax.map(lambda block: errors_at_ends(field, block[0], block[1], shared.solver), blocks), axis=0
         )
 
     return jax.lax.map(one, (fields, windows))

@@ -2,18 +2,7 @@
 
 from . import runtime
 from ._version import __version__
-from .adaptation import (
-    METHODS,
-    Adaptation,
-    FineTune,
-    LeastSquares,
-    Method,
-    Ridge,
-    Solution,
-    Source,
-    adapt,
-    pool,
-)
+from .adaptation import METHODS, Adaptation, FineTune, LeastSquares, Method, Ridge, Solution, Source, adapt, pool
 from .dynamics import (
     AbstractVectorField,
     Actuator,

@@ -110,11 +110,7 @@ def results_of(scenarios: Sequence[Flown]) -> Results:
 
 
 def fly_all(
-    scenarios: list[Scenario],
-    controller: Controller,
-    seconds: float,
-    stages: Stages,
-    hardware: Hardware | None = None,
+    scenarios: list[Scenario], controller: Controller, seconds: float, stages: Stages, hardware: Hardware | None = None
 ) -> list[Flown]:
     """Simulate all scenarios, each a cached stage; the controller must have the hardware's rotor lag."""
     hardware = Hardware() if hardware is None else hardware

@@ -112,10 +112,7 @@ def tables(rows: Results) -> list[Table]:
         "contain the true value [%]": lambda own: f"{100 * np.mean(own['inside']):.0f}",
     }
     head = ("flight", "parameter")
-    return [
-        widths,
-        tabulate("Intervals, their prediction and errors", rows.group(*head), more, head),
-    ]
+    return [widths, tabulate("Intervals, their prediction and errors", rows.group(*head), more, head)]
 
 
 def margin_table(planned: Mapping[str, float], flown: Mapping[str, tuple[float, float]]) -> Table:

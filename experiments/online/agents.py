@@ -164,13 +164,7 @@ def fixed_model(
 def online(hardware: Hardware, period: float) -> OnlineAdaptation:
     sizes = np.maximum(hardware.sizes(), 1e-4)
     return OnlineAdaptation(
-        nominal(),
-        period,
-        tuple(sizes.tolist()),
-        PRIOR,
-        DISTURBANCE,
-        process=PROCESS,
-        hypotheses=HYPOTHESES,
+        nominal(), period, tuple(sizes.tolist()), PRIOR, DISTURBANCE, process=PROCESS, hypotheses=HYPOTHESES
     )
 
 

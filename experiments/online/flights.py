@@ -131,8 +131,7 @@ def ground_fits(change: str, seeds: int, hardware: Hardware) -> AbstractVectorFi
     """Fit `nominal` with a disturbance to ten seconds of random flight after a change, stacked over seeds."""
     flights = random_flight.random_flights(CHANGES[change], seeds, 10.0, jax.random.key(sum(map(ord, change))))
     noisy = jax.vmap(jax.vmap(hardware.measure))(
-        jnp.asarray(flights.states, jnp.float32),
-        jax.random.split(jax.random.key(1), flights.states.shape[:2]),
+        jnp.asarray(flights.states, jnp.float32), jax.random.split(jax.random.key(1), flights.states.shape[:2])
     )
     field = with_disturbance(agents.nominal())
 

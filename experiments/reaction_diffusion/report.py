@@ -9,15 +9,7 @@ from experiments.reaction_diffusion import forecast, gray_scott, shifted
 from experiments.reaction_diffusion.config import LOCAL, POINTWISE
 from experiments.reaction_diffusion.shifted import AUTO
 from experiments.reporting.claims import Claim, Part, Undecided, all_of
-from experiments.reporting.names import (
-    FINE_TUNED,
-    HYBRID,
-    LEAST_SQUARES,
-    NO_PHYSICS,
-    SOURCE_ONLY,
-    TARGET_ONLY,
-    label,
-)
+from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, NO_PHYSICS, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.results import Results
 from experiments.reporting.tables import Table, cross_table, over_seeds, spread_text, tabulate
 

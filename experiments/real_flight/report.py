@@ -50,11 +50,7 @@ Errors are lengths of vectors, of rotation the angle; an RMSE over flights count
 
 
 def write(
-    config: RealFlightConfig,
-    sets: Mapping[str, Flights],
-    folds: Sequence[Fold],
-    rows: Results,
-    stages: Stages,
+    config: RealFlightConfig, sets: Mapping[str, Flights], folds: Sequence[Fold], rows: Results, stages: Stages
 ) -> None:
     split = [{"train": [*map(flight_of, fold.train)], "test": [*map(flight_of, fold.test)]} for fold in folds]
     said = [f"{name}: {line}" for name, each in sets.items() for line in each.said]

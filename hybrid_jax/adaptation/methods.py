@@ -97,11 +97,7 @@ class LeastSquares(Method):
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         n, d = train.x0.shape
-        options = {
-            "solver": settings.solver,
-            "max_steps": self.max_steps,
-            "scale": scale_of(settings.objective, d),
-        }
+        options = {"solver": settings.solver, "max_steps": self.max_steps, "scale": scale_of(settings.objective, d)}
         indices = None if self.indices is None else checks.places("indices", self.indices, d)
         larger = sized(with_disturbance(field, indices), d)
         start = larger if self.disturbance is True else field

@@ -2,15 +2,7 @@
 
 from hybrid_jax.control.controller import Controller, Plan
 from hybrid_jax.control.cost import Weights
-from hybrid_jax.control.loop import (
-    Flight,
-    Hardware,
-    Loop,
-    Performance,
-    fly,
-    open_loop_costs,
-    performance,
-)
+from hybrid_jax.control.loop import Flight, Hardware, Loop, Performance, fly, open_loop_costs, performance
 from hybrid_jax.control.observer import Observer
 from hybrid_jax.control.references import add_body_rates, figure_eight, hover, low_flyby, sample, step
 from hybrid_jax.control.sensitivities import advance, lagged_speeds

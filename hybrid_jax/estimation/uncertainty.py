@@ -12,13 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics import AbstractVectorField, Hybrid, trainable
-from hybrid_jax.dynamics.disturbance import (
-    disturbance_of,
-    disturbance_units,
-    physics_of,
-    sized,
-    with_disturbance,
-)
+from hybrid_jax.dynamics.disturbance import disturbance_of, disturbance_units, physics_of, sized, with_disturbance
 from hybrid_jax.estimation import least_squares
 from hybrid_jax.estimation.least_squares import LeastSquaresFit, Scale, Solver, fit_free, ravel_parameters
 from hybrid_jax.estimation.normal_equations import (
