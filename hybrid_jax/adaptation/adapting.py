@@ -31,7 +31,7 @@ from hybrid_jax.dynamics.disturbance import (
 )
 from hybrid_jax.dynamics.rigid_body import uncorrected
 from hybrid_jax.dynamics.window_checks import check_windows
-from hybrid_jax.estimation.least_squares import discretisation, warn_of_steps
+from hybrid_jax.estimation.discretisation import NAMED, compare_steps
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, sandwich
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import checked, compact
@@ -42,12 +42,11 @@ from hybrid_jax.runtime import entry, keep_programs, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
-from hybrid_jax.training.objective import UNSCALED, Settings
+from hybrid_jax.training.objective import UNSCALED, Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories, check_like, features_of, overflows, shares_outside
 
 FEWEST = 10  # windows, of which outliers are told apart
 HELD_OUT = 5  # one in so many windows validates
-NAMED = 50  # physics with more parameters is a network, and its weights are not listed
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; check dt and all units"
 NOT_FITTED = "no parameter was fitted"
@@ -152,9 +151,9 @@ def adapt(
     if disturbance_of(field) is None:
         adapted = uncorrected(without_zeros(adapted))  # what windows need
     status = Status(int(solution.status))
-    if exact and status != Status.DIVERGED:
-        scale = scale_of(settings.objective, windows.x0.shape[-1])
-        warn_of_steps(discretisation(adapted, windows, solver, scale))
+    if status != Status.DIVERGED and isinstance(settings.objective, TrajectoryLoss):
+        scale = settings.objective.scale(windows.x0.shape[-1])
+        compare_steps(adapted, windows, solver, scale, named=exact or None)
     space, found = state_space(field, windows.x0.shape[-1]), disturbance_of(adapted)
     choice = {} if solution.choice is None else _chosen(solution.choice, train, space)
     without = None if exact else NOT_LEAST_SQUARES

@@ -6,7 +6,6 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jaxtyping import Array, Int, PyTree
 
@@ -204,11 +203,6 @@ def scale_of(objective: Objective, d: int) -> Scale:
         remedy = "or take method='fine_tune', which minimises any"
         given = type(objective).__name__
         raise ValueError(f"settings.objective must be a TrajectoryLoss for least squares, got {given}; {remedy}")
-    if not isinstance(objective, ChannelLoss):
-        return None
-    if objective.huber is not None:
+    if isinstance(objective, ChannelLoss) and objective.huber is not None:
         raise ValueError("settings.objective must have no huber threshold for least squares")
-    scale = np.full(d, np.inf)  # a state in no channel does not count
-    for channel in objective.channels:
-        scale[channel.start : channel.stop] = channel.scale
-    return jnp.asarray(scale.astype(jnp.result_type(float)))  # JAX would compile a program that converts it
+    return objective.scale(d)

@@ -1,6 +1,5 @@
 """Nonlinear least squares for the physical parameters θ_p, in the physics' own parametrisation."""
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -9,7 +8,6 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
@@ -19,23 +17,18 @@ from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.dynamics.window_checks import check_windows
+from hybrid_jax.estimation.discretisation import Scale, Solver, compare_steps
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, corrected, judged, minimise, move_of_rows
 from hybrid_jax.implicit_solvers import solver_errors, unsolved
 from hybrid_jax.integrate import compact, rollout
-from hybrid_jax.metrics import errors_in
-from hybrid_jax.runtime import FASTEST_COMPILE, entry, jit_by_size, keep_programs
+from hybrid_jax.runtime import entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories, errors_of
 
 MANY, CHUNK = 10_000, 1000  # windows: of more, a triangle takes the place of J and r, and is found by so many at a time
 TOGETHER = 64  # windows that are linearised at a time
 LEAST = 0.1  # of what rounding does to the states: a step of which less is expected is the last
-COARSE = 0.5  # standard errors that half the solver's step may move a parameter
-REMEDY = "windows with a smaller dt, or a solver with more substeps, such as RK4(substeps=2)"
-FINE = 1e-3  # of how far the states move: smaller errors do not count as noise of which a fit is
 
-Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
-Scale = Float[Array, " d"] | None  # the error of each state that counts as 1; without one, 1 in its own unit
 Theta = Float[Array, " p"]
 
 
@@ -98,41 +91,8 @@ def fit_least_squares(
             return found
         if isinstance(solver, diffrax.AbstractImplicitSolver) and found.status == Status.DIVERGED:
             raise unsolved(solver)
-        moved = discretisation(found.field, windows, solver, scale)
-    warn_of_steps(moved)
+        moved = compare_steps(found.field, windows, solver, scale, named=True)
     return replace(found, discretisation=jnp.array(moved))
-
-
-def warn_of_steps(moved: float, remedy: str = REMEDY) -> None:
-    if moved > COARSE:
-        said = f"half the solver's step would move a parameter by {moved:.2g} standard errors: give {remedy}"
-        warnings.warn(said, stacklevel=4)
-
-
-def discretisation(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale) -> float:
-    """Return that of a fit at a field; no parameter moves by more standard errors than all predictions together."""
-    n, unit = len(windows), 1 if scale is None else np.asarray(scale)
-    some = windows if n <= MANY else windows[np.linspace(0, n - 1, CHUNK).astype(int)]
-    fine = replace(some, x=np.repeat(some.x, 2, axis=1), u=np.repeat(some.u, 2, axis=1), dt=some.dt / 2)
-    errors, halved = (np.asarray(errors_in(each, field, compact(solver))) for each in (some, fine))
-    parts, measured = (halved[:, 1::2] - errors, errors, some.x - some.x0[:, None], some.x), ~np.isnan(some.x)
-    change, errors, moved, states = (np.where(measured, np.asarray(each) / unit, 0) for each in parts)
-    noise = (np.linalg.norm(errors) + FINE * np.linalg.norm(moved)) / (measured.sum() * n / len(some)) ** 0.5
-    rounded = 2 * np.finfo(errors.dtype).eps * np.linalg.norm(states)  # both predictions
-    if np.linalg.norm(change) <= max(COARSE * noise, rounded):
-        return 0.0
-    return float(_standard_errors(field, some, solver, scale, change)) / noise
-
-
-@jit_by_size(FASTEST_COMPILE)
-def _standard_errors(field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, change):
-    """Compute by how many standard errors, in noise of 1, a change of the predictions moves a parameter at most."""
-    theta, unravel = ravel_parameters(fixed_residual(field))
-    jacobian, _ = _linearised(lambda at, w: prediction_errors(unravel(at), w, solver, scale), theta, windows)
-    jacobian = jacobian.reshape(-1, theta.size)
-    jacobian = jacobian / _nonzero(jnp.linalg.norm(jacobian, axis=0))
-    inverse = jnp.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
-    return jnp.max(jnp.abs(inverse @ jacobian.T @ change.ravel()) / _nonzero(jnp.sqrt(jnp.diagonal(inverse))))
 
 
 def _linearised(errors: Callable[[Theta, Trajectories], Array], theta: Theta, windows: Trajectories):

@@ -20,8 +20,9 @@ from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
+from hybrid_jax.estimation.discretisation import FINE, Solver, warn_of_steps
 from hybrid_jax.estimation.elimination import End, descend, reduced
-from hybrid_jax.estimation.least_squares import FINE, Solver, ravel_parameters, warn_of_steps
+from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.estimation.record_search import TINY, size_of
 from hybrid_jax.estimation.shooting import Problem
@@ -142,8 +143,7 @@ def fit_records(
         scale = {name: jnp.asarray(each) for name, each in (deviation | known).items()}
         problem = Problem(model, scale, np.inf, dt, RK4() if solver is None else solver, substeps)
         steps = record_search.steps_of(segment, gridded, dt)
-        theta = np.asarray(ravel_learned(model)[0])
-        near = record_search.deviations_of(model, prior or {})
+        theta, near = np.asarray(ravel_learned(model)[0]), record_search.deviations_of(model, prior or {})
         segments = shooting.cut(gridded, steps)
         nodes = len(gridded), 1 if segment is None else segments.valid.shape[1], 1
         centres, spread = jnp.tile(jnp.array(model.start), nodes), np.array(model.spread)[None]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.estimation.discretisation import compare_steps
 from hybrid_jax.metrics import window_mse
 from hybrid_jax.runtime import FAST_COMPILE, entry
 from hybrid_jax.status import Status
@@ -19,7 +20,7 @@ from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import LaneMap, count, lane, load_balance
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState, RunConfig
-from hybrid_jax.training.objective import Settings, check_minibatch, compiler_options
+from hybrid_jax.training.objective import Settings, TrajectoryLoss, check_minibatch, compiler_options
 from hybrid_jax.trajectories import Trajectories
 
 FIRST_BLOCK = 5  # epochs; later blocks are sized by the clock
@@ -64,6 +65,8 @@ def sweep(
 ) -> FitState:
     """Train each lane until it stops. If all have stopped already, the program is compiled and nothing is trained.
 
+    You get a warning if half the solver's step would change the lane with the best validation loss, as in `fit`.
+
     Args:
         validation: windows for early stopping, shared by all lanes.
         settings: see `fit`; the same for all lanes.
@@ -95,7 +98,7 @@ def sweep(
     costs = np.asarray(plans.n_train) + len(shared[1]) / 8  # a validation window costs an eighth of a training window
     none = np.zeros(len(costs), np.int32)
     block((states, plans, none), shared, costs, range(len(costs)))  # compiles, trains nothing
-    more, began = FIRST_BLOCK, time.perf_counter()
+    more, began, trains = FIRST_BLOCK, time.perf_counter(), np.any(states.status == Status.RUNNING)
     while len(active := np.flatnonzero(states.status == Status.RUNNING)):
         start = time.perf_counter()
         # A device with less work than the busiest trains its lanes for more epochs, so that none is idle.
@@ -105,6 +108,11 @@ def sweep(
         if on_block is not None:
             on_block(states, _progress(states, plans, time.perf_counter() - began))
         more = hosts.agreed(int(np.clip(more * block_seconds / (time.perf_counter() - start), 1, 4 * more)))
+    if trains and isinstance(settings.objective, TrajectoryLoss):
+        field, plan, mse = lane((states.best, plans, states.best_mse), int(np.argmin(states.best_mse)))
+        own, scale = train[plan.subset[: plan.n_train]], settings.objective.scale(train.x0.shape[-1])
+        if np.isfinite(mse):
+            compare_steps(field, own, settings.solver, scale)
     return states
 
 

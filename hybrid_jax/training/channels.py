@@ -71,6 +71,12 @@ class ChannelLoss(TrajectoryLoss):
             raise ValueError(f"{name}: states of at least {widest} numbers expected, got {size}")
         return windows
 
+    def scale(self, d: int) -> Float[Array, " d"]:
+        scale = np.full(d, np.inf)  # a state in no channel does not count
+        for channel in self.channels:
+            scale[channel.start : channel.stop] = channel.scale
+        return jnp.asarray(scale.astype(jnp.result_type(float)))  # JAX would compile a program that converts it
+
     def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
         return jnp.mean(self.error(jnp.moveaxis(difference, 1, -1)))
 

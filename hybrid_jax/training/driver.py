@@ -18,6 +18,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import check_batch_norm
 from hybrid_jax.dynamics.window_checks import check_windows
+from hybrid_jax.estimation.discretisation import compare_steps
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
@@ -62,6 +63,9 @@ class FitResult(eqx.Module):
             interrupted it.
         history: the losses of each epoch.
         state: the final state of the run.
+        discretisation: what half the solver's step would change. Without a network it is by how many standard errors a
+            parameter would move at most, else the change of the predictions over their errors. -1 if it was not
+            compared, as the run did not end well or the objective is not a `TrajectoryLoss`.
     """
 
     best: Learner
@@ -72,6 +76,7 @@ class FitResult(eqx.Module):
     status: Status
     history: History
     state: FitState
+    discretisation: float = -1.0
 
 
 class FitInterrupted(KeyboardInterrupt):
@@ -99,6 +104,8 @@ def fit(
     progress: Report | bool | None = None,
 ) -> FitResult:
     """Train a field by gradient descent with early stopping. `result.best` is the field of the best epoch.
+
+    You get a warning if `discretisation` is above 0.5: a network then learns the error of the solver's steps.
 
     If a network has no scaling of its inputs, the training windows determine one first; see `with_scaling`.
 
@@ -137,7 +144,7 @@ def fit(
     plan = make_run_config(each, np.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
     field = ready(field, train)  # scaling changes the tree of the field, but not what is learned
     plan = replace(plan, rates=jax.tree.structure(eqx.filter(field, trainable(field))).unflatten(plan.rates))
-    return drive(fitting.start(field, key, shared[-1]), plan, data, shared, progress)
+    return compared(drive(fitting.start(field, key, shared[-1]), plan, data, shared, progress), data, shared[1])
 
 
 def checked_arguments(
@@ -197,6 +204,16 @@ def ready(field: Learner, train: Trajectories) -> Learner:
     if (reason := check_savable(field)) is not None:
         warnings.warn(reason, stacklevel=4)
     return with_motion(with_scaling(field, train), train) if isinstance(field, AbstractVectorField) else field
+
+
+def compared(result: FitResult, data: PyTree, settings: Settings) -> FitResult:
+    """The result with its `discretisation`, of which it warns the user of an entry."""
+    loss = settings.objective
+    if result.status == Status.DIVERGED or not (isinstance(loss, TrajectoryLoss) and isinstance(data, Trajectories)):
+        return result
+    scale = loss.scale(data.x0.shape[-1])
+    moved = compare_steps(result.best, data, settings.solver, scale, stacklevel=5)
+    return replace(result, discretisation=moved)
 
 
 def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progress: Report | bool | None) -> FitResult:

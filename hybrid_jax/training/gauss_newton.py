@@ -5,6 +5,7 @@ double precision: squaring J in float32 would lose the least sensitive direction
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import diffrax
 import equinox as eqx
@@ -17,6 +18,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, ravel_learned
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.window_checks import check_windows
+from hybrid_jax.estimation.discretisation import compare_steps
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, in_python, minimise, move_of_equations
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
@@ -41,12 +43,14 @@ class GaussNewtonFit(eqx.Module):
         loss: its loss, L_MSE on the windows plus λ times the penalty.
         steps: the number of points that were tried.
         status: how the fit ended: OK if it stopped before `max_steps`, at a finite loss.
+        discretisation: what half the solver's step would change, as in `FitResult`; you get a warning above 0.5.
     """
 
     field: AbstractVectorField
     loss: float
     steps: int
     status: Status
+    discretisation: float = -1.0
 
 
 def residual_norm(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
@@ -128,7 +132,10 @@ def fit_gauss_newton(
     if scale is None and overflows(windows):
         return GaussNewtonFit(field, np.inf, 0, Status.DIVERGED)
     problem = _Problem(field, jnp.asarray(weight, float), scale, rows, RK4() if solver is None else solver)
-    return _descend(problem, jax.tree.map(jnp.asarray, windows), max_steps)
+    found = _descend(problem, jax.tree.map(jnp.asarray, windows), max_steps)
+    if found.status == Status.DIVERGED:
+        return found
+    return replace(found, discretisation=compare_steps(found.field, windows, problem.solver, scale))
 
 
 class _Problem(eqx.Module):

@@ -96,6 +96,14 @@ class TrajectoryLoss(Objective):
             value = value + weight * settings.regulariser(field, batch, predicted)
         return value, predicted
 
+    def scale(self, d: int) -> Float[Array, " d"] | None:
+        """Return the error of each state that counts as 1; None if each counts in its own unit.
+
+        Args:
+            d: size of the state.
+        """
+        return None
+
     def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
         """Return the error of a minibatch.
 

@@ -12,7 +12,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.io.files import named_leaves
 from hybrid_jax.runtime import entry
-from hybrid_jax.training.driver import FitResult, Report, checked_arguments, drive, ready
+from hybrid_jax.training.driver import FitResult, Report, checked_arguments, compared, drive, ready
 from hybrid_jax.training.fitting import FitState, Optimiser, make_run_config, start
 from hybrid_jax.training.objective import Learner, Settings
 from hybrid_jax.trajectories import Trajectories
@@ -127,4 +127,5 @@ def fit_in_stages(
         state = _judged(start(field, stage_key, shared[-1]), *shared[:2])
         results.append(drive(state, plan, windows, shared, progress))
         field = results[-1].best
+    results[-1] = compared(results[-1], data, shared[1])
     return results
