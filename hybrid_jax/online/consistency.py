@@ -15,10 +15,11 @@ from hybrid_jax.online import kalman
 from hybrid_jax.online.multiple_model import Verdict
 from hybrid_jax.online.samples import HUGE, Sample
 from hybrid_jax.online.state import OnlineState
-from hybrid_jax.online.tuning import TRIAL, WINDOW, Tuning
+from hybrid_jax.online.tuning import BURST, TRIAL, WINDOW, Tuning
 
 NEAR = 0.95  # share of its bound from which a parameter counts as at it
-AT_BOUND = 5.0  # alarms as which one at its bound counts in a second
+PERSISTENT = 5.0  # alarms as which a parameter at its bound, or an unlikely error, counts in a second
+UNLIKELY = 0.5  # share of `Tuning.reject` from which errors count as alarms, if they last
 SETTLED = 0.5  # count of alarms below which an estimate is kept
 
 
@@ -29,17 +30,19 @@ def believed(
     share = jnp.sum(verdict.squares) / jnp.maximum(jnp.sum(jnp.where(sample.seen, 1.0, 0.0)), 1.0)
     nis = state.nis + jnp.where(sample.measured, -jnp.expm1(-periods / WINDOW), 0.0) * (share - state.nis)
     at_bound = sample.measured & (jnp.max(jnp.abs(verdict.theta)) >= NEAR * tuning.bound)
-    added = jnp.where(verdict.changed, 1.0, 0.0) + jnp.where(at_bound, AT_BOUND * periods, 0.0)
+    wrong = at_bound | (nis > UNLIKELY * tuning.reject)
+    added = jnp.where(verdict.changed, 1.0, 0.0) + jnp.where(wrong, PERSISTENT * periods, 0.0)
     counted = state.doubt * jnp.exp(-periods * sample.elapsed / TRIAL) + added
     # Once it is too large it is doubled, and so takes time to fall.
-    doubled = jnp.where(added > 0, 2 * tuning.alarms, counted)
-    doubt = jnp.where(counted >= tuning.alarms, doubled, counted)
+    begins = (counted >= tuning.alarms) & (state.doubt < tuning.alarms)
+    doubt = jnp.where(begins, 2 * tuning.alarms, jnp.minimum(counted, 2 * tuning.alarms))
     trusted = jnp.where(nis < tuning.reject, verdict.theta, state.trusted)
-    trusted = jnp.where(doubt < tuning.alarms, trusted, state.settled)
+    burst = state.burst * jnp.exp(-periods * sample.elapsed) + jnp.where(verdict.changed, 1.0, 0.0)
+    trusted = jnp.where((doubt < tuning.alarms) & (burst < BURST), trusted, state.settled)
     # A mean, as the last value may be that of a gust, or of a fault before its first alarm.
     rate = jnp.where(doubt < SETTLED, -jnp.expm1(-periods / TRIAL), 0.0)
     settled = state.settled + rate * (trusted - state.settled)
-    return {"nis": nis, "doubt": doubt, "trusted": trusted, "settled": settled}
+    return {"nis": nis, "doubt": doubt, "burst": burst, "trusted": trusted, "settled": settled}
 
 
 def sound(new: OnlineState, begun: OnlineState, old: OnlineState, variances: Float[Array, " d"]) -> OnlineState:

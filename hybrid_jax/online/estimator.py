@@ -27,7 +27,7 @@ from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import Interval, intervals
 from hybrid_jax.integrate import check_callable, check_field
 from hybrid_jax.online import consistency, excitation, kalman, multiple_model
-from hybrid_jax.online.change_test import EAGER, ChangeTest
+from hybrid_jax.online.change_test import EAGER, PART, ChangeTest
 from hybrid_jax.online.excitation import Excitation
 from hybrid_jax.online.hypotheses import Hypothesis, ModelSet, Subspace, model_set, subspace_of
 from hybrid_jax.online.kalman import Belief, Correction, Each, FilterModel
@@ -38,8 +38,7 @@ from hybrid_jax.online.tuning import HOLD, MEMORY, PAUSE, Tuning
 from hybrid_jax.runtime import entry
 
 RISE, FALL = 10.0, 0.2  # of the logarithm of how much faster [1/s]
-# Random walk of a disturbance, in its prior [1/√s], whose effects a parameter's must exceed: of a gust that lasts for a
-# second, with an rms of a sixth of the prior. The filter cannot know of gusts before they come.
+# Random walk of a disturbance, in its prior [1/√s], which a parameter's effect must exceed: a gust of a sixth of it.
 BREEZE = 0.25
 TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a parameter explains
 
@@ -112,8 +111,8 @@ class OnlineAdaptation(AbstractEstimator):
         self.field, self.dt = field, float(dt)
         self.noise, self.process = (tuple(np.ravel(numbers).tolist()) for numbers in (noise, process))
         self.names, self.scales = named_priors(field, prior, disturbance)
-        given = checks.list_of("hypotheses", hypotheses, Hypothesis)
-        self.hypotheses = tuple(subspace_of(hypothesis, self.names, self.scales) for hypothesis in given)
+        given = (subspace_of(h, self.names, self.scales) for h in checks.list_of("hypotheses", hypotheses, Hypothesis))
+        self.hypotheses = tuple(given)
 
     @entry
     def begin(self, x: Float[Array, " d"]) -> OnlineState:
@@ -141,6 +140,7 @@ class OnlineAdaptation(AbstractEstimator):
             trusted=theta,
             settled=theta,
             doubt=zero,
+            burst=zero,
             opened=theta,
             haste=theta,
             nis=zero + 1,
@@ -176,7 +176,8 @@ class OnlineAdaptation(AbstractEstimator):
         model = self._filter_model(sample, each)
         d, variances, tuning, periods = len(x), model.variances, self.tuning, self.dt / self.tuning.pace
         belief, told, correction, gains = self._filtered(state, model, sample)
-        test, opened = state.test.after(correction.white, gains, sample, periods, tuning, PAUSE)
+        part = np.where(self._varies(), PART, EAGER)
+        test, opened = state.test.after(correction.white, gains, sample, periods, tuning, PAUSE, part)
         opens = jnp.max(opened) > 0
         verdict = Verdict(None, belief.z[d:], jnp.square(correction.white), opens, opens)
         if state.mixture is not None:
@@ -256,8 +257,7 @@ class OnlineAdaptation(AbstractEstimator):
         x, (start, unravel) = sample.x, ravel_parameters(self.field)
 
         def rates(x, theta):
-            moved = start + jnp.asarray(self.scales, x.dtype) * theta
-            return unravel(moved.astype(start.dtype))(x, sample.u)
+            return unravel((start + jnp.asarray(self.scales, x.dtype) * theta).astype(start.dtype))(x, sample.u)
 
         added = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, x.dtype)), x.shape)
         unit = state_space(self.field, len(x)).normalise
@@ -268,22 +268,23 @@ class OnlineAdaptation(AbstractEstimator):
     ) -> tuple[Belief, Excitation, Correction, Array]:
         """Update the filter of all parameters along excited directions; also return excitation and gains of θ."""
         d, tuning, ones = len(state.x), self.tuning, jnp.ones_like(state.theta)
-        walk = tuning.drift * jnp.exp(state.haste)
-        periods = self.dt / tuning.pace
+        walk, periods = tuning.drift * jnp.exp(state.haste), self.dt / tuning.pace
         diffusion = periods * sample.elapsed * jnp.square(walk)
         diffusion = diffusion + state.opened * jnp.maximum(1 - jnp.sum(jnp.square(state.root[d:]), axis=1), 0.0)
-        belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted)
-        belief = kalman.limit_covariance(belief, ones)
-        predicted = kalman.reset_state(belief, sample, sample.restart, model.variances)
+        varies, share = (jnp.asarray(np.where(self._varies(), *each), ones.dtype) for each in ((1, 0), (TAKEN, 1)))
+        # A disturbance takes what is not estimated. Hypotheses compete by likelihood, for which all doubt counts.
+        alone = tuning.excitation and self._varies().any() and not self.hypotheses
+        part = state.excitation.estimated(share) if alone else None
+        belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted, part)
+        predicted = kalman.reset_state(kalman.limit_covariance(belief, ones), sample, sample.restart, model.variances)
         belief, correction = kalman.correct(predicted, sample, model)
         told, gains = state.excitation, correction.gains[:, d:]
         if tuning.excitation:
-            varies = jnp.asarray(np.where(self._varies(), 1.0, 0.0), ones.dtype)
             # Each alarm but the first in 10 s is like a step of a random walk by the prior: a gust that has just begun.
             begun = jnp.sqrt(jnp.maximum(state.doubt - 1, 0.0) / MEMORY)
             breeze = jnp.maximum(jnp.minimum(begun, tuning.drift * tuning.gusts), BREEZE)
-            hidden, share = jnp.maximum(walk, breeze * varies), 1 + (TAKEN - 1) * varies
-            told = excitation.after_sample(told, slope, correction, sample, hidden, share, periods, tuning)
+            walk = jnp.maximum(walk, breeze * varies)
+            told = excitation.after_sample(told, slope, correction, sample, walk, share, periods, tuning)
             belief, gains = excitation.consider(predicted, belief, correction, told, share)
         return kalman.triangular(belief, d), told, correction, gains
 
@@ -294,5 +295,6 @@ class OnlineAdaptation(AbstractEstimator):
         rise = jnp.where(pulled > 0, RISE * jnp.minimum(pulled, 4.0), -FALL)
         rise = self.dt / tuning.pace * jnp.where(sample.measured, rise, 0.0)
         haste = jnp.clip(state.haste + rise + jnp.where(opens & (pulled > 0), 1.0, 0.0), 0.0, math.log(tuning.gusts))
-        # What opens to its prior need not walk there.
-        return jnp.asarray(varies, haste.dtype) * haste if varies.any() else jnp.where(opens, 0.0, haste)
+        return (
+            jnp.asarray(varies, haste.dtype) * haste if varies.any() else jnp.where(opens, 0.0, haste)
+        )  # what opens need not walk

@@ -53,6 +53,10 @@ class Excitation(eqx.Module):
             found = 3 * twice - 2 * twice @ found
         return found
 
+    def estimated(self, share: Float[Array, " p"]) -> Float[Array, "*n p p"]:
+        """The projection on the other directions, in units of the prior."""
+        return jnp.eye(len(share), dtype=share.dtype) - share[:, None] * self.considered() / share
+
 
 def after_sample(
     excitation: Excitation,

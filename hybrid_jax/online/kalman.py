@@ -76,14 +76,19 @@ def predict(
     transition: Float[Array, "k k"] | None,
     diffusion: Float[Array, " k"],
     acted: Bool[Array, ""],
+    part: Float[Array, "k k"] | None = None,
 ) -> tuple[Belief, Float[Array, "d n"]]:
-    """Predict one period if a known input was applied; also return the Jacobian of the next x."""
+    """Predict one period if a known input was applied; also return the Jacobian of the next x.
+
+    `part` projects a on the directions that are estimated, by default all; only these call for caution.
+    """
     z, root = belief
     d = len(model.variances)
     moved, slope = step_with_jacobian(model, field, z[:d], z[d:])
     own, a = root[d:], z[d:]
+    learned = own if part is None else part @ own
     # Products of errors of a and of x, which a linear filter leaves out, move the state while a is uncertain.
-    noise = model.process_noise + model.tuning.caution**2 * jnp.sum(jnp.square(slope[:, d:] @ own), axis=1)
+    noise = model.process_noise + model.tuning.caution**2 * jnp.sum(jnp.square(slope[:, d:] @ learned), axis=1)
     if transition is not None:
         own, a = transition @ own, transition @ a
     later = jnp.where(acted, jnp.concatenate([slope @ root, own]), root)

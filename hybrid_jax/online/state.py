@@ -18,7 +18,7 @@ from hybrid_jax.online.excitation import TAKES_PART, Excitation
 from hybrid_jax.online.kalman import Belief
 from hybrid_jax.online.multiple_model import Mixture
 from hybrid_jax.online.samples import SampleHistory
-from hybrid_jax.online.tuning import Tuning
+from hybrid_jax.online.tuning import BURST, Tuning
 
 DISTURBANCE = "disturbance"
 Numbers = float | tuple[float, ...] | np.ndarray
@@ -36,7 +36,8 @@ class OnlineState(eqx.Module):
         mixture: the filters of the hypotheses and their weights; None without hypotheses.
         trusted: the last consistent θ, which the model uses.
         settled: their mean over the last 10 s without alarms, restored if alarms persist.
-        doubt: number of recent alarms.
+        doubt: number of alarms in the last 10 s.
+        burst: number of alarms in the last second.
         opened: 1 for each parameter whose variance rises to its prior before the next sample, after an alarm; else 0.
         haste: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.
         nis: mean normalised innovation squared, 1 if noise and model are correct.
@@ -54,6 +55,7 @@ class OnlineState(eqx.Module):
     trusted: Float[Array, "*n p"]
     settled: Float[Array, "*n p"]
     doubt: Float[Array, "*n"]
+    burst: Float[Array, "*n"]
     opened: Float[Array, "*n p"]
     haste: Float[Array, "*n p"]
     nis: Float[Array, "*n"]
@@ -103,7 +105,7 @@ def flags_of(state: OnlineState, tuning: Tuning) -> Flags:
         frozen=state.history.equal >= tuning.frozen,
         gap=state.history.silent > tuning.gap,
         changed=test.quiet < 1,
-        inconsistent=(state.nis >= tuning.reject) | (state.doubt >= tuning.alarms),
+        inconsistent=(state.nis >= tuning.reject) | (state.doubt >= tuning.alarms) | (state.burst >= BURST),
         unexcited=jnp.diagonal(considered, axis1=-2, axis2=-1) > TAKES_PART,
         at_bound=jnp.abs(state.trusted) >= tuning.bound,
     )

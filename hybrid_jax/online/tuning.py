@@ -9,6 +9,7 @@ from hybrid_jax import checks
 SPANS = (0.05, 0.5)  # of the two sums of the change test
 PAUSE, SETTLE, HOLD = 0.1, 0.3, 0.6  # least time from an alarm to the next, of a mixture, and to an unexplained one
 WINDOW, TRIAL, MEMORY = 0.2, 10.0, 2.0  # time constants of the mean NIS, the count of alarms, and the information
+BURST = 2.0  # alarms in a second (weighted by e⁻ᵗ) from which an estimate is not used: they mean that it is moving
 SLOWEST = 0.05  # period up to which a pace of 1 is right
 
 
