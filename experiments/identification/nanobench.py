@@ -41,6 +41,7 @@ PAST = 200  # intervals before a window: on flights of A that were left out fewe
 FIT_STEPS = 12  # of Levenberg–Marquardt, of which the first few count
 FORCE = Layout(dt=DT, steps=50, most=200, disturbance=(0.0,) * 6)
 LEARN = ("Ix", "Iy", "Iz", "k_rotors", "centre_of_mass", "torque_gain", "drag", "aerodynamic_moment", "rate_damping")
+TEN = "adapted from A, ten seconds"
 OBSERVED = ", past 2 s"  # of a model with the mean force and torque that it lacked in the past of a window
 SCALE = np.repeat([0.1, 0.05, 0.2, 0.2], [3, 4, 3, 3]).astype(np.float32)  # of the errors of p, q, v and ω
 
@@ -49,7 +50,7 @@ SCALE = np.repeat([0.1, 0.05, 0.2, 0.2], [3, 4, 3, 3]).astype(np.float32)  # of 
 class Options:
     """From one airframe to another, in the data set NanoBench: flights of an airframe A, and of B, which replaced it.
 
-    Each flight of B is left out in turn; the model learns from the others, or from ten seconds of one of them.
+    Each flight of B is left out in turn; the model learns from the others, or from ten seconds of each of them in turn.
     """
 
     folder: Annotated[Path, tyro.conf.Positional]
@@ -82,7 +83,7 @@ def flight_of(recording: Recording, field: Actuated) -> FlightLog:
     return FlightLog(t, x, speeds, recording.name)[within(t, flights)]
 
 
-def windows_of(recordings, field: Actuated, stride: int = STRIDE) -> hj.Trajectories:
+def windows_of(recordings, field: Actuated, stride: int) -> hj.Trajectories:
     return cut_windows([flight_of(each, field) for each in recordings], STEPS, stride)
 
 
@@ -109,8 +110,7 @@ def errors(field, tests: hj.Trajectories, observed: bool = False) -> list[float]
     return [float(np.sqrt(np.mean(np.asarray(part)[:, at] ** 2))) for at in (9, 49) for part in found]
 
 
-def fitted_to(start, recordings: list[Recording], field: Actuated, stride: int = 50):
-    windows = windows_of(recordings, field, stride)
+def fitted_to(start, windows: hj.Trajectories):
     return fit_least_squares(start, windows, max_steps=FIT_STEPS, scale=jnp.asarray(SCALE)).field
 
 
@@ -121,43 +121,63 @@ def run(options: Options) -> None:
     a, b = ([read_recording(options.folder / f"{name}.csv.gz", columns) for name in part] for part in flown)
     aware, constant = thrust_of(a), thrust_of(a, voltage=False)
     console.print("A:", {name: np.asarray(value).round(4).tolist() for name, value in aware.theta().items()})
-    of_a = fitted_to(rigid_body(VEHICLE, LEARN, Terms()), a, aware, 100)
+    learned = windows_of(a, aware, 100)
+    of_a = fitted_to(rigid_body(VEHICLE, LEARN, Terms()), learned)
+    tens = [first_seconds(each, SECONDS)[0] for each in b]
+    few = [thrust_of([each], start=aware, free=("curve",)) for each in tens]
+    windows = [windows_of([one], each, STEPS) for one, each in zip(tens, few, strict=True)]
+    adapted = [hj.adapt(of_a, each, learned_from=learned) for each in windows]
+    console.print("Chosen from ten seconds:", [each.chosen for each in adapted])
     forces, scores = [], {}
     for i, left in enumerate(b):
         others = b[:i] + b[i + 1 :]
         fitted, gain = thrust_of(others, start=aware), thrust_of(others, voltage=False, start=constant)
-        tens = [first_seconds(each, SECONDS)[0] for each in others]
-        few = [thrust_of([each], start=aware, free=("curve",)) for each in tens]
-        errors_few = np.concatenate([force_errors(each, left) for each in few])
+        errors_few = np.concatenate([force_errors(each, left) for each in few[:i] + few[i + 1 :]])
         forces.append([*(rmse(force_errors(each, left)) for each in (aware, fitted)), rmse(errors_few)])
         console.print(Path(left.name).name, [f"{each:.3f}" for each in forces[-1]])
-        test, plain, short = tests_of(left, fitted), tests_of(left, gain), tests_of(left, few[0])
-        simple = [fitted_to(rigid_body(VEHICLE), others, each) for each in (gain, fitted)]
+        test, plain, short = tests_of(left, fitted), tests_of(left, gain), [tests_of(left, each) for each in few]
+        simple = [fitted_to(rigid_body(VEHICLE), windows_of(others, each, 50)) for each in (gain, fitted)]
         models = {
-            "constant state": (HoldState(), test),
-            "frozen rates": (FrozenRates(simple[1]), test),
-            "physics, constant gain": (simple[0], plain),
-            "physics, voltage": (simple[1], test),
-            "adapted from A": (fitted_to(of_a, others, fitted), test),
-            "adapted from A, ten seconds": (fitted_to(of_a, tens[:1], few[0], 5), short),
+            "constant state": [(HoldState(), test)],
+            "frozen rates": [(FrozenRates(simple[1]), test)],
+            "physics, constant gain": [(simple[0], plain)],
+            "physics, voltage": [(simple[1], test)],
+            "adapted from A": [(fitted_to(of_a, windows_of(others, fitted, 50)), test)],
+            TEN: [(each.field, windows) for each, windows in zip(adapted, short, strict=True)],
         }
-        for (name, (model, windows)), observed in itertools.product(models.items(), (False, True)):
+        for (name, pairs), observed in itertools.product(models.items(), (False, True)):
             if name == "constant state" and observed:
                 continue
             line = scores.setdefault(name + OBSERVED * observed, [])
-            line.append(errors(model, windows, observed))
-            console.print(name + OBSERVED * observed, [f"{each:.3f}" for each in line[-1]])
+            line.append([errors(model, windows, observed) for model, windows in pairs])
+            console.print(name + OBSERVED * observed, [[f"{each:.3f}" for each in one] for one in line[-1]])
+    show(console, np.asarray(forces), {name: np.asarray(each) for name, each in scores.items()})
 
-    def pooled(part) -> tuple[str, ...]:
-        return tuple(f"{each:.3f}" for each in np.sqrt(np.mean(np.square(part), axis=0)))
 
+def show(console: Console, forces: Float[np.ndarray, "f 3"], scores: dict[str, Float[np.ndarray, "f m 8"]]) -> None:
+    """Print tables of errors over all flights left out, and of those from ten seconds of each flight on the others."""
+
+    def pooled(part) -> Float[np.ndarray, " e"]:
+        return np.sqrt(np.mean(np.square(part), axis=0))
+
+    def cells(numbers) -> tuple[str, ...]:
+        return tuple(f"{each:.3f}" for each in numbers)
+
+    names, other = ("p [m]", "v [m/s]", "R [rad]", "ω [rad/s]"), ~np.eye(len(forces), dtype=bool)
+    pairs = {name: np.broadcast_to(each, (*other.shape, each.shape[-1])) for name, each in scores.items()}
     title = "Specific force along the thrust, RMSE [m/s²]"
-    shown = [Table(title, ("from A alone", "fitted to B", "ten seconds of B"), [pooled(forces)])]
-    names = ("p [m]", "v [m/s]", "R [rad]", "ω [rad/s]")
-    for i, at in enumerate((0.1, 0.5)):
-        lines = [(name, *pooled(part)[4 * i : 4 * i + 4]) for name, part in scores.items()]
-        shown.append(Table(f"Flights of B left out, RMSE after {at} s", ("model", *names), lines))
-    for table in shown:
+    tables = [Table(title, ("from A alone", "fitted to B", "ten seconds of B"), [cells(pooled(forces))])]
+    for at, part in ((0.1, slice(4)), (0.5, slice(4, 8))):
+        lines = [(name, *cells(pooled(each[other])[part])) for name, each in pairs.items()]
+        tables.append(Table(f"Flights of B left out, RMSE after {at} s", ("model", *names), lines))
+        lines = []
+        for j, flight in enumerate(OF_B.split()):
+            own = {name: pooled(each[other[:, j], j])[part] for name, each in pairs.items()}
+            best = np.min([each for name, each in own.items() if "adapted" not in name], axis=0)
+            lines += [(flight, *cells(own[TEN + OBSERVED])), ("best baseline", *cells(best))]
+        title = f"Ten seconds of a flight{OBSERVED}: the others after {at} s"
+        tables.append(Table(title, ("flight", *names), lines))
+    for table in tables:
         print_table(console, table)
 
 
