@@ -1,6 +1,5 @@
 """Adaptation that chooses the most probable change, see `Auto`."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
@@ -25,7 +24,7 @@ from hybrid_jax.adaptation.anchored import (
 )
 from hybrid_jax.adaptation.expectation import errors_at_ends
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
-from hybrid_jax.adaptation.plausible import Plausible, extended, groups_of, names_of
+from hybrid_jax.adaptation.plausible import Plausible, extended, free_parameters, groups_of, names_of
 from hybrid_jax.adaptation.results import NETWORK
 from hybrid_jax.adaptation.selection import (
     BLOCKS,
@@ -52,24 +51,9 @@ from hybrid_jax.status import Status
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 
-# What each candidate fits, as groups of parameters. Those apply of which the field has all groups.
-CANDIDATES: Mapping[str, tuple[str, ...]] = {
-    "source": (),
-    "theta": ("theta",),
-    "disturbance": ("theta", "disturbance"),
-    "force": ("theta", "force"),
-    "drag": ("theta", "drag"),
-    "efficiency": ("theta", "efficiency"),
-    "force_torque": ("theta", "force", "torque"),
-    "force_drag": ("theta", "force", "drag"),
-    "force_efficiency": ("theta", "force", "efficiency"),
-    "force_torque_drag": ("theta", "force", "torque", "drag"),
-    "all": ("theta", "force", "torque", "drag", "efficiency"),
-}
 PLAUSIBLE = Plausible()
 VAGUE = 1 / 3  # of a plausible change: if a network may have taken more, a parameter is called effective
 ROUNDS = 2  # the second one around what the first has taken: squared errors are not quadratic over large changes
-CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
 
 class Choice(NamedTuple):
@@ -149,14 +133,15 @@ class Auto(Method):
                 effect = measure(field, train, solver, scale, starts)
             chosen, nothing, move, rows = judge(larger, train, found, every, source, learned_from, effect, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
+                options = chosen.sizes, *options[1:]
                 (_, found, starts), fitted = fits(larger, move, train, rows, *options), rows
                 if not traced and int(found.status) == Status.DIVERGED:
                     _, found, starts = fits(larger, still, train, rows, *options)
-        found, starts, chosen, left_out = confirm(self, larger, (found, starts), (first[0], first[2]), chosen, sizes)
+        found, starts, chosen, left_out = confirm(self, larger, (found, starts), (first[0], first[2]), chosen)
         if self.networks and network:
             step = anchor(larger, train, starts, found, solver, scale, nothing.error, self.blocks)
         outcome = found, chosen, left_out, source, nothing, effect, step
-        return conclude(self, field, larger, train, outcome, options[:2])
+        return conclude(self, field, larger, train, outcome, (sizes, solver))
 
 
 class OfSource(NamedTuple):
@@ -206,14 +191,14 @@ def _judge(
     return found, nothing, jnp.where(rows[1], every.theta - start, 0.0).astype(sizes.dtype), rows
 
 
-def _confirm(method: Auto, larger, changed, still, chosen: Posterior, sizes) -> tuple[Fit, Any, Posterior, Array]:
+def _confirm(method: Auto, larger, changed, still, chosen: Posterior) -> tuple[Fit, Any, Posterior, Array]:
     """Return the fit and the starts of the chosen change, or those of none if left-out blocks do not confirm it.
 
     The last are the parameters fitted without each block.
     """
     free, start = jnp.stack([*free_parameters(larger).values()])[chosen.taken], ravel_parameters(larger)[0]
     blocks = blocks_of(len(still[0].equations.score), method.blocks)
-    thetas = left_out_thetas(changed[0], free, sizes, start, blocks)
+    thetas = left_out_thetas(changed[0], free, chosen.sizes, start, blocks)
     sure = (chosen.taken == 0) | surely_lower(changed[0], still[0], thetas, blocks)
     found, starts = jax.tree.map(partial(jnp.where, sure), changed, still)
     chosen = chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
@@ -287,15 +272,3 @@ def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:
     adapted = ravel_parameters(larger)[1](choice.theta[index])
     return adapted if choice.change is None else with_change(adapted, choice.change[index])  # type: ignore
-
-
-def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
-    """Return which parameters of an extended field each candidate fits (c, p)."""
-    names, found = names_of(field), {}
-    group = groups_of(names)
-    lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
-    for name, fitted in CANDIDATES.items():
-        if set(fitted) <= {*group, "theta"}:
-            free = np.array([each in fitted for each in group])
-            found[name] = free & ~lost if "efficiency" in fitted else free
-    return found

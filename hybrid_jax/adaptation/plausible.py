@@ -1,6 +1,6 @@
-"""The prior of an adaptation: plausible sizes of changes, so that parameters without excitation do not fit noise."""
+"""The changes that an adaptation considers and their plausible sizes: a prior, so that noise is not fitted."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 
 import jax
@@ -20,6 +20,22 @@ from hybrid_jax.trajectories import Trajectories
 # Parameters of a corrected rigid body; the others are its own, θ_p.
 GROUPS = {"efficiency": "efficiency", "added_drag": "drag"}
 GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
+
+# What each candidate fits, as groups of parameters. Those apply of which the field has all groups.
+CANDIDATES: Mapping[str, tuple[str, ...]] = {
+    "source": (),
+    "theta": ("theta",),
+    "disturbance": ("theta", "disturbance"),
+    "force": ("theta", "force"),
+    "drag": ("theta", "drag"),
+    "efficiency": ("theta", "efficiency"),
+    "force_torque": ("theta", "force", "torque"),
+    "force_drag": ("theta", "force", "drag"),
+    "force_efficiency": ("theta", "force", "efficiency"),
+    "force_torque_drag": ("theta", "force", "torque", "drag"),
+    "all": ("theta", "force", "torque", "drag", "efficiency"),
+}
+CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
 
 @dataclass(frozen=True)
@@ -101,3 +117,15 @@ def groups_of(names: Sequence[str]) -> list[str]:
     steady = {name for name in names if name.startswith("disturbance[")}
     groups = GROUPS if steady <= GROUPS.keys() else GROUPS | dict.fromkeys(steady, "disturbance")
     return [groups.get(name, groups.get(name.split("[")[0], "theta")) for name in names]
+
+
+def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
+    """Return which parameters of an extended field each candidate fits (c, p)."""
+    names, found = names_of(field), {}
+    group = groups_of(names)
+    lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
+    for name, fitted in CANDIDATES.items():
+        if set(fitted) <= {*group, "theta"}:
+            free = np.array([each in fitted for each in group])
+            found[name] = free & ~lost if "efficiency" in fitted else free
+    return found

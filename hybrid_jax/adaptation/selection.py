@@ -125,6 +125,7 @@ class Posterior(NamedTuple):
     probability: Float[Array, " c"]  # of each change
     naive: Float[Array, " c"]  # the same probability if the source had no errors
     taken: Int[Array, ""]  # index of the chosen candidate
+    sizes: Float[Array, " p"]  # the prior of a fit whose errors have the variance of the noise, not the dispersion
 
 
 def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array, " p"]) -> Posterior:
@@ -153,7 +154,8 @@ def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array
     move, evidence = (jnp.split(each, 2) for each in jax.lax.map(of_candidate, priors))
     evidence, naive = (jnp.where(jnp.isfinite(each), each, -jnp.inf).at[0].max(-1e30) for each in evidence)
     taken = jnp.where(jnp.max(evidence) > evidence[0] + np.log(STRONG), jnp.argmax(evidence), 0)
-    return Posterior(start + jnp.nan_to_num(move[0]), jax.nn.softmax(evidence), jax.nn.softmax(naive), taken)
+    held = sizes * jnp.sqrt(every.noise / variance)
+    return Posterior(start + jnp.nan_to_num(move[0]), jax.nn.softmax(evidence), jax.nn.softmax(naive), taken, held)
 
 
 def spread(equations: NormalEquations, free: Bool[Array, " p"], of_source: Float[Array, "p p"]) -> Float[Array, "p p"]:

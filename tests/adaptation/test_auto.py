@@ -14,8 +14,7 @@ from pendulum import LENGTH, Push, flown, hybrid, pendulum, pushes
 import hybrid_jax as hj
 from hybrid_jax.adaptation import FineTune, adapt, auto, selection
 from hybrid_jax.adaptation.anchored import fit_anchored, taken_by_network, with_change
-from hybrid_jax.adaptation.auto import CANDIDATES, free_parameters
-from hybrid_jax.adaptation.plausible import extended
+from hybrid_jax.adaptation.plausible import CANDIDATES, extended, free_parameters
 from hybrid_jax.adaptation.selection import STRONG, Fit, alike, blocks_of, correlated, fit_each, posterior
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.estimation.least_squares import ravel_parameters
