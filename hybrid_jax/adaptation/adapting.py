@@ -285,5 +285,6 @@ def _parameters(
         "without_intervals": None,
         "covariance": whole,
         "degrees": degrees,
+        "absorbed": absorbed,
         "changed": tuple(sorted(moved, key=lambda name: -moved[name])),
     }

@@ -19,9 +19,9 @@ SOURCES = 3  # at least so many: the variance between two says nothing
 def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parameter]:
     """Combine the parameters of several results. Intervals include the variance within and between results.
 
-    The covariance of one fit assumes an exact network. Sources with different seeds differ in what their networks
-    absorbed, so they are combined as in multiple imputation (Rubin, Multiple Imputation for Nonresponse in Surveys,
-    1987, Sec. 3.1).
+    Sources with different seeds differ in what their networks absorbed. The variance between them takes the place of
+    the bound on it that a single result has, as in multiple imputation (Rubin, Multiple Imputation for Nonresponse in
+    Surveys, 1987, Sec. 3.1).
 
     Args:
         results: adaptations of sources that were trained with different seeds, all to the same windows.
@@ -89,7 +89,11 @@ def _estimates(result: Adaptation) -> dict[str, tuple[float, float, float]]:
     theta, _ = ravel_parameters(result.field)
     assert result.covariance is not None
     assert result.degrees is not None
-    known = zip(theta.tolist(), np.diag(result.covariance).tolist(), result.degrees.tolist(), strict=True)
+    whole = np.diag(result.covariance)
+    own = whole - (0.0 if result.absorbed is None else result.absorbed)
+    with np.errstate(invalid="ignore"):  # infinite, where nothing was fitted
+        degrees = result.degrees * np.square(own / whole)  # `satterthwaite`, without the part of infinite degrees
+    known = zip(theta.tolist(), own.tolist(), degrees.tolist(), strict=True)
     return dict(zip(named_parameters(result.field), known, strict=True))
 
 
