@@ -80,14 +80,6 @@ class Quantity:
         """
         return x
 
-    def canonical(self, x: Float[Array, " n *b"], own: Float[Array, " n *b"]) -> Float[Array, " n *b"]:
-        """Return x, or a derivative there, in the representation that networks read.
-
-        Args:
-            own: x itself or a derivative (n), which changes as x does.
-        """
-        return own
-
     def continuous(self, path: Float[np.ndarray, "t n"]) -> Float[np.ndarray, "t n"]:
         """Return a sequence of values without jumps between representations.
 
@@ -151,9 +143,6 @@ class Attitude(Quantity):
 
     def nearest(self, x, to):
         return jnp.where(jnp.sum(x * to) < 0, -x, x)
-
-    def canonical(self, x, own):
-        return jnp.where(x[0] < 0, -own, own)
 
     def continuous(self, path):
         turned = np.sum(path[..., 1:, :] * path[..., :-1, :], axis=-1) < 0
@@ -267,8 +256,10 @@ class StateSpace:
         Args:
             own: x itself or a derivative (d), which changes as x does.
         """
-        for part, one in self._curved():
-            own = jnp.concatenate([own[: part.start], one.canonical(x[part], own[part]), own[part.stop :]])
+        for part, one in self.parts:
+            if isinstance(one, Attitude):
+                turned = jnp.where(x[part.start] < 0, -own[part], own[part])
+                own = jnp.concatenate([own[: part.start], turned, own[part.stop :]])
         return own
 
     def continuous(self, x0: Numbers, x: Numbers) -> Numbers:
