@@ -9,7 +9,7 @@ import numpy as np
 import scipy  # not scipy.stats, which takes half a second to import
 from jaxtyping import Array, Bool, Float
 
-from hybrid_jax.adaptation.selection import blocks_of
+from hybrid_jax.adaptation.selection import ALIKE, blocks_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import Solver
 from hybrid_jax.integrate import compact, rollout
@@ -18,7 +18,6 @@ from hybrid_jax.trajectories import Trajectories, errors_of
 
 LEVEL = 0.8
 JOINED = 10  # windows that touch, at most so many, are predicted as one
-ALIKE = 2  # so many blocks of one flight count as one: neighbours are alike, and another flight differs more
 Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
 
 

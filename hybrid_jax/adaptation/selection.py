@@ -30,6 +30,7 @@ FEW = 10  # windows, of which no order is seen
 SHIFTS = 20  # other windows that each is compared with
 SURELY = 2.0  # standard errors by which one model must predict better to replace another
 ENOUGH = 5  # blocks, to know a standard error
+ALIKE = 2  # so many blocks of one flight count as one: neighbours are alike, and another flight differs more
 STRONG = 20.0  # odds against no change from which one is believed (Kass and Raftery 1995)
 TINY = float(np.finfo(np.float32).tiny)
 
@@ -233,7 +234,7 @@ def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) ->
     before, after = (jnp.sum(square * blocks[1], axis=1) for square in (still.equations.square[blocks[0]], after))
     least = jnp.maximum(jnp.finfo(before.dtype).eps * before, TINY)
     gain = jnp.log(jnp.maximum(before, least) / jnp.maximum(after, least))
-    enough = jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) / len(gain) ** 0.5
+    enough = jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) * (ALIKE / len(gain)) ** 0.5
     return enough if len(gain) >= ENOUGH else jnp.array(True)
 
 
