@@ -29,7 +29,7 @@ QUESTIONS = {
     "coverage": Asked(
         "Do 95 % intervals contain the true value?",
         (
-            "One source model is enough for a parameter that it calls physical; pool three for one that it calls effective.",
+            "One source model is enough for a parameter that it calls physical; pool three for an effective one.",
             "This holds where physics has every force that acts; elsewhere an interval can miss the true value.",
         ),
     ),
