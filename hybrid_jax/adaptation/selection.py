@@ -227,8 +227,9 @@ def left_out_thetas(found: Fit, free: Bool[Array, " p"], sizes, start, blocks) -
 def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) -> Bool[Array, ""]:
     """Whether a change lowers the logarithm of the error of blocks left out by more than `SURELY` standard errors.
 
-    Evidence assumes independent errors; where physics lacks something they are not. The logarithm is the likelihood of
-    a block of unknown variance, in which no block outweighs the others. See `left_out_thetas`.
+    `ALIKE` neighbouring blocks count as one. Evidence assumes independent errors; where physics lacks something they
+    are not. The logarithm is the likelihood of a block of unknown variance, in which no block outweighs the others. See
+    `left_out_thetas`.
     """
     after = jax.vmap(lambda theta, place: found.at(theta).square[place])(thetas, blocks[0])
     before, after = (jnp.sum(square * blocks[1], axis=1) for square in (still.equations.square[blocks[0]], after))
