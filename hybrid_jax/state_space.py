@@ -262,23 +262,6 @@ class StateSpace:
                 own = jnp.concatenate([own[: part.start], turned, own[part.stop :]])
         return own
 
-    def continuous(self, x0: Numbers, x: Numbers) -> Numbers:
-        """Return trajectories without jumps between representations; traced ones stay unchanged.
-
-        Args:
-            x0: the initial states (…, d), which stay unchanged.
-            x: the states that follow (…, t, d).
-        """
-        if checks.is_traced(x0) or checks.is_traced(x):
-            return x
-        for part, one in self._curved():
-            own = np.asarray(x0)[..., part], np.asarray(x)[..., part]
-            path = np.concatenate([own[0][..., None, :], last_measured(*own)], axis=-2)
-            if not np.array_equal(found := one.continuous(path), path):
-                x = np.array(x)
-                x[..., part] = np.where(np.isnan(own[1]), np.nan, found[..., 1:, :])
-        return x
-
     def check(self, name: str, x: Numbers) -> None:
         """Raise an error if a state is invalid, for example if a quaternion is not of unit length.
 
@@ -298,14 +281,3 @@ class StateSpace:
 
     def _curved(self) -> Iterator[tuple[slice, Quantity]]:
         return ((part, one) for part, one in self.parts if not one.is_vector)
-
-
-def last_measured(x0: Numbers, x: Numbers) -> Float[np.ndarray, "*n t d"]:
-    """The states with each number that is NaN, not measured, replaced by its last measured value."""
-    x = np.asarray(x)
-    if not (missing := np.isnan(x)).any():
-        return x
-    path = np.concatenate([np.asarray(x0)[..., None, :], x], axis=-2)
-    places = np.arange(1, path.shape[-2])[:, None]
-    last = np.maximum.accumulate(np.where(missing, 0, places), axis=-2)
-    return np.take_along_axis(path, last, axis=-2)

@@ -92,6 +92,17 @@ def errors_of(predicted: Float[Array, "*s"], x: Float[Array | np.ndarray, "*s"])
     return jnp.where(jnp.isnan(x), 0, predicted - x)
 
 
+def last_measured(windows: Trajectories) -> Float[np.ndarray, "*n t d"]:
+    """The states with each number that is NaN, not measured, replaced by its last measured value."""
+    x = np.asarray(windows.x)
+    if not (missing := np.isnan(x)).any():
+        return x
+    path = np.concatenate([np.asarray(windows.x0)[..., None, :], x], axis=-2)
+    places = np.arange(1, path.shape[-2])[:, None]
+    last = np.maximum.accumulate(np.where(missing, 0, places), axis=-2)
+    return np.take_along_axis(path, last, axis=-2)
+
+
 def overflows(trajectories: Trajectories) -> bool:
     """Whether squares of its states overflow their type, for example 1e30 in float32: then no loss is finite."""
     states = np.asarray(trajectories.x0), np.asarray(trajectories.x)

@@ -13,8 +13,8 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, ravel_learned, state_space
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
-from hybrid_jax.state_space import Attitude, Quantity, StateSpace, last_measured
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.state_space import Attitude, Quantity, StateSpace
+from hybrid_jax.trajectories import Trajectories, check, last_measured
 
 ALIKE, FAR = 0.9, 3.0  # correlation of a rate with what it is the rate of, and a factor between them that is a unit
 TINY = 1e-12  # added to the size of a change
@@ -30,7 +30,7 @@ def check_windows(
     """
     check(windows, name, missing)
     space = state_space(field, windows.x0.shape[-1])
-    known = windows.x if checks.is_traced(windows.x) else last_measured(windows.x0, windows.x)
+    known = windows.x if checks.is_traced(windows.x) else last_measured(windows)
     for part, states in (("x0", windows.x0), ("x", known)):
         space.check(f"{name}: {part}", states)
     _warn_of_turns(space, windows.x0, known, name)
@@ -109,5 +109,10 @@ def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectorie
     double = any(eqx.is_inexact_array(leaf) and leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(field))
     if double and windows.x0.dtype != jnp.float64:  # a step of the solver keeps a type
         windows = replace(windows, **{part: getattr(windows, part).astype(jnp.float64) for part in ("x0", "u", "x")})
-    x = state_space(field, windows.x0.shape[-1]).continuous(windows.x0, windows.x)
-    return windows if x is windows.x else replace(windows, x=x)
+    if checks.is_traced(windows.x0) or checks.is_traced(windows.x):
+        return windows
+    path = np.concatenate([np.asarray(windows.x0)[:, None], last_measured(windows)], axis=1)
+    found = [one.continuous(path[..., part]) for part, one in state_space(field, path.shape[-1]).parts]
+    if np.array_equal(joined := np.concatenate(found, axis=-1), path):
+        return windows
+    return replace(windows, x=np.where(np.isnan(windows.x), np.nan, joined[:, 1:]))

@@ -15,8 +15,7 @@ from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import AbstractScaling, Channels, ChannelScaling
-from hybrid_jax.state_space import last_measured
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, last_measured
 
 SAMPLES, SMALL = 10_000, 64  # intervals that are looked at, at most, of a state of so many numbers; fewer of a larger
 KEPT, MOST = 50_000, 100  # numbers and windows of its motion that a network keeps, at most
@@ -74,7 +73,7 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     unset = [eqx.tree_equal(network.scaling, ChannelScaling()) for network in networks]
     if not any(unset):
         return field
-    x0, u, after = np.asarray(windows.x0), np.asarray(windows.u), last_measured(windows.x0, windows.x)
+    x0, u, after = np.asarray(windows.x0), np.asarray(windows.u), last_measured(windows)
     before = np.concatenate([x0[:, None], after[:, :-1]], axis=1)
     samples = before.shape[0] * before.shape[1]
     every = -(-samples // max(1, SAMPLES * SMALL // max(SMALL, before.shape[2])))

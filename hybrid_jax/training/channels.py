@@ -11,9 +11,8 @@ from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import CHUNK
-from hybrid_jax.state_space import last_measured
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
-from hybrid_jax.trajectories import Trajectories, check, errors_of
+from hybrid_jax.trajectories import Trajectories, check, errors_of, last_measured
 
 FLOOR = 1e-3  # least scale of a state over its size: one that hardly changes must not outweigh the others
 
@@ -108,7 +107,7 @@ class ChannelLoss(TrajectoryLoss):
 def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLoss:
     """A loss relative to the RMS change over a window of each quantity in the field's state space."""
     parts = [part for part, _ in state_space(field, windows.x0.shape[-1]).parts]
-    x0, end = np.asarray(windows.x0, float), last_measured(windows.x0, windows.x)[:, -1].astype(float)
+    x0, end = np.asarray(windows.x0, float), last_measured(windows)[:, -1].astype(float)
 
     def rms(vectors: Float[np.ndarray, "n k"]) -> float:
         return float(np.sqrt(np.mean(np.sum(np.square(vectors), axis=-1))))
