@@ -20,7 +20,7 @@ INDEXED = re.compile(
     r"_([Dipdkmtuvxyz0]|up|down|MSE|reg)(?![a-zA-Z0-9_])",
     re.DOTALL,
 )
-DOTTED = re.compile(r"<mover><mi>(\w)</mi><mo>&#x002D9;</mo></mover>")
+NORM = "<mo>&#x02016;</mo>"  # would be as high as its whole line
 ROOT = Path(__file__).parents[2]
 
 
@@ -61,9 +61,8 @@ def on_page_content(content, page, config, files):
 
     def formula(found):
         text = html.unescape(found[2]).strip()
-        # A letter with its dot, since browsers set a dot above too small.
-        dotted = r'<mi style="font-style: italic">\1&#x0307;</mi>'
-        return DOTTED.sub(dotted, convert(text, display=display[found[1]]))
+        formula = convert(text, display=display[found[1]])
+        return formula.replace(NORM, NORM.replace(">", ' stretchy="false">', 1))
 
     def indexed(found):
         if found[2] is None:

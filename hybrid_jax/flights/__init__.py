@@ -1,6 +1,7 @@
 """Recorded flights: read logs, check them, clean them and cut them into training windows.
 
-    windows = hj.load_windows("flights/", hj.load_vehicle("vehicle.toml"), steps=10)  # one log of any format per flight
+    vehicle = hj.load_vehicle("vehicle.toml")
+    windows = hj.load_windows("flights/", vehicle, steps=10)  # a log of any format per flight
 
 You can also take each step yourself. Split by flight before cutting: windows of one flight share samples and wind.
 

@@ -16,12 +16,12 @@ class Hypothesis:
 
         Hypothesis("inertia", {"Ix": 0.3, "Iy": 0.3})
         Hypothesis("mass", together=({"efficiency": -0.2, "Ix": -0.2, "Iy": -0.2},))
-        Hypothesis("wind", {"disturbance[vx]": 3.0, "disturbance[vy]": 3.0}, rates={"disturbance[vx]": 1.5}, lead=0.1)
+        Hypothesis("wind", {"disturbance[vx]": 3.0}, rates={"disturbance[vx]": 1.5}, lead=0.1)
 
     Attributes:
         name: name of the hypothesis in messages.
-        parameters: standard deviation of the independent change of each parameter, in the physics' own
-            parametrisation, by name: efficiency[0] is one entry, efficiency a whole array.
+        parameters: standard deviation of the independent change of each parameter, as physics stores it, by name:
+            efficiency[0] is one entry, efficiency a whole array.
         together: shared factors (unit variance) that scale several parameters, for example a mass.
         rates: standard deviation of the rate of change of a parameter in `parameters` [1/s]. The rate is a random walk
             that moves by as much in half a second.
