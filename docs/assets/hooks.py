@@ -20,7 +20,8 @@ INDEXED = re.compile(
     r"_([Dipdkmtuvxyz0]|up|down|MSE|reg)(?![a-zA-Z0-9_])",
     re.DOTALL,
 )
-NORM = "<mo>&#x02016;</mo>"  # would be as high as its whole line
+# Without `stretchy="false"` a norm is as high as its whole line.
+NORM, FIXED = "<mo>&#x02016;", '<mo stretchy="false">&#x02016;'
 ROOT = Path(__file__).parents[2]
 
 
@@ -61,8 +62,7 @@ def on_page_content(content, page, config, files):
 
     def formula(found):
         text = html.unescape(found[2]).strip()
-        formula = convert(text, display=display[found[1]])
-        return formula.replace(NORM, NORM.replace(">", ' stretchy="false">', 1))
+        return convert(text, display=display[found[1]]).replace(NORM, FIXED)
 
     def indexed(found):
         if found[2] is None:
