@@ -236,7 +236,10 @@ def _parameters(
     values = values_of(field)
     groups = groups_of([*values])
     units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
-    found = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
+    before = values_of(extended(source, d))
+    found = {
+        name: Parameter(value, unit=units[name], before=before.get(name, np.nan)) for name, value in values.items()
+    }
     free, absorbed, vague = np.ones(len(values), bool), np.zeros(len(values)), np.zeros(len(values), bool)
     if choice is not None:
         places = [choice.parameters.index(name) for name in values]
@@ -269,7 +272,6 @@ def _parameters(
     whole = covariance + np.diag(absorbed)
     bounds = intervals(field, jnp.asarray(whole), level, degrees)
     apart = intervals(field, jnp.asarray(covariance), level, degrees)  # the source has the same network
-    before = values_of(extended(source, d))
     scaled, moved = "efficiency" in np.array(groups)[free], dict[str, float]()
     for i, name in enumerate(values):
         value, low, high = jax.device_get(tuple(bounds[name]))

@@ -30,6 +30,7 @@ class Parameter:
         unit: the unit, for example "kg m²"; None if unknown.
         effective: why the value predicts well but need not be the system's own, so that it has no interval; None if it
             is physical.
+        before: the source's value, in `unit`; NaN if it has none.
     """
 
     value: float
@@ -37,6 +38,7 @@ class Parameter:
     high: float = math.nan
     unit: str | None = None
     effective: str | None = None
+    before: float = math.nan
 
     @property
     def has_interval(self) -> bool:
@@ -146,7 +148,11 @@ class Adaptation:
             note = f"{self.level:.0%} confidence intervals" if self.without_intervals is None else "no intervals"
             width = max(map(len, self.parameters))
             yield f"Parameters ({note}):"
-            yield from (f"  {name:<{width}}  {parameter}" for name, parameter in self.parameters.items())
+            for name, one in self.parameters.items():
+                before = f", before {one.before:.4g}" if abs(one.value - one.before) > 0 else ""
+                yield f"  {name:<{width}}  {one}{before}"
+            if self.changed:
+                yield f"Significantly different from the source: {', '.join(self.changed)}."
             told = [name for name, one in self.parameters.items() if one.has_interval and one.high < np.inf]
             effective = [name for name, one in self.parameters.items() if one.effective]
             if len(told + effective) < len(self.parameters) and self.chosen is not None:

@@ -78,9 +78,7 @@ def _page(
 ) -> page.Page:
     learned = named_parameters(without_past(known.field))
     names = [*found.changed, *(name for name in found.parameters if name not in found.changed)]
-    # A term that was not there was 0, an efficiency 1.
-    priors = {name: float(learned.get(name, name.startswith("efficiency"))) for name in names}
-    changes = [(name, priors[name], found.parameters[name]) for name in names]
+    changes = [(name, found.parameters[name].before, found.parameters[name]) for name in names]
     changed = changes[: len(found.changed)]
     effective: dict[Any, dict[str, None]] = {}  # why → names without their indices
     for name, _, one in changes:
