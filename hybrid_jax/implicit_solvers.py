@@ -65,5 +65,5 @@ def solver_errors(solver: diffrax.AbstractSolver | None) -> Iterator[None]:
 
 
 def unsolved(solver: diffrax.AbstractSolver | None) -> ValueError:
-    remedy = "give windows with a smaller dt, start nearer, or bound the field"
-    return ValueError(f"solver: {type(solver).__name__} finds no step where the search went; {remedy}")
+    remedy = "use windows with a smaller dt, a better first guess, or a bounded field"
+    return ValueError(f"solver: {type(solver).__name__} cannot solve a step of a trial model; {remedy}")

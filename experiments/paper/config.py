@@ -134,7 +134,7 @@ class Config(Run):
             raise ValueError(f"--n-target must each be {needed}, got {self.sizes}")
         if NO_PHYSICS in chosen and self.residual_outputs != "all":
             refused = f"--residual-outputs {self.residual_outputs}"
-            raise ValueError(f"{refused}: no_physics must write all derivatives, leave it out")
+            raise ValueError(f"{refused}: no_physics needs all derivatives: leave it out")
         # Physics alone has nothing to normalise.
         if self.norm == "batch" and self.batch_size < 2 and chosen != {PHYSICS_ONLY}:
             raise ValueError(f"--batch-size must be at least 2 with --norm batch, got {self.batch_size}")

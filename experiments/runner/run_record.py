@@ -20,7 +20,7 @@ from hybrid_jax.runtime import cores, hardware
 
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax")
 FILE = "run.json"
-HINT = "  --restart starts anew and moves it aside; another --out leaves it as it is"
+HINT = "  --restart starts from the beginning and renames it; another --out leaves it unchanged"
 FIXED = ("config", "versions", "flights")  # a run resumes only if these are equal
 MACHINE = ("machine",)  # where these are not, it says so
 
@@ -91,7 +91,7 @@ def record_in(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: truncated or not JSON: {first_line(error)}") from error
     if not (isinstance(found, dict) and {"state", "started", *FIXED, *MACHINE} <= found.keys()):
-        raise ValueError(f"{path}: not the record of a run; --restart starts anew and moves it aside")
+        raise ValueError(f"{path}: not the record of a run; --restart starts from the beginning and renames it")
     return found
 
 

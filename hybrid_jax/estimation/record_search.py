@@ -214,7 +214,7 @@ def approached(search: Search, segment: float | None) -> tuple[Search, Float[Arr
     if segment is None:
         return search, theta, own
     if len(theta) + own.size > MOST:
-        raise ValueError(f"segment: {own.size} numbers at the nodes are too many; use {segment * 2:.3g} s or more")
+        raise ValueError(f"segment: {own.size} unknown initial states are too many; use {segment * 2:.3g} s or more")
     size = sizes_of(search, theta, own)
     none = np.zeros(len(theta), bool)
     for i, share in enumerate((APPROACH[0], *APPROACH)):

@@ -58,8 +58,8 @@ def casadi_function(
     sizes = sizes_of(field, state_size, input_size, observe)
     if sizes[0] > MOST_STATES:
         raise ValueError(
-            f"state_size must be at most {MOST_STATES}, got {sizes[0]}: CasADi would write every number out, as of a "
-            "grid; use export_program"
+            f"state_size must be at most {MOST_STATES}, got {sizes[0]}: CasADi would write out every "
+            "number; use export_program"
         )
     if not isinstance(name, str) or not ca.Function.check_name(name):
         raise ValueError(f"name must be one that CasADi accepts for a function, got {checks.short_repr(name)}")

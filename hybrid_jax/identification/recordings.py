@@ -102,7 +102,7 @@ def _columns_of(name: str, recordings: Sequence[Recording]) -> tuple[int, ...]:
     """Return the measured axes of a quantity; ValueError unless the recordings agree."""
     axes = recordings[0].signals[name].axes
     for each in (each for each in recordings if each.signals[name].axes != axes):
-        raise ValueError(f"{each.name}: {name} has axes {each.signals[name].axes}, those before {axes}")
+        raise ValueError(f"{each.name}: {name} must have axes {axes} like the others, got {each.signals[name].axes}")
     known = AXES[name][0] if name in AXES else axes
     return tuple(map(known.index, axes))
 

@@ -88,7 +88,7 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
     pairs = {key: (found.get(key, "absent"), wanted.get(key, "absent")) for key in sorted(found.keys() | wanted.keys())}
     differing = [f"{key} is {ours}, expected {theirs}" for key, (ours, theirs) in pairs.items() if ours != theirs]
     if differing:
-        raise ValueError(f"{path}: other configuration: {'; '.join(differing)}")
+        raise ValueError(f"{path}: has another configuration: {'; '.join(differing)}")
     return dataset
 
 

@@ -122,7 +122,7 @@ class OnlineAdaptation(AbstractEstimator):
             raise ValueError(f"x must be one sample (d,), got shape {x.shape}")
         for name, values in (("noise", self.noise), ("process", self.process)):
             if len(values) not in (1, len(x)):
-                raise ValueError(f"{name} must be one number, or one for each of the {len(x)} of x, got {len(values)}")
+                raise ValueError(f"{name} must be one number, or {len(x)}, one for each state, got {len(values)}")
         if indices is not None:
             checks.places("indices", indices, len(x))
         p, none = ravel_parameters(self.field)[0].size, jnp.zeros_like(x)

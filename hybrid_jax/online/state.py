@@ -122,7 +122,7 @@ def named_priors(
         raise ValueError(f"prior: {', '.join(unknown)}: must be among {', '.join(dict.fromkeys(groups))}")
     size, sizes = groups.count(DISTURBANCE), np.ravel(disturbance)
     if len(sizes) not in (1, size):
-        raise ValueError(f"disturbance must be one number, or one for each of {size} disturbed, got {len(sizes)}")
+        raise ValueError(f"disturbance must be one number, or {size}, one for each disturbed state, got {len(sizes)}")
     disturbed = iter(np.broadcast_to(sizes, size).tolist())
     found = []
     for name, group in zip(names, groups, strict=True):

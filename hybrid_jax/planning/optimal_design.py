@@ -206,7 +206,7 @@ def _design(model, bounds, seconds: float, window: float, dt: float, bandwidth: 
     if abs(round(window / dt) * dt - window) > 1e-6 * window or not window <= seconds:
         raise ValueError(f"window must be a multiple of dt {dt} and at most seconds {seconds}, got {window}")
     if not 1 / seconds <= bandwidth <= 0.5 / dt:
-        raise ValueError(f"bandwidth must be between 1 / seconds and half of 1 / dt, in Hz, got {bandwidth}")
+        raise ValueError(f"bandwidth must be from {1 / seconds:.3g} to {0.5 / dt:.3g} Hz, got {bandwidth}")
     numbers = seconds, math.floor(bandwidth * seconds + 1e-9), dt
     if isinstance(bounds, InputBounds):
         return InputSeries(bounds, *numbers)

@@ -147,7 +147,7 @@ class SplitSpec:
         checks.count("steps", self.steps)
         checks.count("flights", self.flights, least=0)
         if self.flights and (self.windows % self.flights or self.windows * self.steps > self.flights * SECONDS / DT):
-            raise ValueError(f"windows must be divided evenly among {self.flights} flights of {SECONDS:g} s")
+            raise ValueError(f"windows must be a multiple of the {self.flights} flights, got {self.windows}")
         if self.steps > round(SECONDS / DT):
             raise ValueError(f"steps must be at most {round(SECONDS / DT)}, a whole flight, got {self.steps}")
 
@@ -196,7 +196,7 @@ def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[T
         whole = round(SECONDS / DT) // spec.steps  # windows of a flight of which none is dropped
         parts += [part[:each] for part in found if len(part) == whole] if spec.flights else found
         if not parts:
-            raise ValueError(f"domain {domain.name}: none of {tally['flights']} flights stayed in bounds; weaken it")
+            raise ValueError(f"domain {domain.name}: all {tally['flights']} flights left the bounds; use weaker forces")
     if spec.flights:
         return concatenate(parts[: spec.flights]), tally
     windows = concatenate(parts)

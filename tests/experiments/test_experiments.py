@@ -85,7 +85,7 @@ REFUSED = {
     "comparison": [
         (("--methods", "hybrid", "hybrid"), "--methods must be at least one, each different"),
         (("--residual-inputs", "no_xy"), "--methods last_layer needs a residual that sees"),
-        (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
+        (("--residual-outputs", "accelerations"), "no_physics needs all derivatives"),
         (("--n-target", "20", "3", "--batch-size", "3"), "--n-target must each be more than the 9 parameters"),
         (("--encoding.box", "2", "0.5"), "--encoding.box must be two factors, low < high, above 0"),
     ],

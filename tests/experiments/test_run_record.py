@@ -51,7 +51,7 @@ def test_another_configuration_is_refused_field_by_field(tmp_path):
         f"{tmp_path}: holds an unfinished run, begun {before['started']}, that differs:",
         "  config.rates.physics: 0.01 → 0.5",
         "  config.seeds: 1 → 2",
-        "  --restart starts anew and moves it aside; another --out leaves it as it is",
+        "  --restart starts from the beginning and renames it; another --out leaves it unchanged",
     ]
     assert record(tmp_path) == before
 

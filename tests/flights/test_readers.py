@@ -237,7 +237,7 @@ def test_pipes_links_and_bombs_neither_hang_nor_fill_the_memory(tmp_path):
     assert {path.name for path in left} >= {"pipe.ulg", "nowhere.csv", "loop.csv"}
     for name in ("pipe.ulg", "nowhere.csv", "loop.csv", "zeros.ulg.gz"):
         refusal(lambda name=name: read_recording(tmp_path / name), name)
-    refusal(lambda: read_recording(tmp_path / "zeros.ulg.gz"), "unpacks to over 16 MiB")
+    refusal(lambda: read_recording(tmp_path / "zeros.ulg.gz"), "unpacks to more than 16 MiB")
 
 
 @pytest.mark.parametrize("plugin", ["ROS1", "MCAP"])
@@ -246,7 +246,7 @@ def test_messages_of_a_bag_are_limited_as_a_packed_log_is(flight, tmp_path, monk
     for name, limit in (("RATIO", 0.1), ("SMALL", 0)):
         read_recording(path, topics={"motors": "/rotors:data:rpm"})
         monkeypatch.setattr(raw, name, limit)
-    refusal(lambda: read_recording(path), path, "unpacks to over 0 MiB")
+    refusal(lambda: read_recording(path), path, "unpacks to more than 0 MiB")
 
 
 def test_a_folder_of_all_kinds_says_what_it_reads(flight, written, tmp_path):

@@ -176,7 +176,7 @@ def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
         ({"prior": {"friction": 0.1}}, "prior: idle must be given, 0 if it should stay constant"),
         ({"prior": 0.0}, "prior must be positive for at least one parameter, got 0 for all"),
         ({"disturbance": 1.0}, "indices must say"),
-        ({"disturbance": (1.0, 1.0), "indices": (0,)}, "disturbance must be one number, or one for each of 1 dist"),
+        ({"disturbance": (1.0, 1.0), "indices": (0,)}, "disturbance must be one number, or 1, one for each dist"),
         ({"noise": 0.0}, "noise must be"),
         ({"hypotheses": hj.Hypothesis("a", {"idle": 0.3})}, "hypotheses must be a list of Hypothesis, got Hypothesis"),
         ({"hypotheses": [hj.Hypothesis("a", {"idle": 1})], "prior": HELD}, "hypothesis a: idle must be among"),
@@ -191,7 +191,7 @@ def test_a_filter_that_makes_no_sense_is_refused(options, said):
 def test_a_sample_is_a_list_or_an_array_of_the_size_of_the_first():
     state = adaptation().begin([0.0])
     assert eqx.tree_equal(adaptation().update(state, [0.1], [1]), adaptation().update(state, np.array([0.1]), [1.0]))
-    with pytest.raises(ValueError, match=r"^noise must be one number, or one for each of the 1 of x, got 2"):
+    with pytest.raises(ValueError, match=r"^noise must be one number, or 1, one for each state, got 2"):
         OnlineAdaptation(SLIDE, DT, (NOISE, NOISE)).begin([0.0])
     with pytest.raises(ValueError, match=r"^x must be one sample \(1,\), as the state is, got shape \(2,\)"):
         adaptation().update(state, [0.0, 0.0], [0.0])

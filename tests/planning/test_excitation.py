@@ -129,7 +129,7 @@ def test_a_parameter_that_nothing_excites_is_named():
         ({"bounds": hj.InputBounds((-1.0,), (1.0,), (2.0,), (-1.0,), (1.0,))}, "x0 leaves its limits even at rest"),
         ({"noise": None}, "noise must be given"),
         ({"window": 0.05}, "window must be a multiple of dt"),
-        ({"bandwidth": 0.1}, "bandwidth must be between"),
+        ({"bandwidth": 0.1}, "bandwidth must be from"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(change, said):

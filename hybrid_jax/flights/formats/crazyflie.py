@@ -109,7 +109,7 @@ def read_crazyflie(content: bytes) -> Parts:
         last = max(ticks[-1] for ticks, _ in columns.values()) - min(ticks[0] for ticks, _ in columns.values())
         facts["damage"] = f"its CRC-32 is wrong: cut off or changed; records end at {1e-6 * float(last):.4g} s"
     elif end != len(content) - 4:
-        raise ValueError(f"byte {end}: a record of no known event; was the file written by another firmware?")
+        raise ValueError(f"byte {end}: the event of this record is unknown; was the file written by other firmware?")
     for name, (ticks, values) in columns.items():
         jumps = np.flatnonzero(np.abs(np.diff(values.astype(float))) > 0.98 * LIMITED) + 1
         for row in jumps[:1] if values.dtype == np.int16 else ():

@@ -58,7 +58,7 @@ class Unpacked:
     def count(self, size: int) -> int:
         self.left -= size
         if self.left < 0:
-            raise ValueError(f"unpacks to over {self.most / 2**20:.0f} MiB, as no log does; unpack it first")
+            raise ValueError(f"unpacks to more than {self.most / 2**20:.0f} MiB; unpack it first if it is a log")
         return size
 
 

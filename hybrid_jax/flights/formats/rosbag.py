@@ -110,10 +110,10 @@ def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, t
     except Exception as error:  # a damaged bag makes its libraries raise any exception
         why = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
         raise ValueError(
-            f"is not a bag, or is cut off or damaged: ros2 bag reindex, or copy it again ({why})"
+            f"is not a bag, or is cut off or damaged; run ros2 bag reindex, or copy it again ({why})"
         ) from error
     if empty := [topic for topic, found in messages.items() if not found]:
-        raise ValueError(f"topic {empty[0]} has lost its messages; ros2 bag reindex, or copy it again")
+        raise ValueError(f"topic {empty[0]} has lost its messages; run ros2 bag reindex, or copy the bag again")
     return types, chosen, messages
 
 
@@ -216,6 +216,6 @@ def _motors(topic: str, field: str, messages) -> tuple[np.ndarray, str]:
     counts = {len(row) for row in rows}
     if len(counts) > 1 or min(counts) < FEWEST_ROTORS:
         known = ", ".join(each for each in vars(messages[0]) if not each.startswith("_"))
-        found = f"{', '.join(map(str, sorted(counts)))} numbers, must be one for each motor; its fields are {known}"
+        found = f"{', '.join(map(str, sorted(counts)))} numbers, but needs one for each motor; its fields are {known}"
         raise ValueError(f"{topic}: field {name} has {found}")
     return np.stack(rows), name
