@@ -83,12 +83,8 @@ def flight_of(recording: Recording, field: Actuated) -> FlightLog:
     return FlightLog(t, x, speeds, recording.name)[within(t, flights)]
 
 
-def windows_of(recordings, field: Actuated, stride: int) -> hj.Trajectories:
-    return cut_windows([flight_of(each, field) for each in recordings], STEPS, stride)
-
-
-def tests_of(recording: Recording, field: Actuated) -> hj.Trajectories:
-    return cut_windows([flight_of(recording, field)], PAST + STEPS, STRIDE)
+def windows_of(recordings, field: Actuated, stride: int, steps: int = STEPS) -> hj.Trajectories:
+    return cut_windows([flight_of(each, field) for each in recordings], steps, stride)
 
 
 @eqx.filter_jit
@@ -135,7 +131,8 @@ def run(options: Options) -> None:
         errors_few = np.concatenate([force_errors(each, left) for each in few[:i] + few[i + 1 :]])
         forces.append([*(rmse(force_errors(each, left)) for each in (aware, fitted)), rmse(errors_few)])
         console.print(Path(left.name).name, [f"{each:.3f}" for each in forces[-1]])
-        test, plain, short = tests_of(left, fitted), tests_of(left, gain), [tests_of(left, each) for each in few]
+        tests = partial(windows_of, [left], stride=STRIDE, steps=PAST + STEPS)
+        test, plain, short = tests(fitted), tests(gain), [tests(each) for each in few]
         simple = [fitted_to(rigid_body(VEHICLE), windows_of(others, each, 50)) for each in (gain, fitted)]
         models = {
             "constant state": [(HoldState(), test)],

@@ -139,9 +139,5 @@ def parameters_of(found: Adaptation | None) -> dict[str, Any]:
     if found is None:
         return {"theta": None, "theta_interval": None}
     theta = {name: one.value for name, one in found.parameters.items()}
-    ends = (
-        {name: [one.low, one.high] for name, one in found.parameters.items()}
-        if found.without_intervals is None
-        else None
-    )
-    return {"theta": theta, "theta_interval": ends}
+    ends = {name: [one.low, one.high] for name, one in found.parameters.items()}
+    return {"theta": theta, "theta_interval": ends if found.without_intervals is None else None}

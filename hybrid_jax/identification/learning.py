@@ -144,8 +144,7 @@ def expected_with_past(
     """Return the errors to expect of a past that is learned from logs, by stretches of them that are left out in turn.
 
     A stretch is a flight, or a part of one that is longer than what a past remembers. Each is predicted by what the
-    others teach, but with what was measured before it. Another flight is assumed to differ from all of these as much
-    as one stretch from another.
+    others teach, but with what was measured before it.
 
     Args:
         model: the model with its past before these logs.
@@ -154,7 +153,7 @@ def expected_with_past(
         most: the largest number of intervals to learn from.
     """
     flights = sequences(logs, 2 * STEPS)
-    found: dict[str, list[Float[np.ndarray, " 4"]]] = {horizon: [] for horizon in horizons}
+    found: dict[str, list[list[Float[np.ndarray, " 4"]]]] = {horizon: [[] for _ in flights] for horizon in horizons}
     for i, one in enumerate(flights):
         x, u = np.concatenate([one.x0, one.x[0]]), np.asarray(one.u[0])
         count = max(1, min(-(-STRETCHES // len(flights)), int(one.horizon * one.dt / (2 * max(model.time_constants)))))
@@ -167,8 +166,8 @@ def expected_with_past(
             for horizon, errors in found.items():
                 if (steps := round(float(horizon.split()[0]) / one.dt)) <= end - begin:
                     windows = windows_of(seen, u[begin:end], one.dt, steps=steps)
-                    errors.append(rmse(np.stack(flight_errors(past, windows), axis=-1))[-1])
-    of_flights = {name: expected(np.log(each), flights=len(flights)) for name, each in found.items() if each}
+                    errors[i].append(rmse(np.stack(flight_errors(past, windows), axis=-1))[-1])
+    of_flights = {name: expected_from_parts(each) for name, each in found.items() if any(each)}
     return {name: dict(zip(NAMES, map(tuple, each.T.tolist()), strict=True)) for name, each in of_flights.items()}
 
 
@@ -252,10 +251,20 @@ def expected(
     n, middle = len(logs), np.mean(logs, axis=0)
     if n < 2:
         return np.stack([np.exp(middle), np.zeros_like(middle), np.full_like(middle, np.inf)])
-    half = (
-        scipy.special.stdtrit(n - 1, (1 + level) / 2) * np.std(logs, axis=0, ddof=1) * (1 + 1 / (flights or n)) ** 0.5
-    )
+    error = np.std(logs, axis=0, ddof=1) * (1 + 1 / (flights or n)) ** 0.5
+    half = scipy.special.stdtrit(n - 1, (1 + level) / 2) * error
     return np.exp([middle, middle - half, middle + half])
+
+
+def expected_from_parts(parts: Sequence[Sequence[Float[np.ndarray, " 4"]]]) -> Float[np.ndarray, "3 4"]:
+    """Return what `expected` does, from the RMSE of parts of each flight.
+
+    Each flight counts once, as its parts are alike. Of a single flight, another one is assumed to differ from all of
+    its parts as much as one part from another.
+    """
+    if len(parts) == 1:
+        return expected(np.log(parts[0]), flights=1)
+    return expected(np.log([rmse(np.stack(each)) for each in parts if len(each)]))
 
 
 def rmse_by_flight(

@@ -12,6 +12,7 @@ from hybrid_jax.adaptation.expectation import errors_at_ends, expected_errors, l
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.state_space import StateSpace
+from hybrid_jax.trajectories import concatenate, split
 
 LINE = StateSpace().padded(1)
 
@@ -52,9 +53,8 @@ def test_a_small_rotation_is_given_in_radians():
 
 def test_errors_after_windows_that_touch_are_those_of_one_long_prediction():
     whole = swings(1, steps=24)
-    parts = [replace(whole, x0=x0, u=whole.u[:, at : at + 8], x=whole.x[:, at : at + 8])
-             for x0, at in zip((whole.x0, whole.x[:, 7], whole.x[:, 15]), (0, 8, 16), strict=True)]  # fmt: skip
-    chained = hj.Trajectories(*(jnp.concatenate([getattr(p, n) for p in parts]) for n in ("x0", "u", "x")), whole.dt)
+    head, rest = split(whole, 8)
+    chained = concatenate([head, *split(rest, 8)])
     field = pendulum(0.8)
     found = errors_at_ends(field, chained, jnp.ones(3, bool))
     alone = hj.rollout_batch(field, chained.x0, chained.u, whole.dt)[:, -1] - chained.x[:, -1]

@@ -56,17 +56,24 @@ def test_white_noise_on_a_true_model_changes_little():
     assert error(hj.fit_disturbance(Spring(), [noisy]), tested) < 1.1 * error(Spring(), tested)
 
 
+def hovering(seed, lively, count, push=(0.3, 0, 0, 0, 0, 0), noise=0.02):
+    """Flights of 2 s with a push that the body lacks, as sensors with noise see them."""
+    random = np.random.default_rng(seed)
+    x0 = np.tile(np.eye(13, dtype="f4")[3], (count, 1))
+    x0[:, 7:] = lively * random.normal(size=(count, 6))
+    u = hj.IRIS.hover_speed * (1 + 0.01 * lively * random.normal(size=(count, 20, 4))).repeat(10, axis=1).astype("f4")
+    x = np.array(hj.rollout_batch(hj.Hybrid(BODY, ConstantDisturbance(jnp.array(push))), x0, u, 0.01))
+    x[..., 7:] += noise * random.normal(size=(count, 200, 6))
+    return hj.Trajectories(x0, u, x.astype("f4"), 0.01)
+
+
 def test_attitudes_are_corrected_in_their_tangent_space():
     """A constant torque that the model lacks, as an angular acceleration of 0.3 rad/s²."""
-    random = np.random.default_rng(5)
-    pushed = hj.Hybrid(BODY, ConstantDisturbance(jnp.array([0, 0, 0, 0.3, 0, 0])))
-    u = (hj.IRIS.hover_speed * (1 + 0.02 * random.normal(size=(3, 12, 4)))).repeat(10, axis=1).astype("f4")
-    x0 = np.tile(np.eye(13, dtype="f4")[3], (3, 1))
-    windows = hj.Trajectories(x0, u, np.asarray(hj.rollout_batch(pushed, x0, u, 0.01)), 0.01)
+    windows = hovering(5, 0.2, 3, (0, 0, 0, 0.3, 0, 0), noise=0.0)
     model = hj.fit_disturbance(BODY, [windows])
     states = hj.observe(model, windows)
-    reached = hj.rollout_batch(model, states[:, 100], u[:, 100:], 0.01)[:, -1]
-    plain = hj.rollout_batch(BODY, windows.x[:, 99], u[:, 100:], 0.01)[:, -1]
+    reached = hj.rollout_batch(model, states[:, 180], windows.u[:, 180:], 0.01)[:, -1]
+    plain = hj.rollout_batch(BODY, windows.x[:, 179], windows.u[:, 180:], 0.01)[:, -1]
     off, before = (np.abs(each[:, :13] - windows.x[:, -1])[:, 10:].max() for each in (reached, plain))
     assert off < 0.2 * before
     np.testing.assert_allclose(np.linalg.norm(reached[:, 3:7], axis=1), 1, atol=1e-4)
@@ -79,17 +86,6 @@ def test_a_model_is_refitted_near_the_one_before_and_saved(tmp_path):
     assert error(again, flights(1)) < 0.5 * error(Spring(), flights(1))
     hj.save(tmp_path / "m.npz", again)
     assert error(hj.load(tmp_path / "m.npz").field, flights(1)) == error(again, flights(1))
-
-
-def hovering(seed, lively, count):
-    """Flights of 2 s with a push that the body lacks, as sensors with noise see them."""
-    random = np.random.default_rng(seed)
-    x0 = np.tile(np.eye(13, dtype="f4")[3], (count, 1))
-    x0[:, 7:] = lively * random.normal(size=(count, 6))
-    u = hj.IRIS.hover_speed * (1 + 0.01 * lively * random.normal(size=(count, 20, 4))).repeat(10, axis=1).astype("f4")
-    x = np.array(hj.rollout_batch(hj.Hybrid(BODY, ConstantDisturbance(jnp.array([0.3, 0, 0, 0, 0, 0]))), x0, u, 0.01))
-    x[..., 7:] += 0.02 * random.normal(size=(count, 200, 6))
-    return hj.Trajectories(x0, u, x.astype("f4"), 0.01)
 
 
 def test_a_hover_does_not_ruin_what_was_learned_in_motion():
