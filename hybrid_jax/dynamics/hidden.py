@@ -197,19 +197,20 @@ def with_hidden(field: AbstractVectorField, *parts: AbstractHidden) -> WithHidde
 
 
 class DisturbanceModel(AbstractVectorField):
-    """A disturbance that is predicted from its past: ẋ = f(x, u) + D e, żᵢ = (e − zᵢ) / τᵢ, e = W (z₁, …, z_k, x, 1).
+    """A disturbance predicted from its past: ẋ = f(x, u) + D e, żᵢ = (e − zᵢ) / τᵢ, e = W (z₁ − z₂, …, z_k, x, 1).
 
     The state is (x, z₁, …, z_k). e is the disturbance in the tangent space of x, D its effect on ẋ, and zᵢ is e after a
-    filter. While x is measured, e is the measured disturbance instead: see `after`, and `hybrid_jax.estimation.observe`
-    for many samples. This is an innovations form of linear hidden dynamics (Ljung, System Identification, 1999, 4.3)
-    with fixed poles.
+    filter. W reads what a filter passes and the next, slower one does not, since the filters themselves are alike.
+    While x is measured, e is the measured disturbance instead: see `after`, and `hybrid_jax.estimation.observe` for
+    many samples. This is an innovations form of linear hidden dynamics (Ljung, System Identification, 1999, 4.3) with
+    fixed poles.
 
     Attributes:
         field: f, with d states and e numbers in their tangent space.
         weights: W (e, k e + n + 1), in the units of ẋ, z and x.
-        sizes: by how much each number that W multiplies varied in the data of the first fit (k e + n + 1), in its unit;
+        sizes: by how much z₁ (k times) and x varied in the data of the first fit, and 1 (k e + n + 1), in their units;
             infinite for a state that did not vary.
-        time_constants: time constants τ₁, …, τ_k of the filters [s].
+        time_constants: time constants τ₁ < … < τ_k of the filters [s].
         states: indices of the n states that W reads.
     """
 
@@ -235,8 +236,9 @@ class DisturbanceModel(AbstractVectorField):
         Args:
             x: the state of the field, followed by the states of the filters.
         """
-        d = len(x) - self.hidden
-        return self.weights @ jnp.concatenate([x[d:], x[jnp.array(self.states, int)], jnp.ones(1, x.dtype)])
+        filtered = x[len(x) - self.hidden :].reshape(-1, len(self.weights))
+        bands = -jnp.diff(filtered, axis=0, append=0 * filtered[:1])
+        return self.weights @ jnp.concatenate([bands.ravel(), x[jnp.array(self.states, int)], jnp.ones(1, x.dtype)])
 
     def after(
         self, x: Float[Array, " d+f"], predicted: Float[Array, " d"], measured: Float[Array, " d"], dt: float

@@ -162,13 +162,15 @@ def _slopes(field, x, u) -> Float[Array, "n d d"]:
 
 def _features(model: DisturbanceModel, states: np.ndarray) -> Float[np.ndarray, "n f"]:
     own, filtered = np.split(states, [states.shape[1] - model.hidden], axis=1)
-    return np.concatenate([filtered, own[:, list(model.states)], np.ones((len(states), 1))], axis=1)
+    bands = -np.diff(filtered.reshape(len(states), -1, len(model.weights)), axis=1, append=0)
+    parts = bands.reshape(filtered.shape), own[:, list(model.states)], np.ones((len(states), 1))
+    return np.concatenate(parts, axis=1)
 
 
 def _sizes(model: DisturbanceModel, states: np.ndarray) -> Float[Array, " f"]:
-    features, e = _features(model, states), len(model.weights)
-    fastest = np.sqrt(np.mean(np.square(features[:, :e]), axis=0)) + 1e-12
-    varied = features[:, model.hidden : -1].std(axis=0)
+    d, e = states.shape[1] - model.hidden, len(model.weights)
+    fastest = np.sqrt(np.mean(np.square(states[:, d : d + e]), axis=0)) + 1e-12
+    varied = states[:, list(model.states)].std(axis=0)
     sizes = [*[fastest] * len(model.time_constants), np.where(varied > 1e-9, varied, np.inf), [1.0]]
     return jnp.asarray(np.concatenate(sizes), model.weights.dtype)
 

@@ -94,9 +94,8 @@ def test_a_baseline_is_mostly_taken_where_others_are_better_by_chance():
 @pytest.mark.parametrize(("flights", "parts"), [(1, 5), (2, 3), (3, 2), (7, 1)])
 def test_interval_holds_another_flight_in_eight_of_ten_cases(flights, parts):
     """Several flights differ twice as much as parts of one, another one from a single flight as much as these."""
-    rng, size = np.random.default_rng(1), 2 if flights > 1 else 1
-    logs = rng.normal(-3, 0.3 * size, (2000, flights + 1, 1, 1))
-    logs = logs + 0.3 * rng.normal(size=(2000, flights + 1, parts, 1))
+    rng, n, spread = np.random.default_rng(1), flights + 1, 0.6 if flights > 1 else 0.3
+    logs = rng.normal(-3, spread, (2000, n, 1, 1)) + rng.normal(0, 0.3, (2000, n, parts, 1))
     found = np.squeeze([learning.expected_from_parts(np.exp(each[:-1])) for each in logs])
     truth = [learning.rmse(np.exp(each[-1]))[0] for each in logs]
     assert np.mean((found[:, 1] < truth) & (truth < found[:, 2])) == pytest.approx(0.8, abs=0.05)
