@@ -9,7 +9,7 @@ from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.window_checks import continuous
 from hybrid_jax.integrate import LONG, RK4, Solver, rollout_batch
-from hybrid_jax.runtime import FAST_COMPILE, entry, jit_by_size
+from hybrid_jax.runtime import UNOPTIMISED, entry, jit_by_size
 from hybrid_jax.trajectories import Trajectories, check, errors_of
 
 CHUNK = 1000  # windows predicted at once
@@ -22,12 +22,12 @@ def predict(field: AbstractVectorField, x0, u, dt: float, solver: Solver | None 
     return rollout_batch(field, x0, u, dt, solver) if states is None else states
 
 
-@jit_by_size(FAST_COMPILE)
+@jit_by_size(UNOPTIMISED)
 def errors_in(windows: Trajectories, field: AbstractVectorField, solver: Solver | None) -> Float[Array, "n t d"]:
-    """Return x − x̂ of many windows, NaN where nothing was measured."""
+    """Return x − x̂ of many windows, NaN where nothing was measured; for a field that is evaluated once or twice."""
 
     def errors(part: Trajectories):
-        return jnp.asarray(part.x) - predict(field, part.x0, part.u, part.dt, solver)
+        return jnp.asarray(part.x) - rollout_batch(field, part.x0, part.u, part.dt, solver)
 
     return in_chunks(errors, windows, CHUNK)
 

@@ -21,6 +21,8 @@ import numpy as np
 import platformdirs
 from jaxlib import lapack
 
+from hybrid_jax import checks
+
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
 CPUS = Path("/proc/cpuinfo")
 FLAGS = "XLA_FLAGS"
@@ -136,11 +138,20 @@ def jit_with(options: dict[str, bool | int] | None) -> Callable[[Callable[P, R]]
 
 
 def jit_by_size(options: dict[str, bool | int] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """`jit_with`, whose programs `keep_programs` deletes: each size of data has its own, of some 20 MiB."""
+    """`jit_with`, whose programs `keep_programs` deletes: each size of data has its own, of some 20 MiB.
+
+    Inside of another program, which has its own options, it is only traced.
+    """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        _sized.append(jit_with(options)(function))
-        return _sized[-1]
+        _sized.append(compiled := jit_with(options)(function))
+
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            traced = any(map(checks.is_traced, jax.tree.leaves((args, kwargs))))
+            return (function if traced else compiled)(*args, **kwargs)
+
+        return call if options else compiled
 
     return decorate
 

@@ -17,12 +17,13 @@ from hybrid_jax.adaptation.auto import Auto, Choice
 from hybrid_jax.adaptation.expectation import expected_errors, longest_chain
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.outliers import outliers
-from hybrid_jax.adaptation.plausible import extended, groups_of, values_of
+from hybrid_jax.adaptation.plausible import groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, correlated, overlap
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space, trainable
 from hybrid_jax.dynamics.disturbance import (
+    ConstantDisturbance,
     disturbance_of,
     disturbance_units,
     physics_of,
@@ -38,7 +39,7 @@ from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import errors_in
 from hybrid_jax.networks.standardise import motion_of
-from hybrid_jax.runtime import entry, keep_programs, load_lapack
+from hybrid_jax.runtime import UNOPTIMISED, entry, jit_with, keep_programs, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
@@ -55,6 +56,8 @@ FEW = "windows: {} are too few to determine {} parameters; those that they do no
 BY_NETWORK = "the network's effect is comparable to that of a plausible change; hj.pool of several sources helps"
 BY_ROTORS = "the rotors' efficiencies, which were fitted too, can have the same effect"
 OVERLAP = "windows overlap: left-out blocks share samples with the others, so the expected errors are too small"
+
+_vector_of = jit_with(UNOPTIMISED)(ConstantDisturbance.vector)
 
 METHODS: Mapping[str, Method] = {
     "auto": Auto(),
@@ -162,7 +165,7 @@ def adapt(
     return Adaptation(
         field=adapted,
         method=name,
-        disturbance=None if found is None else np.asarray(found.vector(windows.x0.shape[-1])),
+        disturbance=None if found is None else np.asarray(_vector_of(found, windows.x0.shape[-1])),
         mse_before=_mse(errors, windows),
         mse_after=_mse(errors_in(windows, adapted, compact(settings.solver)), windows),
         windows=len(windows),
@@ -236,7 +239,7 @@ def _parameters(
     values = values_of(field)
     groups = groups_of([*values])
     units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
-    before = values_of(extended(source, d))
+    before = values_of(source, d)
     found = {
         name: Parameter(value, unit=units[name], before=before.get(name, np.nan)) for name, value in values.items()
     }

@@ -20,6 +20,7 @@ from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
 from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, inverse
 from hybrid_jax.estimation.starts import Starts, from_starts
+from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 RANK = 32  # dimensions of the subspace
@@ -36,17 +37,18 @@ class Anchored(NamedTuple):
     naive: Float[Array, ""]  # the same odds if the source had no errors
 
 
-def fit_anchored(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    starts: Starts | None,
-    noise: Float[Array, ""],
-    solver: Solver,
-    scale: Scale,
-    error: Float[Array, ""],
-    blocks,
-) -> Anchored:
-    """Compute the step for each penalty and choose the best; `error` is the source's own, see `Unchanged`."""
+class Subspace(NamedTuple):
+    """A subspace of k directions of the network's weights, and their effects on the e errors of n windows."""
+
+    basis: Float[Array, "k w"]
+    effects: Float[Array, "n e k"]
+    errors: Float[Array, "n e"]
+
+
+def subspace(
+    field: AbstractVectorField, windows: Trajectories, starts: Starts | None, solver: Solver, scale: Scale
+) -> Subspace:
+    """Linearise the errors by the network's weights along random directions in the range of Jᵀ."""
     weights, _ = weights_of(field)
     smooth, weigh = from_starts(windows, starts)
 
@@ -66,6 +68,12 @@ def fit_anchored(
         images = jax.lax.map(seen, jax.random.split(jax.random.key(0), RANK), batch_size=TOGETHER)
         basis = jnp.linalg.qr(images.T)[0].T
     effects = jnp.moveaxis(jax.lax.map(push, basis, batch_size=TOGETHER), 0, -1)
+    return Subspace(basis, effects, residuals)
+
+
+def fit_anchored(found: Subspace, noise: Float[Array, ""], error: Float[Array, ""], blocks) -> Anchored:
+    """Compute the step for each penalty and choose the best; `error` is the source's own, see `Unchanged`."""
+    basis, effects, residuals = found
     gram, score = jnp.einsum("ner,nes->nrs", effects, effects), jnp.einsum("ner,ne->nr", effects, residuals)
     values, vectors = jnp.linalg.eigh(jnp.sum(gram, axis=0))
     values = jnp.maximum(values, jnp.maximum(1e-6 * values[-1], TINY))
@@ -126,6 +134,7 @@ class Effect(NamedTuple):
     of_states: Float[Array, " d"]
 
 
+@jit_by_size(UNOPTIMISED)
 def network_effect(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, starts: Starts | None
 ) -> Effect:

@@ -13,10 +13,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.anchored import (
-    Anchored,
+    Subspace,
     fit_anchored,
     has_network,
     network_effect,
+    subspace,
     taken_by_network,
     weights_of,
     with_change,
@@ -112,36 +113,35 @@ class Auto(Method):
                 source is assumed to be exact.
         """
         jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
-        traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))  # then the outer program has the options
-        fits, anchor, begin, measure, replace, judge, confirm, conclude = STEPS if traced else COMPILED
+        traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))
         # Only these settings matter; as an array, another scale needs no other program.
         scale, solver = scale_of(settings.objective, train.x0.shape[-1]), settings.solver
-        larger, physics, sizes = begin(self, field, train)
+        larger, physics, sizes = _begin(self, field, train)
         options, effect, step = (sizes, solver, scale, self.max_steps), None, None
         still, network = np.zeros(sizes.shape, sizes.dtype), has_network(field)
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
         learned_from = motion_of(field) if learned_from is None else learned_from
         if learned_from is not None:
             distinct, learned_from = jnp.array(min(len(learned_from), len(train))), alike(learned_from, train)
-            own = fits(larger, still, learned_from, both, *options, distinct)[0]
-            rival = None if physics is None else fits(physics, still, learned_from, both, *options, distinct)[:2]
-            larger, source = replace(self, larger, own, rival, distinct, sizes)
+            own = _fits(larger, still, learned_from, both, *options, distinct)[0]
+            rival = None if physics is None else _fits(physics, still, learned_from, both, *options, distinct)[:2]
+            larger, source = _replace(self, larger, own, rival, distinct, sizes)
         options = *options, jnp.array(len(train))
-        (found, every, starts), fitted = first, _ = fits(larger, still, train, both, *options), None
+        (found, every, starts), fitted = first, _ = _fits(larger, still, train, both, *options), None
         for _ in range(ROUNDS):
             if network:  # also if physics replaced the source: then it is the difference of two models
-                effect = measure(field, train, solver, scale, starts)
-            chosen, nothing, move, rows = judge(larger, train, found, every, source, learned_from, effect, sizes)
+                effect = network_effect(field, train, solver, scale, starts)
+            chosen, nothing, move, rows = _judge(larger, train, found, every, source, learned_from, effect, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
                 options = chosen.sizes, *options[1:]
-                (_, found, starts), fitted = fits(larger, move, train, rows, *options), rows
+                (_, found, starts), fitted = _fits(larger, move, train, rows, *options), rows
                 if not traced and int(found.status) == Status.DIVERGED:
-                    _, found, starts = fits(larger, still, train, rows, *options)
-        found, starts, chosen, left_out = confirm(self, larger, (found, starts), (first[0], first[2]), chosen)
+                    _, found, starts = _fits(larger, still, train, rows, *options)
+        found, starts, chosen, left_out = _confirm(self, larger, (found, starts), (first[0], first[2]), chosen)
         if self.networks and network:
-            step = anchor(larger, train, starts, found, solver, scale, nothing.error, self.blocks)
+            step = _anchor(larger, train, starts, found, solver, scale)
         outcome = found, chosen, left_out, source, nothing, effect, step
-        return conclude(self, field, larger, train, outcome, (sizes, solver))
+        return _conclude(self, field, larger, train, outcome, (sizes, solver))
 
 
 class OfSource(NamedTuple):
@@ -152,12 +152,14 @@ class OfSource(NamedTuple):
     distinct: Int[Array, ""]
 
 
+@jit_by_size(UNOPTIMISED)
 def _begin(method: Auto, field, train: Trajectories):
     larger = extended(field, train.x0.shape[1])
     physics = without_network(larger) if has_network(larger) else None
     return larger, physics, method.plausible.sizes(larger, train)
 
 
+@jit_by_size(FASTEST_COMPILE)
 def _fits(field, move, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
     """Fit nothing and some parameters, from where the parameters moved by `move`, which smooths the starts as well."""
     start, unravel = ravel_parameters(field)
@@ -165,6 +167,7 @@ def _fits(field, move, windows: Trajectories, free, *options) -> tuple[Fit, Fit,
     return (*(jax.tree.map(itemgetter(row), found) for row in (0, 1)), starts)
 
 
+@jit_by_size(UNOPTIMISED)
 def _replace(method: Auto, larger, own: Fit, rival: tuple[Fit, Fit] | None, distinct, sizes) -> tuple[Any, OfSource]:
     """Replace the source by its physics if they predict its own motion better, fitted again if that is better still."""
     if rival is None:
@@ -179,6 +182,7 @@ def _replace(method: Auto, larger, own: Fit, rival: tuple[Fit, Fit] | None, dist
     return larger, OfSource(own, alone, distinct)
 
 
+@jit_by_size(UNOPTIMISED)
 def _judge(
     larger, train: Trajectories, around: Fit, every: Fit, source: OfSource | None, learned_from, effect, sizes
 ) -> tuple[Posterior, Unchanged, Float[Array, " p"], Bool[Array, "2 p"]]:
@@ -191,6 +195,7 @@ def _judge(
     return found, nothing, jnp.where(rows[1], every.theta - start, 0.0).astype(sizes.dtype), rows
 
 
+@jit_by_size(UNOPTIMISED)
 def _confirm(method: Auto, larger, changed, still, chosen: Posterior) -> tuple[Fit, Any, Posterior, Array]:
     """Return the fit and the starts of the chosen change, or those of none if left-out blocks do not confirm it.
 
@@ -205,12 +210,13 @@ def _confirm(method: Auto, larger, changed, still, chosen: Posterior) -> tuple[F
     return found, starts, chosen, jnp.where(sure, thetas, found.theta)
 
 
-def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale, error, blocks: int) -> Anchored:
-    """Fit the network's change on top of the chosen candidate."""
-    field = ravel_parameters(larger)[1](found.theta)
-    return fit_anchored(field, train, starts, found.noise, solver, scale, error, blocks_of(len(train), blocks))
+@jit_by_size(FASTEST_COMPILE)
+def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale) -> Subspace:
+    """Linearise by the network's weights at the chosen candidate."""
+    return subspace(ravel_parameters(larger)[1](found.theta), train, starts, solver, scale)
 
 
+@jit_by_size(UNOPTIMISED)
 def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options) -> Solution:
     """Add the network's change if it is probable, and compute the errors of left-out blocks."""
     (found, chosen, left_out, source, nothing, effect, step), (sizes, solver) = outcome, options
@@ -228,6 +234,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     inherited = spread(found.equations, free[taken] & found.seen, of_source)
     changes = jnp.zeros((len(left_out), 0))
     if step is not None:
+        step = fit_anchored(step, found.noise, nothing.error, blocks)
         removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, if physics replaced it
         odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
         better = odds > STRONG
@@ -256,12 +263,6 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     status = jnp.where(jnp.any(found.seen), found.status, Status.STALLED)  # of what has no effect nothing is found
     finite = (status == Status.OK) | ~jnp.isinf(ends).any()
     return Solution(adapted, found.steps, jnp.where(finite, status, Status.DIVERGED), choice)
-
-
-LOOPS: tuple[Any, ...] = (_fits, _anchor)
-ONCE: tuple[Any, ...] = (_begin, network_effect, _replace, _judge, _confirm, _conclude)
-STEPS = LOOPS + ONCE
-COMPILED = (*map(jit_by_size(FASTEST_COMPILE), LOOPS), *map(jit_by_size(UNOPTIMISED), ONCE))
 
 
 def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:

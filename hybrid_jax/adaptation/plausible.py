@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import ravel_parameters
-from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.estimation.uncertainty import named_parameters, names_of
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
@@ -97,20 +98,15 @@ def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:
     return sized(with_disturbance(corrected(field)), d)
 
 
-def names_of(field: AbstractVectorField) -> list[str]:
-    names: list[str] = []
-    jax.eval_shape(lambda: names.extend(named_parameters(field)))  # computes nothing
-    return names
-
-
 @jit_by_size(UNOPTIMISED)  # one by one, these small operations take as long to compile as a rollout
-def _numbers(field: AbstractVectorField) -> list[Array]:
-    return [*named_parameters(field).values()]
+def _numbers(field: AbstractVectorField, d: int | None) -> list[Array]:
+    return [*named_parameters(field if d is None else extended(field, d)).values()]
 
 
-def values_of(field: AbstractVectorField) -> dict[str, float]:
-    """Return the parameters of a field's physics by name."""
-    return dict(zip(names_of(field), map(float, jax.device_get(_numbers(field))), strict=True))
+def values_of(field: AbstractVectorField, d: int | None = None) -> dict[str, float]:
+    """Return the parameters of a field's physics by name, of the `extended` one for a state of d numbers."""
+    named = field if d is None else eqx.filter_eval_shape(extended, field, d)
+    return dict(zip(names_of(named), map(float, jax.device_get(_numbers(field, d))), strict=True))
 
 
 def groups_of(names: Sequence[str]) -> list[str]:

@@ -201,7 +201,7 @@ def uncorrected(field: AbstractVectorField) -> AbstractVectorField:
 
     def smaller(body: RigidBody) -> RigidBody:
         kept = {name: value for name, value in body.deviations.items() if name not in CORRECTIONS}
-        used = any(np.any(body.deviations.get(name, 0)) for name in CORRECTIONS)
+        used = any(np.asarray(body.deviations.get(name, 0)).any() for name in CORRECTIONS)
         return body if used else replace(body, deviations=kept)
 
     return _with_bodies(field, smaller)

@@ -14,7 +14,7 @@ from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.disturbance import physics_of, with_physics
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.metrics import errors_in
-from hybrid_jax.runtime import FASTEST_COMPILE, jit_by_size
+from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
@@ -83,7 +83,7 @@ def warn_of_steps(moved: float, remedy: str, named: bool = True, stacklevel: int
         warnings.warn(f"half the solver's step would {what} errors: give {remedy}", stacklevel=stacklevel)
 
 
-@jit_by_size(FASTEST_COMPILE)
+@jit_by_size(UNOPTIMISED)
 def _standard_errors(field: AbstractVectorField, windows: Trajectories, solver: Solver, weight, change):
     """Compute by how many standard errors, in noise of 1, a change of the predictions moves a parameter at most."""
     fixed = fixed_residual(field)

@@ -25,7 +25,7 @@ from hybrid_jax.estimation.normal_equations import (
     masked,
     normal_equations,
 )
-from hybrid_jax.runtime import entry, jit_by_size
+from hybrid_jax.runtime import UNOPTIMISED, entry, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 
@@ -92,7 +92,7 @@ def covariance_of(
     return _covariance(equations, fitted, cluster, len(windows)) + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
 
 
-@jit_by_size()
+@jit_by_size(UNOPTIMISED)
 def _covariance(equations: NormalEquations, p: Int[Array, ""] | int, cluster: int, n: Int[Array, ""] | int):
     gram, score, _ = equations
     bread = inverse(jnp.sum(gram, axis=0))
@@ -147,22 +147,24 @@ def intervals(
         ValueError: if level is not between 0 and 1, or the covariance has another shape or a negative variance.
     """
     check_level(level)
-    theta, unravel = ravel_parameters(physics := physics_of(field))
-    array, p = jnp.asarray(checks.real_array("covariance", covariance), float), theta.size
+    p = jax.eval_shape(lambda: ravel_parameters(field)[0]).size
+    array = checks.real_array("covariance", covariance)
     if array.shape != (p, p):
         raise ValueError(f"covariance must be ({p}, {p}), as the field has {p} parameters, got shape {array.shape}")
-    variances = jnp.diagonal(array)
-    if not checks.is_traced(variances) and not (variances >= 0).all():
+    if not checks.is_traced(array) and not ((variances := np.diagonal(array)) >= 0).all():
         raise ValueError(f"covariance must have variances of at least 0, got {variances}")
-    quantile = jax.jit(jax.scipy.special.ndtri)((1 + level) / 2)
-    if degrees is not None:
-        quantile = jnp.asarray(scipy.special.stdtrit(degrees, (1 + level) / 2))
-    away = quantile * jnp.sqrt(variances)
-    left, right = (named_parameters(unravel(end)) for end in (theta - away, theta + away))
-    return {
-        name: Interval(value, jnp.minimum(left[name], right[name]), jnp.maximum(left[name], right[name]))
-        for name, value in named_parameters(physics).items()
-    }
+    upper = (1 + level) / 2
+    quantile = scipy.special.ndtri(upper) if degrees is None else scipy.special.stdtrit(degrees, upper)
+    return dict(zip(names_of(field), _bounds(physics_of(field), jnp.asarray(array), quantile), strict=True))
+
+
+@jit_by_size(UNOPTIMISED)  # one by one, these small operations take a second to compile
+def _bounds(physics: AbstractVectorField, covariance: Float[Array, "p p"], quantile) -> list[Interval]:
+    theta, unravel = ravel_parameters(physics)
+    away = (quantile * jnp.sqrt(jnp.diagonal(covariance).astype(float))).astype(theta.dtype)
+    left, middle, right = (named_parameters(unravel(end)).values() for end in (theta - away, theta, theta + away))
+    ends = zip(middle, left, right, strict=True)
+    return [Interval(value, jnp.minimum(one, other), jnp.maximum(one, other)) for value, one, other in ends]
 
 
 def check_determined(field: AbstractVectorField, n: int, fitted: int | None = None) -> None:
@@ -176,6 +178,13 @@ def check_determined(field: AbstractVectorField, n: int, fitted: int | None = No
 def check_level(level: float) -> None:
     if not 0 < (checks.real(level) or 0) < 1:
         raise ValueError(f"level must be between 0 and 1, got {checks.short_repr(level)}")
+
+
+def names_of(field: AbstractVectorField) -> list[str]:
+    """Return the names of `named_parameters` in the order of compiled programs, in which dictionaries are sorted."""
+    names: list[str] = []
+    eqx.filter_eval_shape(lambda field: names.extend(named_parameters(field)), field)  # computes nothing
+    return names
 
 
 def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:

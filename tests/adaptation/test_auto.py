@@ -13,7 +13,7 @@ from pendulum import LENGTH, Push, flown, hybrid, pendulum, pushes
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation import FineTune, adapt, auto, selection
-from hybrid_jax.adaptation.anchored import fit_anchored, taken_by_network, with_change
+from hybrid_jax.adaptation.anchored import fit_anchored, subspace, taken_by_network, with_change
 from hybrid_jax.adaptation.plausible import CANDIDATES, extended, free_parameters
 from hybrid_jax.adaptation.selection import STRONG, Fit, alike, blocks_of, correlated, fit_each, posterior
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
@@ -121,7 +121,7 @@ def test_windows_choose_what_changed(chosen):
 def test_a_step_of_the_network_is_taken_if_the_source_does_not_err_as_much():
     truth = eqx.tree_at(lambda field: field.residual.bias_out, hybrid(), hybrid().residual.bias_out + 1.0)
     windows, blocks = flown(truth), blocks_of(40, 5)
-    fit = partial(fit_anchored, hybrid(), windows, None, jnp.zeros(()), None, None)
+    fit = partial(fit_anchored, subspace(hybrid(), windows, None, None, None), jnp.zeros(()))
     found = [fit(jnp.asarray(error), blocks) for error in (0.0, 1e9)]
     assert min(found[0].odds, found[1].naive) > STRONG > found[1].odds
     after = rollout_mse(with_change(hybrid(), found[0].change), windows)
@@ -263,13 +263,13 @@ def test_a_stiff_system_is_adapted_to_the_same_rate_from_near_and_far():
 
 
 def test_a_fit_that_diverges_from_the_first_estimate_begins_again_at_the_source(monkeypatch):
-    fits, *others = auto.COMPILED
+    fits = auto._fits
 
     def diverging(field, move, *options):
         nothing, found, starts = fits(field, move, *options)
         return nothing, found._replace(status=Status.DIVERGED if np.any(move) else found.status), starts
 
-    monkeypatch.setattr(auto, "COMPILED", (diverging, *others))
+    monkeypatch.setattr(auto, "_fits", diverging)
     assert adapt(pendulum(0.7), flown(pendulum())).converged
 
 
