@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import permutations, product
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
 from experiments.flying.scenario import hardware
 from experiments.runner import command
@@ -26,6 +26,8 @@ HOME, BLOCK = np.array([0.0, 0.0, 2.0], np.float32), 10  # m; periods of a predi
 MEMORY = 1.0  # s, of a gust
 CHANGE = np.array([0.0, -8 / 3, 0.0])  # m/s²: the side wind at the end
 AFTER = 30  # blocks after it
+RIGHT = np.arange(4)[None]  # the order of rotors in what the filter is given
+EXCHANGED = np.array([order for order in permutations(range(4)) if sum(np.array(order) != range(4)) == 2])
 PRIOR = {"Ix": 0.3, "Iy": 0.3, "k": 0.2}
 DISTURBANCE, PROCESS = (3.0,) * 3 + (5.0,) * 3, (0.0,) * 7 + (0.003,) * 3 + (0.005,) * 3
 PUSHES = tuple(f"disturbance[v{axis}]" for axis in "xyz")
@@ -64,8 +66,8 @@ class Hovered(NamedTuple):
     errors: Float[Any, "*n t 2 2"]
     theta: Float[Any, "*n t p"]
     deviation: Float[Any, "*n t p"]
-    unexcited: Float[Any, "*n t p"]
     inconsistent: Float[Any, "*n t"]
+    exchanged: Float[Any, "*n t 4"]
     changes: Float[Any, "*n t"]
 
     def ratios(self, first: int, last: int) -> Float[Any, "*n 2"]:
@@ -76,8 +78,12 @@ class Hovered(NamedTuple):
     def found(self, blocks: int) -> Float[Any, " *n"]:
         """Time after the wind until the adapted model errs half as much in v as the first one [s]; inf if never."""
         later = self.errors[..., blocks + 1 :, :, 0]
-        halved = later[..., 0] < later[..., 1] / 4
-        return np.where(halved.any(axis=-1), DT * BLOCK * (np.argmax(halved, axis=-1) + 1), np.inf)
+        return _first(later[..., 0] < later[..., 1] / 4)
+
+
+def _first(found: Bool[np.ndarray, "*n t"]) -> Float[Any, " *n"]:
+    """Time until the first block of which it is true [s]; inf if there is none."""
+    return np.where(found.any(axis=-1), DT * BLOCK * (np.argmax(found, axis=-1) + 1), np.inf)
 
 
 def adaptation_of(world: str, noise: float, named: bool = False) -> OnlineAdaptation:
@@ -89,9 +95,9 @@ def adaptation_of(world: str, noise: float, named: bool = False) -> OnlineAdapta
 
 @jit_with(FASTEST_COMPILE)
 def hover(
-    adaptation: OnlineAdaptation, world: str, noise: float, blocks: int, gusts: Float[Array, " n"], keys: PRNGKeyArray
+    adaptation: OnlineAdaptation, world: str, noise: float, blocks: int, gusts: Float[Array, " n"], keys, orders=RIGHT
 ) -> Hovered:
-    """Hover for some blocks and AFTER more in a side wind, for each rms of gusts [m/s²] and key."""
+    """Hover for some blocks and AFTER more in a side wind, for each rms of gusts [m/s²], key and order of rotors."""
     (step, _, start), device, kept = WORLDS[world], hardware(noise, 0, 0), np.exp(-DT / MEMORY)
     first, sizes = with_disturbance(adaptation.field), np.square(device.sizes())
 
@@ -100,14 +106,14 @@ def hover(
         squares = jnp.square(after - expected) + sizes
         return jnp.stack([jnp.sum(squares[VELOCITY]), jnp.sum(squares[BODY_RATES])])
 
-    def flight(gust, key):
+    def flight(gust, key, order):
         def period(now, given):
             (own, x, seen, push, state), (key, steady) = now, given
             one, two = jax.random.split(key)
             push = kept * push + gust * np.sqrt(1 - kept**2) * jax.random.normal(one, (3,))
             own, x, u = step(own, x, seen, push + steady * CHANGE)
             seen = device.measure(x, two)
-            return (own, x, seen, push, adaptation.update(state, seen, u)), u
+            return (own, x, seen, push, adaptation.update(state, seen, u[order])), u
 
         def block(now, given):
             after, inputs = jax.lax.scan(period, now, (jax.random.split(given[0], BLOCK), jnp.full(BLOCK, given[1])))
@@ -115,14 +121,14 @@ def hover(
             errors = jnp.stack([error(model, now[1], after[1], inputs) for model in models])
             (theta, covariance), flags = adaptation.estimate(state), adaptation.flags(state)
             deviation = jnp.sqrt(jnp.diagonal(covariance))
-            return after, Hovered(errors, theta, deviation, flags.unexcited, flags.inconsistent, state.changes)
+            return after, Hovered(errors, theta, deviation, flags.inconsistent, flags.exchanged, state.changes)
 
         x = jnp.zeros(13).at[2].set(HOME[2]).at[3].set(1.0)
         now = start, x, x, jnp.zeros(3), adaptation.begin(x)
         steady = jnp.where(jnp.arange(blocks + AFTER) < blocks, 0.0, 1.0)
         return jax.lax.scan(block, now, (jax.random.split(key, blocks + AFTER), steady))[1]
 
-    return jax.vmap(flight)(gusts, keys)
+    return jax.vmap(flight)(gusts, keys, jnp.broadcast_to(orders, (len(keys), 4)))
 
 
 @dataclass(frozen=True)
@@ -155,6 +161,12 @@ def run(options: Options) -> None:
                 f"{alarm} | {parts} | {inside:.0f} | {100 * own.inconsistent[:blocks].mean():.0f}",
                 flush=True,
             )
+    given = jnp.zeros(12), jax.random.split(jax.random.key(8), 12), np.concatenate([np.tile(RIGHT, (6, 1)), EXCHANGED])
+    print("noise, world | exchanged rotors seen in how many of 6 flights with none | time to name two that are [s]")
+    for noise, world in product((0.1, 1.0), WORLDS):
+        seen = np.asarray(hover(adaptation_of(world, noise), world, noise, 300, *given).exchanged)
+        named = _first((seen[6:] == (EXCHANGED != RIGHT)[:, None]).all(axis=-1))
+        print(f"{noise:g}, {world} | {seen[:6].any(axis=(1, 2)).sum()} | {' '.join(map('{:.1f}'.format, named))}")
 
 
 main = partial(command.call, "online.hover", Options, run)

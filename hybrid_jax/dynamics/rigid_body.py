@@ -1,6 +1,6 @@
 """f_p: the Newton–Euler equations of a multirotor, by default with unknown Ix, Iy and k (paper, Eq. 10); baselines."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -250,3 +250,15 @@ class FrozenRates(AbstractWrapper):
 
     def write(self, x, inside):
         return inside.at[BODY_RATES].set(0.0)
+
+
+def vehicle_in(field: Any) -> Vehicle | None:
+    vehicles = (getattr(part, "vehicle", None) for part in parts_of(field))
+    return next((one for one in vehicles if isinstance(one, Vehicle)), None)
+
+
+def parts_of(tree: Any) -> Iterator[Any]:
+    yield tree
+    for child in jax.tree.leaves(tree, is_leaf=lambda node: node is not tree):
+        if child is not tree:
+            yield from parts_of(child)

@@ -1,6 +1,6 @@
 """Prepare a field for export: a function of x and u in one precision, and its sizes."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.hidden import DisturbanceModel, WithHidden
+from hybrid_jax.dynamics.rigid_body import parts_of
 from hybrid_jax.integrate import check_field, rk4_step
 from hybrid_jax.networks import smoothed
 from hybrid_jax.vehicle import STATE_SIZE, Vehicle
@@ -79,25 +80,13 @@ def sizes_of(field: Any, state_size: Size, input_size: Size, observe: bool = Fal
     return (d, m, d - field.hidden) if observe else (d, m)  # pyright: ignore[reportReturnType, reportOptionalOperand]
 
 
-def vehicle_in(field: Any) -> Vehicle | None:
-    vehicles = (getattr(part, "vehicle", None) for part in _parts(field))
-    return next((one for one in vehicles if isinstance(one, Vehicle)), None)
-
-
 def _known_sizes(tree: Any) -> tuple[int, int] | None:
     if isinstance(tree, DisturbanceModel | WithHidden):
         inside = _known_sizes(tree.field)
         return inside and (inside[0] + tree.hidden, inside[1])
-    for part in _parts(tree):
+    for part in parts_of(tree):
         if isinstance(vehicle := getattr(part, "vehicle", None), Vehicle):
             return STATE_SIZE, vehicle.rotors
         if isinstance(part, eqx.Module) and hasattr(part, "state_size") and hasattr(part, "input_size"):
             return part.state_size, part.input_size  # pyright: ignore[reportAttributeAccessIssue]
     return None
-
-
-def _parts(tree: Any) -> Iterator[Any]:
-    yield tree
-    for child in jax.tree.leaves(tree, is_leaf=lambda node: node is not tree):
-        if child is not tree:
-            yield from _parts(child)

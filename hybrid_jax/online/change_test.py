@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hybrid_jax.online.kalman import Correction
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import SPANS, Tuning
 
@@ -39,8 +40,7 @@ class ChangeTest(eqx.Module):
 
     def after(
         self,
-        white: Float[Array, " d"],
-        gains: Float[Array, "d p"],
+        correction: Correction,
         sample: Sample,
         periods: float,
         tuning: Tuning,
@@ -48,6 +48,7 @@ class ChangeTest(eqx.Module):
         least: Float[np.ndarray, " p"] | float = 0.0,
     ) -> tuple["ChangeTest", Float[Array, " p"]]:
         """Add the innovations of a sample; also return 1 for each parameter above `least` after an alarm, else 0."""
+        white, gains = correction.white, correction.gains[:, -self.pull.shape[-1] :]
         kept = jnp.where(sample.measured, jnp.exp(-periods / jnp.asarray(SPANS, white.dtype)[:, None]), 1.0)
         pull = kept * self.pull + jnp.where(sample.measured, white @ gains, 0.0)
         spread = kept**2 * self.spread + jnp.where(sample.measured, jnp.sum(jnp.square(gains), axis=0), 0.0)

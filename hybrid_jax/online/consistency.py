@@ -3,7 +3,7 @@
 A large mean of the normalised innovations squared (NIS) means that no θ explains the samples (Bar-Shalom, Li,
 Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4). Persistent alarms, or a
 parameter at its bound, indicate a sensor with a wrong sign, unit or position: the estimate returns to its value before
-the alarms. A filter with a number that is not finite restarts.
+the alarms, as with exchanged rotors (`rotor_order`). A filter with a number that is not finite restarts.
 """
 
 import equinox as eqx
@@ -13,32 +13,35 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.online import kalman
 from hybrid_jax.online.multiple_model import Verdict
+from hybrid_jax.online.rotor_order import ACCEPT, RotorOrder
 from hybrid_jax.online.samples import HUGE, Sample
 from hybrid_jax.online.state import OnlineState
-from hybrid_jax.online.tuning import BURST, TRIAL, WINDOW, Tuning
+from hybrid_jax.online.tuning import ALARMS, BOUND, BURST, REJECT, TRIAL, WINDOW
 
 NEAR = 0.95  # share of its bound from which a parameter counts as at it
 PERSISTENT = 5.0  # alarms as which a parameter at its bound, or an unlikely error, counts in a second
-UNLIKELY = 0.5  # share of `Tuning.reject` from which errors count as alarms, if they last
+UNLIKELY = 0.5  # share of REJECT from which errors count as alarms, if they last
 SETTLED = 0.5  # count of alarms below which an estimate is kept
 
 
 def believed(
-    state: OnlineState, verdict: Verdict, sample: Sample, periods: float, tuning: Tuning
+    state: OnlineState, verdict: Verdict, order: RotorOrder | None, sample: Sample, periods: float
 ) -> dict[str, Float[Array, "..."]]:
     """Compute the consistency fields of the next state: mean NIS, alarms, and θ in use and before the alarms."""
     share = jnp.sum(verdict.squares) / jnp.maximum(jnp.sum(jnp.where(sample.seen, 1.0, 0.0)), 1.0)
     nis = state.nis + jnp.where(sample.measured, -jnp.expm1(-periods / WINDOW), 0.0) * (share - state.nis)
-    at_bound = sample.measured & (jnp.max(jnp.abs(verdict.theta)) >= NEAR * tuning.bound)
-    wrong = at_bound | (nis > UNLIKELY * tuning.reject)
+    at_bound = sample.measured & (jnp.max(jnp.abs(verdict.theta)) >= NEAR * BOUND)
+    wrong = at_bound | (nis > UNLIKELY * REJECT)
     added = jnp.where(verdict.changed, 1.0, 0.0) + jnp.where(wrong, PERSISTENT * periods, 0.0)
     counted = state.doubt * jnp.exp(-periods * sample.elapsed / TRIAL) + added
     # Once it is too large it is doubled, and so takes time to fall.
-    begins = (counted >= tuning.alarms) & (state.doubt < tuning.alarms)
-    doubt = jnp.where(begins, 2 * tuning.alarms, jnp.minimum(counted, 2 * tuning.alarms))
-    trusted = jnp.where(nis < tuning.reject, verdict.theta, state.trusted)
+    begins = (counted >= ALARMS) & (state.doubt < ALARMS)
+    if order is not None:
+        begins = begins | (jnp.max(order.evidence) >= ACCEPT)
+    doubt = jnp.where(begins, 2 * ALARMS, jnp.minimum(counted, 2 * ALARMS))
+    trusted = jnp.where(nis < REJECT, verdict.theta, state.trusted)
     burst = state.burst * jnp.exp(-periods * sample.elapsed) + jnp.where(verdict.changed, 1.0, 0.0)
-    trusted = jnp.where((doubt < tuning.alarms) & (burst < BURST), trusted, state.settled)
+    trusted = jnp.where((doubt < ALARMS) & (burst < BURST), trusted, state.settled)
     # A mean, as the last value may be that of a gust, or of a fault before its first alarm.
     rate = jnp.where(doubt < SETTLED, -jnp.expm1(-periods / TRIAL), 0.0)
     settled = state.settled + rate * (trusted - state.settled)

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, state_space
 from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, with_disturbance
+from hybrid_jax.dynamics.rigid_body import vehicle_in
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import Interval, intervals
 from hybrid_jax.integrate import check_callable, check_field
@@ -30,8 +31,9 @@ from hybrid_jax.online import consistency, excitation, kalman, multiple_model
 from hybrid_jax.online.change_test import EAGER, PART, ChangeTest
 from hybrid_jax.online.excitation import Excitation
 from hybrid_jax.online.hypotheses import Hypothesis, ModelSet, Subspace, model_set, subspace_of
-from hybrid_jax.online.kalman import Belief, Correction, Each, FilterModel
+from hybrid_jax.online.kalman import Belief, Correction, Each, Field, FilterModel
 from hybrid_jax.online.multiple_model import Verdict
+from hybrid_jax.online.rotor_order import RotorOrder
 from hybrid_jax.online.samples import HUGE, Sample, SampleHistory, classify
 from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, flags_of, named_priors
 from hybrid_jax.online.tuning import HOLD, MEMORY, PAUSE, Tuning
@@ -144,6 +146,7 @@ class OnlineAdaptation(AbstractEstimator):
             opened=theta,
             haste=theta,
             nis=zero + 1,
+            order=RotorOrder.begin(vehicle.rotors if (vehicle := vehicle_in(self.field)) else 0, len(x) + p, x.dtype),
             history=SampleHistory(x, none, zero, none),
             changes=zero,
             restarts=zero,
@@ -175,16 +178,18 @@ class OnlineAdaptation(AbstractEstimator):
         sample, history = classify(x, u, elapsed, state.history, self.dt, self.tuning.gap)
         model = self._filter_model(sample, each)
         d, variances, tuning, periods = len(x), model.variances, self.tuning, self.dt / self.tuning.pace
-        belief, told, correction, gains = self._filtered(state, model, sample)
+        belief, told, slope, correction = self._filtered(state, model, sample)
         part = np.where(self._varies(), PART, EAGER)
-        test, opened = state.test.after(correction.white, gains, sample, periods, tuning, PAUSE, part)
+        test, opened = state.test.after(correction, sample, periods, tuning, PAUSE, part)
         opens = jnp.max(opened) > 0
         verdict = Verdict(None, belief.z[d:], jnp.square(correction.white), opens, opens)
         if state.mixture is not None:
-            verdict = multiple_model.update(state.mixture, self._models(), model, sample, belief, correction, gains)
+            verdict = multiple_model.update(state.mixture, self._models(), model, sample, belief, correction)
             unexplained = verdict.unexplained & (test.quiet > HOLD)
             test, opens = test.reset(unexplained, 0.0), opens | unexplained
             opened = jnp.where(unexplained, 1.0, opened)
+        if (order := state.order) is not None:
+            order = order.after(state.joint, self._rates, slope, belief, correction, sample, opens, model)
         # What changed opens to its prior. The state, too, has followed the wrong model since then.
         belief = kalman.reset_state(belief, sample, opens, variances)
         new = OnlineState(
@@ -196,10 +201,11 @@ class OnlineAdaptation(AbstractEstimator):
             mixture=verdict.mixture,
             opened=opened,
             haste=self._haste(state, sample, opens),
+            order=order,
             history=history,
             changes=state.changes + jnp.where(verdict.changed, 1.0, 0.0),
             restarts=state.restarts,
-            **consistency.believed(state, verdict, sample, periods, tuning),
+            **consistency.believed(state, verdict, order, sample, periods),
         )
         begun = self.begin(jnp.where(jnp.abs(history.last) < HUGE, history.last, 0.0))
         return consistency.sound(new, begun, state, variances)
@@ -254,19 +260,19 @@ class OnlineAdaptation(AbstractEstimator):
         return model_set(self.hypotheses, len(self.names), self.dt)
 
     def _filter_model(self, sample: Sample, each: Each) -> FilterModel:
-        x, (start, unravel) = sample.x, ravel_parameters(self.field)
-
-        def rates(x, theta):
-            return unravel((start + jnp.asarray(self.scales, x.dtype) * theta).astype(start.dtype))(x, sample.u)
-
+        x = sample.x
         added = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, x.dtype)), x.shape)
         unit = state_space(self.field, len(x)).normalise
-        return FilterModel(rates, unit, self._variances(x), added, self.dt, self.tuning, each)
+        return FilterModel(self._rates(sample.u), unit, self._variances(x), added, self.dt, self.tuning, each)
+
+    def _rates(self, u) -> Field:
+        start, unravel = ravel_parameters(self.field)
+        return lambda x, theta: unravel((start + jnp.asarray(self.scales, x.dtype) * theta).astype(start.dtype))(x, u)
 
     def _filtered(
         self, state: OnlineState, model: FilterModel, sample: Sample
-    ) -> tuple[Belief, Excitation, Correction, Array]:
-        """Update the filter of all parameters along excited directions; also return excitation and gains of θ."""
+    ) -> tuple[Belief, Excitation, Array, Correction]:
+        """Update the filter of all parameters along excited directions; also return the Jacobian of the next x."""
         d, tuning, ones = len(state.x), self.tuning, jnp.ones_like(state.theta)
         walk, periods = tuning.drift * jnp.exp(state.haste), self.dt / tuning.pace
         diffusion = periods * sample.elapsed * jnp.square(walk)
@@ -278,15 +284,15 @@ class OnlineAdaptation(AbstractEstimator):
         belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted, part)
         predicted = kalman.reset_state(kalman.limit_covariance(belief, ones), sample, sample.restart, model.variances)
         belief, correction = kalman.correct(predicted, sample, model)
-        told, gains = state.excitation, correction.gains[:, d:]
+        told = state.excitation
         if tuning.excitation:
             # Each alarm but the first in 10 s is like a step of a random walk by the prior: a gust that has just begun.
             begun = jnp.sqrt(jnp.maximum(state.doubt - 1, 0.0) / MEMORY)
             breeze = jnp.maximum(jnp.minimum(begun, tuning.drift * tuning.gusts), BREEZE)
             walk = jnp.maximum(walk, breeze * varies)
             told = excitation.after_sample(told, slope, correction, sample, walk, share, periods, tuning)
-            belief, gains = excitation.consider(predicted, belief, correction, told, share)
-        return kalman.triangular(belief, d), told, correction, gains
+            belief, correction = excitation.consider(predicted, belief, correction, told, share)
+        return kalman.triangular(belief, d), told, slope, correction
 
     def _haste(self, state: OnlineState, sample: Sample, opens: Bool[Array, ""]) -> Float[Array, " p"]:
         """Update the log-scale of the random walk: of disturbances, or of all parameters without one."""
@@ -295,6 +301,5 @@ class OnlineAdaptation(AbstractEstimator):
         rise = jnp.where(pulled > 0, RISE * jnp.minimum(pulled, 4.0), -FALL)
         rise = self.dt / tuning.pace * jnp.where(sample.measured, rise, 0.0)
         haste = jnp.clip(state.haste + rise + jnp.where(opens & (pulled > 0), 1.0, 0.0), 0.0, math.log(tuning.gusts))
-        return (
-            jnp.asarray(varies, haste.dtype) * haste if varies.any() else jnp.where(opens, 0.0, haste)
-        )  # what opens need not walk
+        # What opens need not walk.
+        return jnp.asarray(varies, haste.dtype) * haste if varies.any() else jnp.where(opens, 0.0, haste)

@@ -87,8 +87,8 @@ def after_sample(
 
 def consider(
     before: Belief, after: Belief, correction: Correction, told: Excitation, share: Float[Array, " p"]
-) -> tuple[Belief, Float[Array, "d p"]]:
-    """Correct θ on the condition that it stays along considered directions; also return the gains of θ."""
+) -> tuple[Belief, Correction]:
+    """Correct θ on the condition that it stays along considered directions; also return what then corrects it."""
     d, considered = len(correction.white), told.considered()
     gains, root = correction.gains[:, d:], before.root[d:]
     moves = jnp.eye(len(share), dtype=root.dtype)
@@ -106,4 +106,5 @@ def consider(
     held = gains - gains @ moves.T
     z = jnp.concatenate([after.z[:d], before.z[d:] + moves @ (after.z[d:] - before.z[d:])])
     added = jnp.concatenate([jnp.zeros((d, d), z.dtype), held.T])
-    return Belief(z, jnp.concatenate([after.root, added], axis=1)), gains - held
+    kept = jnp.concatenate([correction.gains[:, :d], gains - held], axis=1)
+    return Belief(z, jnp.concatenate([after.root, added], axis=1)), correction._replace(gains=kept)

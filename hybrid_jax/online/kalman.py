@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from hybrid_jax.integrate import rk4_step
 from hybrid_jax.online.samples import Sample
-from hybrid_jax.online.tuning import Tuning
+from hybrid_jax.online.tuning import BOUND, Tuning
 
 Each = Callable[[Callable], Callable]  # a function of one filter → of arrays of several, as `jax.vmap`
 Field = Callable[[Array, Array], Array]  # ẋ as a function of x and a
@@ -44,14 +44,15 @@ class FilterModel(NamedTuple):
 
     def tidy(self, belief: Belief) -> Belief:
         """Normalise the quaternion and clip a to its bounds."""
-        z, d, bound = belief.z, len(self.variances), self.tuning.bound
-        return Belief(jnp.concatenate([self.unit(z[:d]), jnp.clip(z[d:], -bound, bound)]), belief.root)
+        z, d = belief.z, len(self.variances)
+        return Belief(jnp.concatenate([self.unit(z[:d]), jnp.clip(z[d:], -BOUND, BOUND)]), belief.root)
 
 
 class Correction(NamedTuple):
     """The correction of the filter by a sample."""
 
-    white: Float[Array, " d"]  # innovations over their standard deviations
+    errors: Float[Array, " d"]  # innovations over their standard deviations
+    white: Float[Array, " d"]  # the same, clipped
     sizes: Float[Array, " d"]  # standard deviations of the innovations
     gains: Float[Array, "d n"]  # of z for the whitened innovations
     log_likelihood: Float[Array, ""]  # of the sample up to a constant
@@ -125,13 +126,14 @@ def triangular(belief: Belief, d: int) -> Belief:
 def correct(belief: Belief, sample: Sample, model: FilterModel) -> tuple[Belief, Correction]:
     """Process each measured number of a sample; innovations are clipped."""
     (z, root), variances, clip = belief, model.variances, model.tuning.clip
-    white, sizes, gains, likelihood = [], [], [], jnp.zeros((), z.dtype)
+    errors, white, sizes, gains, likelihood = [], [], [], [], jnp.zeros((), z.dtype)
     for i, noise in enumerate(variances):
         used = sample.used[i]
         row = jnp.where(used, root[i], 0.0)
         variance, column = jnp.sum(jnp.square(row)) + noise, root @ row
         size = jnp.sqrt(variance)
-        error = jnp.where(used, jnp.clip((sample.x[i] - z[i]) / size, -clip, clip), 0.0)
+        errors.append(jnp.where(used, (sample.x[i] - z[i]) / size, 0.0))
+        error = jnp.clip(errors[-1], -clip, clip)
         gain = column / size
         # Potter's update: that of the covariance, column columnᵀ / variance, without a difference of squares.
         z, root = z + gain * error, root - column[:, None] * row / (variance + jnp.sqrt(noise * variance))
@@ -139,7 +141,8 @@ def correct(belief: Belief, sample: Sample, model: FilterModel) -> tuple[Belief,
         white.append(error)
         sizes.append(size)
         gains.append(gain)
-    correction = Correction(jnp.stack(white), jnp.stack(sizes), jnp.stack(gains), likelihood)
+    errors, white, sizes, gains = map(jnp.stack, (errors, white, sizes, gains))
+    correction = Correction(errors, white, sizes, gains, likelihood)
     return model.tidy(Belief(z, root)), correction
 
 

@@ -96,19 +96,15 @@ def _means(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "h
 
 
 def update(
-    mixture: Mixture,
-    models: ModelSet,
-    model: FilterModel,
-    sample: Sample,
-    joint: Belief,
-    correction: Correction,
-    gains: Float[Array, "d p"],
+    mixture: Mixture, models: ModelSet, model: FilterModel, sample: Sample, joint: Belief, correction: Correction
 ) -> Verdict:
-    """Process a sample, given the filter of all parameters after its correction and the gains of its θ."""
+    """Process a sample, given the filter of all parameters after its correction."""
     shares, periods = weights(mixture), model.dt / model.tuning.pace
     mixture, white, likelihoods = filtered(mixture, models, model, sample)
     white = jnp.concatenate([white, correction.white[None]])
-    test, concerned = mixture.test.after(shares @ white, gains, sample, periods, model.tuning, SETTLE)
+    test, concerned = mixture.test.after(
+        correction._replace(white=shares @ white), sample, periods, model.tuning, SETTLE
+    )
     changed = jnp.max(concerned) > 0
     # Bayes' rule; what is at the floor stays there, but for the filter of all parameters.
     before = mixture.log_weights

@@ -17,8 +17,9 @@ from hybrid_jax.online.change_test import ChangeTest
 from hybrid_jax.online.excitation import TAKES_PART, Excitation
 from hybrid_jax.online.kalman import Belief
 from hybrid_jax.online.multiple_model import Mixture
+from hybrid_jax.online.rotor_order import RotorOrder
 from hybrid_jax.online.samples import SampleHistory
-from hybrid_jax.online.tuning import BURST, Tuning
+from hybrid_jax.online.tuning import ALARMS, BOUND, BURST, FROZEN, REJECT, Tuning
 
 DISTURBANCE = "disturbance"
 Numbers = float | tuple[float, ...] | np.ndarray
@@ -41,6 +42,7 @@ class OnlineState(eqx.Module):
         opened: 1 for each parameter whose variance rises to its prior before the next sample, after an alarm; else 0.
         haste: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.
         nis: mean normalised innovation squared, 1 if noise and model are correct.
+        order: how likely an exchange of two rotors is; None without rotors.
         history: statistics of the past samples.
         changes: number of alarms.
         restarts: number of restarts after a number that was not finite.
@@ -59,6 +61,7 @@ class OnlineState(eqx.Module):
     opened: Float[Array, "*n p"]
     haste: Float[Array, "*n p"]
     nis: Float[Array, "*n"]
+    order: RotorOrder | None
     history: SampleHistory
     changes: Float[Array, "*n"]
     restarts: Float[Array, "*n"]
@@ -83,7 +86,8 @@ class Flags(NamedTuple):
         gap: whether nothing was measured for longer than `Tuning.gap`.
         changed: whether there was an alarm in the last second.
         inconsistent: whether errors are too large for the model at any θ, or alarms persist, for example because a
-            sensor has a wrong sign, unit or position. The last good estimate is then used.
+            sensor has a wrong sign, unit or position, or rotors are exchanged. The last good estimate is then used.
+        exchanged: which rotors seem to be exchanged with another in the input; empty without rotors.
         unexcited: which parameters recent samples do not excite, alone or in combination with others.
         at_bound: which parameters are at the end of their range.
     """
@@ -93,6 +97,7 @@ class Flags(NamedTuple):
     gap: Bool[Array, ""]
     changed: Bool[Array, ""]
     inconsistent: Bool[Array, ""]
+    exchanged: Bool[Array, " m"]
     unexcited: Bool[Array, " p"]
     at_bound: Bool[Array, " p"]
 
@@ -102,12 +107,13 @@ def flags_of(state: OnlineState, tuning: Tuning) -> Flags:
     considered, test = state.excitation.considered(), state.test if state.mixture is None else state.mixture.test
     return Flags(
         missing=state.history.unseen > 0,
-        frozen=state.history.equal >= tuning.frozen,
+        frozen=state.history.equal >= FROZEN,
         gap=state.history.silent > tuning.gap,
         changed=test.quiet < 1,
-        inconsistent=(state.nis >= tuning.reject) | (state.doubt >= tuning.alarms) | (state.burst >= BURST),
+        inconsistent=(state.nis >= REJECT) | (state.doubt >= ALARMS) | (state.burst >= BURST),
+        exchanged=jnp.zeros((*state.nis.shape, 0), bool) if state.order is None else state.order.exchanged,
         unexcited=jnp.diagonal(considered, axis1=-2, axis2=-1) > TAKES_PART,
-        at_bound=jnp.abs(state.trusted) >= tuning.bound,
+        at_bound=jnp.abs(state.trusted) >= BOUND,
     )
 
 

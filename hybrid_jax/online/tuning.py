@@ -10,6 +10,10 @@ SPANS = (0.05, 0.5)  # of the two sums of the change test
 PAUSE, SETTLE, HOLD = 0.1, 0.3, 0.6  # least time from an alarm to the next, of a mixture, and to an unexplained one
 WINDOW, TRIAL, MEMORY = 0.2, 10.0, 2.0  # time constants of the mean NIS, the count of alarms, and the information
 BURST = 2.0  # alarms in a second (weighted by e⁻ᵗ) from which an estimate is not used: they mean that it is moving
+REJECT = 6.0  # mean normalised innovation squared (NIS) from which an estimate is not used
+ALARMS = 10.0  # alarms in 10 s from which it is not, until their count has halved from twice as many
+FROZEN = 3  # equal samples in a row that mark a sensor as frozen
+BOUND = 4.0  # prior standard deviations that a parameter may move
 SLOWEST = 0.05  # period up to which a pace of 1 is right
 
 
@@ -27,12 +31,8 @@ class Tuning:
         drift: random walk of a parameter, as a share of its prior standard deviation [1/√s, for a pace of 1].
         gusts: largest factor on the random walk of a disturbance while innovations are biased, for example in gusts.
         alarm: threshold of the change test, which is standard normal without a change.
-        reject: mean normalised innovation squared (NIS) above which the estimate is not used.
-        alarms: alarms in 10 s above which the estimate is not used, until their count has halved from twice as many.
         clip: standard deviations at which innovations are clipped against outliers.
         gap: time without samples after which the state is reset to the next one [s]; 0 for 0.1 s times the pace.
-        frozen: number of equal samples in a row that mark a sensor as frozen.
-        bound: prior standard deviations that a parameter may move.
         excitation: information of a sample, in units of the prior, below which a direction of θ is not estimated; 0 to
             estimate all.
         caution: share of the effect of uncertain parameters on a step that counts as noise, because of nonlinearity.
@@ -45,21 +45,16 @@ class Tuning:
     drift: float = 0.002
     gusts: float = 500.0
     alarm: float = 5.0
-    reject: float = 6.0
-    alarms: float = 10.0
     clip: float = 5.0
     gap: float = 0.0
-    frozen: int = 3
-    bound: float = 4.0
     excitation: float = 0.05
     caution: float = 1.5
 
     def __post_init__(self):
         for name in ("pace", "drift", "gap", "excitation", "caution"):
             checks.not_negative(name, getattr(self, name))
-        for name in ("gusts", "alarm", "reject", "alarms", "clip", "bound"):
+        for name in ("gusts", "alarm", "clip"):
             checks.positive(name, getattr(self, name))
-        checks.count("frozen", self.frozen)
 
     def at(self, dt: float) -> "Tuning":
         """Return the settings with pace and gap for samples every dt [s].

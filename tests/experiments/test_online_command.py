@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.online.agents import CHANGES, L1, NAMES, fixed_model, nominal, true_theta, with_theta
-from experiments.online.hover import Hovered, adaptation_of, hover
+from experiments.online.hover import EXCHANGED, PRIOR, RIGHT, Hovered, adaptation_of, hover
 from experiments.online.results import TAGS, GoalEvidence, claims, tables
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
@@ -82,6 +82,16 @@ def judged(rows, step_ms=0.1, seconds=1.0):
 def test_each_claim_fails_where_it_should(change, times, fails):
     assert [id for id, holds in judged(rows(**change), **times).items() if not holds] == fails
     assert {each.header[0] for each in tables(rows(**change))} >= {"change"}
+
+
+def test_exchanged_rotors_are_named_and_end_the_adaptation_and_others_are_not():
+    """Each pair of the Iris' rotors in two seconds of hover; the right order in a wind, too."""
+    orders, keys = np.concatenate([RIGHT, EXCHANGED]), jax.random.split(jax.random.key(0), 7)
+    found = hover(adaptation_of("iris", 1.0), "iris", 1.0, 20, jnp.zeros(7), keys, orders)
+    np.testing.assert_array_equal(found.exchanged[1:, 19], EXCHANGED != RIGHT)
+    assert found.inconsistent[1:, 19].all()
+    assert np.abs(found.theta[:, 19, :3] / np.array([*PRIOR.values()])).max() < 0.1
+    assert not found.exchanged[0].any()
 
 
 @pytest.mark.slow

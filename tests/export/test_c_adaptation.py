@@ -23,7 +23,7 @@ DT = 0.01
 # θ, the last good θ and the sums of corrections are in standard deviations of the prior. An innovation is a difference
 # of two nearly equal numbers: a last digit of 2 m is 1e-4 of a noise of 1 mm, so θ near zero has few right digits.
 UNITS = dict.fromkeys(("theta", "trusted", "settled", "pull", "nis", "z"), 1.0)
-UNITS |= {"spread": 1e-3, "log_weights": 25.0, "sensitivity": 1e-2}
+UNITS |= {"spread": 1e-3, "log_weights": 25.0, "evidence": 25.0, "away": 1.0, "sensitivity": 1e-2}
 HYPOTHESES = (
     hj.Hypothesis("inertia", {"Ix": 0.3, "Iy": 0.3}),
     hj.Hypothesis("thrust", {"k": 0.3}),

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.hidden import DisturbanceModel
+from hybrid_jax.dynamics.rigid_body import vehicle_in
 from hybrid_jax.export.c.files import CFile
-from hybrid_jax.export.program import OBSERVED, Size, prepared, program_of, sizes_of, vehicle_in
+from hybrid_jax.export.program import OBSERVED, Size, prepared, program_of, sizes_of
 from hybrid_jax.runtime import entry
 from hybrid_jax.vehicle import STATE_NAMES
 

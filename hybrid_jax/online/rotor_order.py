@@ -1,0 +1,79 @@
+"""Detect two exchanged rotors from the innovations of a filter.
+
+A disturbance that moves quickly explains a wrong order of the rotors, so innovations stay small; the right order
+explains the samples better still. For each pair a second filter, with the gains of the first, has its inputs exchanged.
+A sequential test compares their likelihoods (Wald, "Sequential analysis", 1947, ch. 3): it accepts the exchange at a
+logarithm of ACCEPT, and begins anew at −REFUSE. What one sample adds is limited (Huber, "A robust version of the
+probability ratio test", 1965), so that a short error of the model, for example as a gust begins, decides nothing.
+"""
+
+from collections.abc import Callable
+from itertools import combinations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hybrid_jax.online.kalman import Belief, Correction, Field, FilterModel
+from hybrid_jax.online.samples import Sample
+from hybrid_jax.online.tuning import BOUND
+
+ACCEPT, REFUSE = 25.0, 10.0  # logarithms of likelihood ratios
+FASTEST = 50.0  # by which they change at most [1/s], for a pace of 1: half a second decides
+
+
+class RotorOrder(eqx.Module):
+    """The filters of h pairs of m rotors."""
+
+    away: Float[Array, "*n h d+p"]  # their x and θ, less those of the first filter
+    evidence: Float[Array, "*n h"]  # logarithm of how much likelier the exchange is
+    orders: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    @classmethod
+    def begin(cls, rotors: int, n: int, dtype) -> "RotorOrder | None":
+        """Initialise before the first sample; None without a pair."""
+        pairs = [{i: j, j: i} for i, j in combinations(range(rotors), 2)]
+        orders = tuple(tuple(pair.get(i, i) for i in range(rotors)) for pair in pairs)
+        return cls(jnp.zeros((len(pairs), n), dtype), jnp.zeros(len(pairs), dtype), orders) if pairs else None
+
+    @property
+    def exchanged(self) -> Bool[Array, "*n m"]:
+        """Which rotors seem to be exchanged with another."""
+        moved = np.array(self.orders) != np.arange(len(self.orders[0]))[None]
+        found = self.evidence[..., None] >= ACCEPT
+        return jnp.any(found & np.broadcast_to(moved, (*found.shape[:-1], moved.shape[1])), axis=-2)
+
+    def after(
+        self,
+        before: Belief,
+        rates: Callable[[Array], Field],
+        slope: Float[Array, "d d+p"],
+        after: Belief,
+        correction: Correction,
+        sample: Sample,
+        opens: Bool[Array, ""],
+        model: FilterModel,
+    ) -> "RotorOrder":
+        """Update after a sample, given the first filter's belief before and after it and the Jacobian of the next x."""
+        d, clip, most = len(sample.x), model.tuning.clip, FASTEST * model.dt / model.tuning.pace
+        x, theta = before.z[:d], before.z[d:]
+        orders = jnp.asarray(np.eye(len(sample.u))[np.array(self.orders)], x.dtype)  # a product has C, a gather has not
+        own = model.each(lambda order, away: rates(order @ sample.u)(x, theta + away))(orders, self.away[:, d:])
+        moved = self.away[:, :d] @ slope[:, :d].T + model.dt * (own - model.field(x, theta)[None])
+        moved = jnp.where(sample.restart, 0.0, jnp.where(sample.acted, moved, self.away[:, :d]))
+        away, ratio = jnp.concatenate([moved, self.away[:, d:]], axis=1), jnp.zeros_like(self.evidence)
+        for i, error in enumerate(correction.errors):
+            own = error - jnp.where(sample.used[i], away[:, i] / correction.sizes[i], 0.0)
+            # What no order explains says nothing.
+            first, second = (jnp.minimum(jnp.square(each), clip**2) for each in (error, own))
+            ratio = ratio + (first - second) / 2
+            added = jnp.clip(own, -clip, clip) - correction.white[i]
+            away = away + added[:, None] * correction.gains[i, None]
+        theta = after.z[None, d:]
+        bounded = jnp.clip(theta + away[:, d:], -BOUND, BOUND) - theta
+        away = jnp.concatenate([jnp.where(opens, 0.0, away[:, :d]), bounded], axis=1)
+        evidence = self.evidence + jnp.clip(ratio, -most, most)
+        goes_on = evidence > -REFUSE  # false if it is not a number
+        evidence = jnp.where(goes_on, jnp.minimum(evidence, 2 * ACCEPT), 0.0)
+        return RotorOrder(jnp.where(goes_on[:, None], away, 0.0), evidence, self.orders)
