@@ -1,11 +1,13 @@
 """What mkdocs does beyond its plugins: MathML, changes, names, 404.html."""
 
 import html
+import io
 import re
-from importlib import import_module
+from importlib import import_module, resources
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from fontTools import subset
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
@@ -22,14 +24,39 @@ INDEXED = re.compile(
 )
 # Without `stretchy="false"` a norm is as high as its whole line.
 NORM, FIXED = "<mo>&#x02016;", '<mo stretchy="false">&#x02016;'
+# Letters, which browsers set as italics, accents, punctuation, operators.
+SIGNS = (
+    "20-7E,A0-FF,2B0-36F,370-3FF,2010-205F,2100-214F,2190-22FF,2308-230B,"
+    "27E8-27EB,1D434-1D467,1D6E2-1D71B"
+)
 ROOT = Path(__file__).parents[2]
 
 
 def on_files(files, config):
-    """Add the list of changes, which lies beside README.md, as a page."""
+    """Add the list of changes, which lies beside README.md, and a font."""
     text = (ROOT / "CHANGELOG.md").read_text().replace("](docs/", "](../")
     files.append(File.generated(config, "about/changes.md", content=text))
+    name = "assets/formulas.woff"
+    files.append(File.generated(config, name, content=font()))
     return files
+
+
+def font():
+    """Return the part of ziamath's font that formulas need, as WOFF."""
+    source = resources.files("ziamath") / "fonts/STIXTwoMath-Regular.ttf"
+    options = subset.Options(
+        flavor="woff",
+        hinting=False,
+        layout_features=["ssty"],  # smaller signs for indices
+        name_IDs=[0, 1, 2, 13, 14],  # with the licence
+    )
+    part = subset.load_font(io.BytesIO(source.read_bytes()), options)
+    subsetter = subset.Subsetter(options)
+    subsetter.populate(unicodes=subset.parse_unicodes(SIGNS))
+    subsetter.subset(part)
+    file = io.BytesIO()
+    subset.save_font(part, file, options)
+    return file.getvalue()
 
 
 def on_page_markdown(markdown, page, config, files):
