@@ -19,10 +19,10 @@ from hybrid_jax.cli.help import RARE
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.disturbance import disturbance_of
-from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, vehicle_in
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.export import casadi_function, export_adaptation_c, export_c, export_program
-from hybrid_jax.export.program import sizes_of, vehicle_in
+from hybrid_jax.export.program import sizes_of
 from hybrid_jax.identification.learning import without_past
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.models import load

@@ -12,8 +12,7 @@ import numpy as np
 from hybrid_jax.cli.command import ChecksFailed, in_flags, printable, step
 from hybrid_jax.cli.help import RARE
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
-from hybrid_jax.export.program import vehicle_in
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, vehicle_in
 from hybrid_jax.flights import Recording, find_logs, read_recording
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean, lag_motors
 from hybrid_jax.flights.checks.consistency import (
