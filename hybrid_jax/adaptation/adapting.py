@@ -97,7 +97,7 @@ def adapt(
         learned_from: windows that the source was trained on, by default those that `hj.fit` stores in its networks.
             "auto" uses them to estimate the source's own error, and the report warns if `windows` are unlike them.
         settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, which is
-            independent of units.
+            independent of units; "auto" takes `learned_from` there if it can.
         level: confidence level of the intervals, between 0 and 1.
 
     Raises:
@@ -136,9 +136,9 @@ def adapt(
         held_out = check_windows(field, held_out, "validation", missing=True)
     check_like(held_out, train, "validation")
     settings = Settings() if settings is None else settings
-    if settings.objective is UNSCALED:
-        settings = replace(settings, objective=scaled_loss(field, train))
     motion = {"learned_from": learned_from} if getattr(method, "uses_motion", False) else {}
+    if settings.objective is UNSCALED:
+        settings = replace(settings, objective=scaled_loss(field, motion.get("learned_from") or train))
     if motion and learned_from is None and has_network(field):
         warnings.warn(NO_MOTION, stacklevel=3)
     if motion and len(windows) <= size:

@@ -123,6 +123,20 @@ def test_a_method_of_a_user_is_the_example_of_the_docstring():
     assert eqx.tree_equal(result.field, pendulum(LENGTH))
 
 
+class Recorded(hj.adaptation.Auto):
+    def solve(self, field, train, validation, settings, learned_from=None):
+        return Solution(field, status=jnp.array(Status.OK), steps=settings.objective.channels[1].scale)
+
+
+def test_errors_count_by_the_source_s_motion_also_in_a_hover():
+    """Otherwise the source that is kept would depend on the flight that it adapts to."""
+    hover = replace(swings(20), x0=1e-3 * swings(20).x0, x=1e-3 * swings(20).x)
+    found = [
+        adapt(hybrid(), windows, method=Recorded(), learned_from=swings(20)).steps for windows in (hover, swings(20))
+    ]
+    assert found[0] == found[1] > 0
+
+
 class Nothing(AbstractVectorField):
     def __call__(self, x, u):
         return x
