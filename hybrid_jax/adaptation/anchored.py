@@ -154,23 +154,25 @@ def network_effect(
 
 
 def taken_by_network(
-    effect: Float[Array, " d"], equations: NormalEquations, of_states: Float[Array, "d p p"]
+    effect: Float[Array, " d"], equations: NormalEquations, of_states: Float[Array, "d p p"], quantities: int
 ) -> Float[Array, " p"]:
     """Compute the variance of each parameter from an effect that physics lacks, of the size of the network's.
 
     An effect b in place of the network's moves a fit by H⁻¹ Jᵀ b, H = JᵀJ: parameter j by at most
-    Σ_s ‖b_s‖ (H⁻¹ J_sᵀ J_s H⁻¹)_jj^½ over states s, by the inequality of Cauchy and Schwarz. Within these bounds any
-    bias is as probable as another, so that the variance is a third of their square (ISO/IEC Guide 98-3, GUM, Sec.
-    4.3.7).
+    Σ_s ‖b_s‖ (H⁻¹ J_sᵀ J_s H⁻¹)_jj^½ over states s, by the inequality of Cauchy and Schwarz, if it is just like the
+    parameter's own effect. An effect may depend on q quantities. One that is a random mixture of q effects which are
+    orthogonal to each other, of which the parameter's own is one, has on average a share 1/q of its square in common
+    with that, so that the variance is the square of the bound over q.
 
     Args:
         effect: ‖b_s‖², see `Effect`.
         equations: of the same windows and the fitted parameters.
         of_states: J_sᵀ J_s, of these and others.
+        quantities: q, on which an effect may depend.
     """
     found = inverse(jnp.sum(equations.gram, axis=0)).matrix
     moved = jnp.sqrt(jnp.maximum(jnp.einsum("pq,sqr,rp->sp", found, of_states, found), 0.0))
-    return jnp.square(jnp.sqrt(effect) @ moved) / 3
+    return jnp.square(jnp.sqrt(effect) @ moved) / quantities
 
 
 def without_network(field: AbstractVectorField) -> AbstractVectorField:

@@ -43,6 +43,7 @@ from hybrid_jax.adaptation.selection import (
     unchanged,
 )
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import disturbance_units
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import sandwich_of_repeated
@@ -254,7 +255,10 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(blocks[1])))
     absorbed = jnp.zeros_like(start)
     if effect is not None:
-        absorbed = jnp.where(alone, absorbed, taken_by_network(effect.of_states, equations, found.of_states))
+        # For example the velocity, the body rates and the rotor speeds, on which aerodynamic forces depend.
+        quantities = len(disturbance_units(larger)) + train.u.shape[-1]
+        most = taken_by_network(effect.of_states, equations, found.of_states, quantities)
+        absorbed = jnp.where(alone, absorbed, most)
     # Other systems' sizes are relative to the source's value, and change with the parametrisation.
     vague = jnp.sqrt(absorbed) > VAGUE * (sizes if "drag" in groups_of(names_of(larger)) else jnp.inf)
     first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends

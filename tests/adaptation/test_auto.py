@@ -214,10 +214,10 @@ def test_an_effect_on_one_state_says_nothing_of_a_parameter_that_another_determi
     moves = np.einsum("pq,ntsq->spnt", np.linalg.inv(gram), jacobian).reshape(2, 2, -1)  # by each error
     worst = moves / np.linalg.norm(moves, axis=-1, keepdims=True)
     most = np.einsum("s,spe,spe->p", sizes, worst, moves)
-    found = taken_by_network(jnp.square(sizes), equations, jnp.asarray(of_states))
+    found = taken_by_network(jnp.square(sizes), equations, jnp.asarray(of_states), 3)
     np.testing.assert_allclose(np.sqrt(3 * np.asarray(found)), most, rtol=1e-4)
     diagonal = equations._replace(gram=jnp.diag(jnp.diag(equations.gram[0]))[None])
-    alone = taken_by_network(jnp.array([4.0, 0.0]), diagonal, jnp.asarray(of_states))
+    alone = taken_by_network(jnp.array([4.0, 0.0]), diagonal, jnp.asarray(of_states), 1)
     assert alone[1] == 0 < alone[0]
 
 
