@@ -32,7 +32,8 @@ HEAD = """\
 A hybrid that was trained on usual flight of a vehicle adapts by `hj.adapt` to one flight after a change, or after none,
 and is tested over 1 s of usual flights after it. Ratio: its test error over the error of the source. Each source (seed)
 has flights of its own to learn from, to adapt to (draws) and to test on, so that sources are independent, and shares
-have confidence intervals over them. For some changes other methods adapt to the same ten seconds:
+have confidence intervals over them. Flights that crash are left out, but for those to adapt to. For some changes other
+methods adapt to the same ten seconds:
 
 - **fine_tune**, **l2_sp**: Adam, and Adam with a penalty on the distance from the source's parameters
 - **fine_tune_paper**: Adam on 1000 windows of five flights without noise, another flight says when to stop

@@ -7,6 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import jax
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
 import hybrid_jax as hj
@@ -22,10 +23,11 @@ from experiments.worlds.iris import Iris
 from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
 from experiments.worlds.methods import AUTO, METHODS, PHYSICS, Task
 from experiments.worlds.rotorpy import ROTORPY
-from experiments.worlds.world import CHANGES, MADE_FOR, NOTHING, World, logged
+from experiments.worlds.world import CHANGES, MADE_FOR, NOTHING, Flown, World, logged
 from hybrid_jax.adaptation import LeastSquares
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.networks.mlp import zero_output
+from hybrid_jax.sim import gone_wrong
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.training import Settings
 from hybrid_jax.training.channels import scaled_loss
@@ -33,6 +35,7 @@ from hybrid_jax.training.channels import scaled_loss
 WORLDS: dict[str, World] = {world.name: world for world in (Iris(), *ROTORPY)}
 STEPS, LONG = 10, 100  # intervals of a window to learn from, and to test on
 LEARNING, TESTING = 20.0, 10.0  # s, of a flight
+SPARE = 1.5  # times as many flights are flown as are needed
 SOURCE, TARGET, TEST, NOISE, TRAINING, LOGGING = range(6)  # purposes of a key
 MANY = 5  # flights to train on in the paper's protocol: 1000 windows
 COMPARED = 6  # sources from which other methods adapt, too
@@ -102,12 +105,19 @@ def key_of(world: World, config: WorldsConfig, purpose: int, draw: int = 0) -> P
     return jax.random.fold_in(jax.random.fold_in(key, purpose), draw)
 
 
+def usual_flights(world: World, change: str, flights: int, seconds: float, key: PRNGKeyArray) -> Flown:
+    """Fly without a crash: the pilot of some vehicles turns over now and then."""
+    flown = world.fly(change, USUAL, round(SPARE * flights), seconds, key)
+    kept = np.flatnonzero(~gone_wrong(flown.states))[:flights]
+    return Flown(*(part[kept] for part in flown))
+
+
 def source_flights(world: World, config: WorldsConfig, seed: int) -> Dataset:
     """Fly a source's training and validation flights: each seed has its own, as intervals concern their errors too."""
     numbers = {"train": config.source_train, "validation": config.validating()}
     each = round(LEARNING / STEPS * 100)
     flights = {name: -(-number // each) for name, number in numbers.items()}
-    flown = world.fly(NOTHING, USUAL, sum(flights.values()), LEARNING, key_of(world, config, SOURCE, seed))
+    flown = usual_flights(world, NOTHING, sum(flights.values()), LEARNING, key_of(world, config, SOURCE, seed))
     noise = config.noise if config.noise_on == "all" else 0.0
     log = partial(logged, steps=STEPS, noise=noise, averaged=config.rotor_speeds == "averaged")
     windows, first = log(flown, key_of(world, config, LOGGING, seed)), each * flights["train"]
@@ -145,7 +155,7 @@ class Tests(NamedTuple):
 
 def tests_after(world: World, change: str, config: WorldsConfig, seed: int) -> Tests:
     key, averaged = key_of(world, config, TEST, seed), config.rotor_speeds == "averaged"
-    flown = world.fly(change, USUAL, config.test_flights, TESTING, key)
+    flown = usual_flights(world, change, config.test_flights, TESTING, key)
     noisy = logged(flown, key, LONG, noise=config.noise, averaged=averaged)
     each = len(noisy) // config.test_flights
     others = [noisy[i : i + each] for i in range(0, len(noisy), each)]
@@ -154,7 +164,7 @@ def tests_after(world: World, change: str, config: WorldsConfig, seed: int) -> T
 
 def many_after(world: World, change: str, config: WorldsConfig) -> tuple[hj.Trajectories, hj.Trajectories]:
     """Return windows of many flights for training, and others for early stopping, without noise."""
-    flown = world.fly(change, USUAL, MANY + 1, LEARNING, key_of(world, config, TRAINING))
+    flown = usual_flights(world, change, MANY + 1, LEARNING, key_of(world, config, TRAINING))
     averaged = config.rotor_speeds == "averaged"
     windows = logged(flown, key_of(world, config, NOISE), STEPS, noise=0.0, averaged=averaged)
     first = len(windows) * MANY // (MANY + 1)
