@@ -60,7 +60,7 @@ def test_seven_changes():
         name = names.get(domain, label(domain))
         assert shown[name] == [*errors, f"{rho.mean():.3g}, {rho.min():.3g}"], domain
     ratios = regret(committed("changes"))
-    assert (f"{np.mean(ratios <= 1.1):.0%}", f"{ratios.max():.2f}") == ("93%", "1.34")
+    assert (f"{np.mean(ratios <= 1.1):.0%}", f"{ratios.max():.2f}") == ("95%", "1.71")
 
 
 @pytest.mark.parametrize("change", PAPER)
@@ -101,7 +101,7 @@ def test_intervals():
             cells.append(f"{min(values):{form}} to {max(values):{form}}" if values else "–")
         assert lines("docs/results/intervals.md")[label(domain)] == cells
     alone = np.mean([row["alone"] for row in fitted if row["alone"] is not None])
-    assert (len(fitted), f"{np.mean(fitted['inside']):.0%}", f"{alone:.0%}") == (689, "99%", "96%")
+    assert (len(fitted), f"{np.mean(fitted['inside']):.0%}", f"{alone:.0%}") == (681, "99%", "98%")
 
 
 @pytest.mark.parametrize(("page", "horizon"), [("results/real_flights", "50"), ("notes/public_logs", "10")])
@@ -140,8 +140,6 @@ def test_adapting_in_flight():
     assert f"{min(shares):.0f} to {max(shares):.0f} % of the intervals" in page
     alarms = sum(row["alarms"] > 0 for row in low["nothing"])
     assert f"false alarm in {alarms} of {len(low['nothing'])} flights" in page
-    fast = rows.where(change="inertia", reference="fast_figure_eight")
-    assert f"true value in {100 * fast.spread('inside.Ix').mean:.0f} % of the time" in page
 
 
 def decimals(page, linked):
