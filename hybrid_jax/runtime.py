@@ -21,8 +21,6 @@ import numpy as np
 import platformdirs
 from jaxlib import lapack
 
-from hybrid_jax import checks
-
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
 CPUS = Path("/proc/cpuinfo")
 FLAGS = "XLA_FLAGS"
@@ -148,7 +146,7 @@ def jit_by_size(options: dict[str, bool | int] | None = None) -> Callable[[Calla
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            traced = any(map(checks.is_traced, jax.tree.leaves((args, kwargs))))
+            traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs)))
             return (function if traced else compiled)(*args, **kwargs)
 
         return call if options else compiled
