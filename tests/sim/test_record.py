@@ -143,7 +143,10 @@ def test_a_domain_in_which_every_flight_fails_says_so(monkeypatch):
     broken = level_flights(64)
     broken.states[:, 3, 2] = np.nan
     monkeypatch.setattr(recording, "random_flights", lambda *_: broken)
-    refusal(lambda: make_dataset(SOURCE, {"train": SplitSpec(1, 10)}, seed=0), "domain source: none of 64 flights")
+    refusal(
+        lambda: make_dataset(SOURCE, {"train": SplitSpec(1, 10)}, seed=0),
+        "domain source: all 64 flights left the bounds",
+    )
 
 
 def call(monkeypatch, *arguments):
