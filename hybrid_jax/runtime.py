@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import platformdirs
+from jax.core import Tracer
 from jaxlib import lapack
 
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
@@ -146,7 +147,7 @@ def jit_by_size(options: dict[str, bool | int] | None = None) -> Callable[[Calla
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs)))
+            traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
             return (function if traced else compiled)(*args, **kwargs)
 
         return call if options else compiled
