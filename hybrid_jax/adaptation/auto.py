@@ -41,6 +41,7 @@ from hybrid_jax.adaptation.selection import (
     spread,
     surely_lower,
     unchanged,
+    without_others,
 )
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import disturbance_units
@@ -193,7 +194,7 @@ def _judge(
         nothing = unchanged(source.own, around, effect.total if effect else 0.0, larger, learned_from, train)
     found = posterior(around, every, start, free, sizes, nothing.apparent)
     rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
-    return found, nothing, jnp.where(rows[1], every.theta - start, 0.0).astype(sizes.dtype), rows
+    return found, nothing, without_others(every, rows[1], start).astype(sizes.dtype), rows
 
 
 @jit_by_size(UNOPTIMISED)

@@ -224,6 +224,17 @@ def left_out_thetas(found: Fit, free: Bool[Array, " p"], sizes, start, blocks) -
     return found.theta + left_out_steps(masked(found.equations, free), held, held @ (found.theta - start), blocks)
 
 
+def without_others(every: Fit, free: Bool[Array, " p"], start) -> Float[Array, " p"]:
+    """Return the change of the free parameters if the others stay, to first order around a fit of all.
+
+    Parameters are correlated: with the others set back alone, predictions can be far worse than the start's.
+    """
+    gram, change = jnp.sum(every.equations.gram, axis=0), every.theta - start
+    others = jnp.where(free, 0.0, change)
+    taken = inverse(jnp.sum(masked(every.equations, free).gram, axis=0)).matrix @ jnp.where(free, gram @ others, 0.0)
+    return jnp.where(free, change + taken, 0.0)
+
+
 def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) -> Bool[Array, ""]:
     """Whether a change lowers the logarithm of the error of blocks left out by more than `SURELY` standard errors.
 
