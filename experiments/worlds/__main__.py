@@ -10,9 +10,10 @@ from rich.console import Console
 from experiments.paper.config import BOTH_ENDS, ONE_FLIGHT, SMOKE, preset_like
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
-from experiments.reporting.report import Report, rows_in
+from experiments.reporting.report import Report, rows_in, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
+from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 from experiments.worlds.cases import WORLDS, WorldsConfig, adapted
 from experiments.worlds.verdicts import (
@@ -24,6 +25,7 @@ from experiments.worlds.verdicts import (
     method_table,
     ratio_table,
 )
+from hybrid_jax.sweep import hosts
 
 NAME = "worlds"
 HEAD = """\
@@ -46,7 +48,7 @@ PRESETS = {
         WorldsConfig,
         replace(BOTH_ENDS, **NOISY, seeds=1, draws=4),
         worlds=("iris", "hummingbird"),
-        changes=("nothing", "reaction_torque", "external_force", "parameter_shift"),
+        changes=("nothing", "motor_lag", "battery", "reaction_torque", "external_force", "parameter_shift"),
         learn_from=("moving", "hover", "near_ground", "outliers"),
     ),
     "smoke": preset_like(
@@ -67,7 +69,9 @@ def experiment(config: WorldsConfig, console: Console) -> None:
         [row for name in config.worlds for row in adapted(WORLDS[name], config, stages)],
         ("world", "change", "flight", "draw", "seed", "method"),
     )
-    stages.publish(NAME, config, rows, report)
+    if hosts.is_main_process():
+        record = record_of(NAME, config, rows, stages.seconds, stages.notes())
+        write_report(config.out / NAME, report(record), Console())
 
 
 def report(record: Mapping[str, Any]) -> Report:

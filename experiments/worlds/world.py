@@ -26,9 +26,10 @@ MADE_FOR = (
     "off_centre_load",
     "gusty_wind",
     "load_and_wind",
+    "reaction_torque",
 )
 NOTHING = "nothing"
-NOT_MADE_FOR = (NOTHING, "reaction_torque", "motor_lag", "battery")  # no candidate can express them
+NOT_MADE_FOR = (NOTHING, "motor_lag", "battery")  # no candidate can express them
 CHANGES = (*MADE_FOR, *NOT_MADE_FOR)
 
 

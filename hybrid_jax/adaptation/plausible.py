@@ -19,7 +19,7 @@ from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 # Parameters of a corrected rigid body; the others are its own, θ_p.
-GROUPS = {"efficiency": "efficiency", "added_drag": "drag"}
+GROUPS = {"efficiency": "efficiency", "reaction_torque": "efficiency", "added_drag": "drag"}
 GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
 
 # What each candidate fits, as groups of parameters. Those apply of which the field has all groups.
@@ -50,7 +50,7 @@ class Plausible:
         force: constant force over the mass [m/s²].
         torque: constant torque over the inertia [rad/s²].
         drag: added drag over the mass [1/s].
-        efficiency: logarithm of each rotor's efficiency.
+        efficiency: logarithm of each rotor's efficiency, and of the factor of all reaction torques.
         disturbance: constant disturbance of another system, over the RMS rate of each state in the windows.
 
     Raises:

@@ -54,7 +54,10 @@ def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
     x, y = (dot(arms, loads) for arms in zip(*vehicle.rotor_positions, strict=True))
     if is_present(constants["centre_of_mass"]):
         x, y = (moment - offset * total for moment, offset in zip((x, y), constants["centre_of_mass"], strict=True))
-    torque = [k * y, -k * x, constants["torque_coefficient"][0] * dot(vehicle.spin, squares)]
+    reaction = constants["torque_coefficient"][0]
+    if is_present(factor := constants["reaction_torque"], absent=1.0):
+        reaction = factor[0] * reaction
+    torque = [k * y, -k * x, reaction * dot(vehicle.spin, squares)]
     if is_present(gain, absent=1.0):
         torque = [factor * part for factor, part in zip(gain, torque, strict=True)]
     return k * total, torque

@@ -64,8 +64,9 @@ class RigidBody(AbstractVectorField):
     velocity v̂ for other forces only by the position: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the thrust.
     Then v − v̂ is λ times the force in the log: f plus the residual. S models the same for drag only.
 
-    Two corrections describe a change of the body (`corrected`): `efficiency` e, a rotor's thrust and reaction torque
-    relative to a sound one at the same speed, and `added_drag` c [1/s] along the body's axes.
+    Three corrections describe a change of the body (`corrected`): `efficiency` e, a rotor's thrust and reaction torque
+    relative to a sound one at the same speed; `reaction_torque`, a factor of all reaction torques, for example of other
+    propellers; and `added_drag` c [1/s] along the body's axes.
 
     Parameters are deviations from nominal that start at zero, so that one learning rate fits all: positive ones as
     log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The rotors' lag
@@ -211,7 +212,8 @@ def hold_corrections(field: AbstractVectorField) -> AbstractVectorField:
     """The field with its corrections as constants, which are no parameters; outside of compiled code."""
 
     def held(body: RigidBody) -> RigidBody:
-        known = {name: tuple(body.deviations[name].tolist()) for name in CORRECTIONS if name in body.deviations}
+        given = {name: body.deviations[name] for name in CORRECTIONS if name in body.deviations}
+        known = {name: tuple(np.ravel(deviation).tolist()) for name, deviation in given.items()}
         return replace(body, deviations={**body.deviations, **known})  # Python numbers are constants
 
     return _with_bodies(field, held)

@@ -14,8 +14,9 @@ SIGNED = {"torque_gain": (3,), "centre_of_mass": (2,), "drag": (3,), "cable_pull
 SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": ()}
 SHAPES = POSITIVE | SIGNED  # of all learnable parameters, for four rotors; see `shape_of`
 OF_VELOCITY = {"drag", "aerodynamic_moment", "velocity_lag", "velocity_gain"}  # no effect where it is not known
-CORRECTIONS = {"efficiency": (4,), "added_drag": (3,)}  # of a body that has changed; see `rigid_body.corrected`
-LOGARITHMIC = (*POSITIVE, "efficiency")
+# Of a body that has changed; see `rigid_body.corrected`.
+CORRECTIONS = {"efficiency": (4,), "reaction_torque": (), "added_drag": (3,)}
+LOGARITHMIC = (*POSITIVE, "efficiency", "reaction_torque")
 Three = tuple[float, float, float]
 NONE = (0.0, 0.0, 0.0)
 
@@ -83,7 +84,7 @@ def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...
     k, (ix, iy, iz) = vehicle.thrust_coefficient, vehicle.inertia
     own = {"Ix": (ix,), "Iy": (iy,), "Iz": (iz,), "k": (k,), "k_rotors": (k,) * vehicle.rotors}
     own |= {"mass": (vehicle.mass,), "torque_coefficient": (vehicle.torque_coefficient,)}
-    own |= {"efficiency": (1.0,) * vehicle.rotors, "added_drag": NONE}
+    own |= {"efficiency": (1.0,) * vehicle.rotors, "reaction_torque": (1.0,), "added_drag": NONE}
     return own | {name: tuple(np.ravel(getattr(terms, name)).tolist()) for name in SIGNED}
 
 

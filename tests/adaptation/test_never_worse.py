@@ -1,5 +1,7 @@
 """Seconds that excite nothing, after which nothing changed, must not make a model worse on flight that moves."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,11 +13,11 @@ DRAG = np.array([0.4, 0.3, 0.1])
 NOISE = np.repeat([1e-3, 2e-3, 0.02, 0.02], [3, 4, 3, 3])  # m, 1, m/s, rad/s
 
 
-def body(drag):
-    return hj.rigid_body(hj.IRIS, terms=Terms(drag=tuple((drag * DRAG).tolist())))
+def body(drag, vehicle=hj.IRIS):
+    return hj.rigid_body(vehicle, terms=Terms(drag=tuple((drag * DRAG).tolist())))
 
 
-def flown(seed, size, noise=1.0, count=100, steps=10, force=None):
+def flown(seed, size, noise=1.0, count=100, steps=10, force=None, vehicle=hj.IRIS):
     """Windows of hover, of a `size` from 0 to 1, about 1 m/s; every measured state has its own noise."""
     rng = np.random.default_rng(seed)
     x0 = np.zeros((count, 13))
@@ -25,7 +27,8 @@ def flown(seed, size, noise=1.0, count=100, steps=10, force=None):
     x0[:, 7:10], x0[:, 10:13] = 2 * size * rng.normal(size=(count, 3)), 1.2 * size * rng.normal(size=(count, 3))
     shakes = 0.12 * rng.normal(size=(count, 1, 4)) + 0.05 * rng.normal(size=(count, steps, 4))
     u = (hj.IRIS.hover_speed * (1 + size * shakes)).astype(np.float32)
-    truth = body(1.0) if force is None else hj.Hybrid(body(1.0), ConstantDisturbance(jnp.array([force, *[0.0] * 5])))
+    truth = body(1.0, vehicle)
+    truth = truth if force is None else hj.Hybrid(truth, ConstantDisturbance(jnp.array([force, *[0.0] * 5])))
     x = np.asarray(hj.rollout_batch(truth, x0.astype(np.float32), u, 0.01))
     x0, x = (a + noise * NOISE * rng.normal(size=a.shape) for a in (x0, x))
     for states in (x0, x):
@@ -59,6 +62,13 @@ def test_hover_changes_what_the_source_does_not_err_on_its_own_motion(force, tak
     assert "force" in found.refused or taken
     assert (found.chosen == "source") != taken
     assert "hj.excitation plans an experiment" in found.report()
+
+
+def test_other_propellers_are_found_by_their_reaction_torque():
+    other = replace(hj.IRIS, torque_coefficient=1.6 * hj.IRIS.torque_coefficient)
+    found = hj.adapt(body(1.0), flown(0, 1.0, vehicle=other))
+    assert found.chosen == "efficiency"
+    np.testing.assert_allclose(found.parameters["reaction_torque"].value, 1.6, rtol=0.03)
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Laws of a rigid body with weakened rotors and added drag."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,8 +21,9 @@ BODY = hj.rigid_body(hj.IRIS)
 U = jnp.array([640.0, 660.0, 650.0, 630.0])
 
 
-def changed(efficiency=(1.0, 1.0, 1.0, 1.0), drag=0.0):
-    deviations = {"efficiency": jnp.log(jnp.array(efficiency)), "added_drag": jnp.full(3, drag)}
+def changed(efficiency=(1.0, 1.0, 1.0, 1.0), drag=0.0, reaction=1.0):
+    factors = {"efficiency": efficiency, "reaction_torque": reaction}
+    deviations = {name: jnp.log(jnp.array(each)) for name, each in factors.items()} | {"added_drag": jnp.full(3, drag)}
     return hj.RigidBody(BODY.deviations | deviations, hj.IRIS)
 
 
@@ -50,6 +53,11 @@ def test_an_efficiency_is_a_factor_on_thrust_and_reaction_torque():
     weak = changed((0.85, 1, 1, 1))
     slower = U.at[0].multiply(np.sqrt(0.85))  # both go with the square of the speed
     np.testing.assert_allclose(weak(moving(), U), BODY(moving(), slower), rtol=1e-6, atol=1e-6)
+
+
+def test_a_factor_of_the_reaction_torque_is_one_of_its_coefficient():
+    other = hj.rigid_body(replace(hj.IRIS, torque_coefficient=1.6 * hj.IRIS.torque_coefficient))
+    np.testing.assert_allclose(changed(reaction=1.6)(moving(), U), other(moving(), U), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
