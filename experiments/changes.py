@@ -22,12 +22,11 @@ from experiments.paper.study import EVERY, flown, pretrained, source_splits, tar
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import FINE_TUNED, HYBRID
-from experiments.reporting.report import Report, rows_in, write_report
+from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results, Row
 from experiments.runner import command
 from experiments.runner.cache import identity_of
 from experiments.runner.options import distinct
-from experiments.runner.run_record import record_of
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate
@@ -41,7 +40,7 @@ from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sweep import evaluate, hosts
+from hybrid_jax.sweep import evaluate
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS, STATE_SIZE
@@ -99,9 +98,7 @@ def experiment(config: ChangesConfig, console: Console) -> None:
         [row for domain in chosen for row in adapted(domain, fields, source.splits["train"], config, stages)],
         ("domain", "candidate", "draw", "seed"),
     )
-    if hosts.is_main_process():
-        record = record_of(NAME, config, rows, stages.seconds, stages.notes())
-        write_report(config.out / NAME, report(record), Console())
+    stages.publish(NAME, config, rows, report)
 
 
 def report(record: Mapping[str, Any]) -> Report:

@@ -19,11 +19,10 @@ from experiments.paper.methods import PAST, Case, Method, adapted, source_only
 from experiments.paper.outcome import FLOOR, paper_report
 from experiments.paper.study import drawn_splits, flown, pretrained, source_splits
 from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER
-from experiments.reporting.report import Report, rows_in, write_report
+from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.options import Target, distinct, factors
-from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.io.datasets import Dataset
@@ -83,11 +82,9 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
         if hosts.is_main_process():
             save_models(out / "models" / domain.name, lanes, found)
         rows, flights = rows + found, flights | {domain.name: target.metadata}
-    if not hosts.is_main_process():
-        return
     floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
     extra = {"truth_theta": {each.name: nominal(each.vehicle) for each in DOMAINS}, FLOOR: floor, "flights": flights}
-    write_report(out, report(record_of(NAME, config, rows, stages.seconds, stages.notes(), **extra)), Console())
+    stages.publish(NAME, config, rows, report, **extra)
 
 
 def report(record: Mapping[str, Any]) -> Report:

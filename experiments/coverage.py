@@ -21,13 +21,12 @@ from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.names import HYBRID
 from experiments.reporting.plots import METHODS as COLOURS
 from experiments.reporting.plots import STYLE, legend_below, name_lines, note, subplots
-from experiments.reporting.report import Report, rows_in, write_report
+from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import EMPTY, Table, tabulate
 from experiments.runner import command
 from experiments.runner.cache import identity_of
 from experiments.runner.options import Count
-from experiments.runner.run_record import record_of
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation.adapting import METHODS
 from hybrid_jax.adaptation.pooling import SOURCES
@@ -104,8 +103,7 @@ def experiment(config: CoverageConfig, console: Console) -> None:
     if not hosts.is_main_process():
         return
     known = stages.timed("known body", lambda: coverage(config.repeats, console))
-    record = record_of(NAME, config, rows, stages.seconds, stages.notes(), known_body=known.rows)
-    write_report(config.out / NAME, report(record), Console())
+    stages.publish(NAME, config, rows, report, known_body=known.rows)
 
 
 def report(record: Mapping[str, Any]) -> Report:
@@ -262,14 +260,10 @@ def _cases(rows: Results) -> dict[str, Results]:
 
 
 CLAIMS = (
-    Claim(
-        "K1",
-        f"At least {ASKED:.0%} and at most {MOST:.0%} of the pooled 95 % intervals contain the truth, for each change, "
-        f"noise and parameter, and they are at most {WIDEST:g} times as wide as 95 % of the errors need "
-        "(fails: significantly fewer or more, or wider).",
-        _covers,
-    ),
-)
+    Claim("K1", f"At least {ASKED:.0%} and at most {MOST:.0%} of the pooled 95 % intervals contain the truth, for each "
+          f"change, noise and parameter, and they are at most {WIDEST:g} times as wide as 95 % of the errors need "
+          "(fails: significantly fewer or more, or wider).", _covers),
+)  # fmt: skip
 
 ABOUT = "Intervals of the physical parameters after adaptation to one flight of ten seconds: do they contain the truth?"
 main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)

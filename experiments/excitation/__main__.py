@@ -30,11 +30,10 @@ from experiments.excitation.results import (
 from experiments.flying.changes import CHANGES
 from experiments.paper.conditions import Noise, measure
 from experiments.reporting.claims import evaluate, verdict_table
-from experiments.reporting.report import Report, rows_in, write_report
+from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results, Row
 from experiments.runner import command
 from experiments.runner.options import Count, Named, NotNegative, Positive, Run, distinct
-from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 from hybrid_jax import control
 from hybrid_jax.control import Controller
@@ -45,7 +44,6 @@ from hybrid_jax.planning import Excitation, FlightBounds, excitation
 from hybrid_jax.planning.fisher_information import information_of
 from hybrid_jax.sim import flight as random_flight
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sweep import hosts
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
@@ -114,11 +112,8 @@ def experiment(config: ExcitationConfig, console: Console) -> None:
     flights = stages.timed("flights", lambda: flown(config, domain, design), "compiling and flying")
     jobs = [partial(fitted, config, domain, flights, name, seed) for name in FLIGHTS for seed in range(config.seeds)]
     rows = Results([row for found in stages.parts("fits", jobs) for row in found], ("flight", "parameter", "seed"))
-    if not hosts.is_main_process():
-        return
     extra = {"design": described(design), "flown": margins(config.bounds, flights[DESIGNED, 0][0])}
-    record = record_of(NAME, config, rows, stages.seconds, stages.notes(), **extra)
-    write_report(config.out / NAME, report(record), Console())
+    stages.publish(NAME, config, rows, report, **extra)
 
 
 def report(record: Mapping[str, Any]) -> Report:

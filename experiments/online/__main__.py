@@ -12,9 +12,8 @@ from experiments.online.flights import fly_all
 from experiments.online.results import GoalEvidence, claims, conclusion, results_of, tables
 from experiments.online.timing import step_time
 from experiments.reporting.claims import evaluate, verdict_table, with_recorded
-from experiments.reporting.report import Report, rows_in, write_report
+from experiments.reporting.report import Report, rows_in
 from experiments.runner import command
-from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 
 NAME = "online"
@@ -44,8 +43,7 @@ def experiment(config: OnlineConfig, console: Console) -> None:
     stages = stages_of(config, console)
     run = fly_all(config, stages)
     step, clock = step_time(config.hardware(), config.controller().period), (run.seconds, run.processor_seconds)
-    record = record_of(NAME, config, results_of(run), stages.seconds, step_ms=step, clock=clock)
-    write_report(config.out / NAME, report(record), Console())
+    stages.publish(NAME, config, results_of(run), report, step_ms=step, clock=clock)
 
 
 def report(record: Mapping[str, Any]) -> Report:

@@ -11,11 +11,10 @@ from experiments.reaction_diffusion.config import PRESETS, Config
 from experiments.reaction_diffusion.figures import draw
 from experiments.reaction_diffusion.report import claims, conclusion, tables
 from experiments.reporting.claims import evaluate, verdict_table
-from experiments.reporting.report import Report, rows_in, write_report
+from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.cache import identity_of
-from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 
 NAME = "reaction_diffusion"
@@ -60,8 +59,7 @@ def experiment(config: Config, console: Console) -> None:
         rows += shifted.study(config, kept)
     if "gray_scott" in config.parts:
         rows += gray_scott.study(config, kept)
-    record = record_of(NAME, config, Results(rows), stages.seconds, stages.notes())
-    write_report(config.out / NAME, report(record), Console())
+    stages.publish(NAME, config, Results(rows), report)
 
 
 def report(record: Mapping[str, Any]) -> Report:

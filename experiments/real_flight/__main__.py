@@ -16,7 +16,6 @@ from hybrid_jax.cli.command import BAD_INPUT
 from hybrid_jax.cli.logs import Flights, read_flights, require_distinct
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 from hybrid_jax.identification.learning import STEPS, learnable
-from hybrid_jax.sweep import hosts
 
 ABOUT = "How well do models that `hybrid-jax fit` and `adapt` learn predict other flights?"
 GUIDE = """\
@@ -46,9 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(config: RealFlightConfig, console: Console) -> None:
     model, sets = prepare(config)
     stages = stages_of(config, console)
-    found = run_folds(config, model, sets, stages)
-    if hosts.is_main_process():
-        write(config, sets, *found, stages)
+    write(config, sets, *run_folds(config, model, sets, stages), stages)
 
 
 def prepare(config: RealFlightConfig) -> tuple[VehicleModel, dict[str, Flights]]:

@@ -8,18 +8,16 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.study import ADAPTED, BASELINES, LEARNED, MODELS, Fold
 from experiments.reporting import names, plots
 from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evaluate, every, verdict_table
 from experiments.reporting.plots import METHODS, STYLE, Line, dots, subplots
-from experiments.reporting.report import Report, rows_in, write_report
+from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval, spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, spread_text, tabulate
-from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.flights.windows import flight_of
@@ -55,8 +53,7 @@ def write(
     split = [{"train": [*map(flight_of, fold.train)], "test": [*map(flight_of, fold.test)]} for fold in folds]
     said = [f"{name}: {line}" for name, each in sets.items() for line in each.said]
     flown = ", ".join(f"{len(each.logs)} {name} ({each.seconds:.0f} s)" for name, each in sets.items())
-    record = record_of(NAME, config, rows, stages.seconds, [*stages.notes(), *said], folds=split, flown=flown)
-    write_report(config.out / NAME, report(record), Console())
+    stages.publish(NAME, config, rows, report, *said, folds=split, flown=flown)
 
 
 def report(record: Mapping[str, Any]) -> Report:

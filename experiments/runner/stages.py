@@ -14,12 +14,13 @@ import jax
 from filelock import FileLock, Timeout
 from rich.console import Console
 
-from experiments.reporting.results import Row
+from experiments.reporting.report import Report, write_report
+from experiments.reporting.results import Results, Row
 from experiments.runner.cache import Cache, sweep_identity
 from experiments.runner.checkpoint import Autosave, Checkpoints, DeferredSignals
 from experiments.runner.options import Run
 from experiments.runner.progress import Line, clock
-from experiments.runner.run_record import PACKAGES, require_same
+from experiments.runner.run_record import PACKAGES, record_of, require_same
 from hybrid_jax.io.datasets import Dataset, versions
 from hybrid_jax.io.files import Arrays, named_leaves, with_leaves
 from hybrid_jax.runtime import cores
@@ -178,6 +179,14 @@ class Stages:
         reused = f"Taken from the cache, with the seconds of the run that made them: {', '.join(self.reused)}."
         saved = f"Saving checkpoints took {self._saving / (self._ran or 1):.2%} of the sweeps' time."
         return [reused] * bool(self.reused) + [saved] * bool(self._ran)
+
+    def publish(
+        self, name: str, config: Run, rows: Results, report: Callable[..., Report], *notes: str, **more: Any
+    ) -> None:
+        """Write and print the report of an experiment, in the process that writes; `more` joins its record."""
+        if hosts.is_main_process():
+            record = record_of(name, config, rows, self.seconds, [*self.notes(), *notes], **more)
+            write_report(config.out / name, report(record), Console())
 
     @contextmanager
     def _alone(self, name: str, path: Path) -> Iterator[None]:

@@ -10,10 +10,9 @@ from rich.console import Console
 from experiments.paper.config import BOTH_ENDS, ONE_FLIGHT, SMOKE, preset_like
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
-from experiments.reporting.report import Report, rows_in, write_report
+from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.run_record import record_of
 from experiments.runner.stages import stages_of
 from experiments.worlds.cases import WORLDS, WorldsConfig, adapted
 from experiments.worlds.verdicts import (
@@ -25,7 +24,6 @@ from experiments.worlds.verdicts import (
     method_table,
     ratio_table,
 )
-from hybrid_jax.sweep import hosts
 
 NAME = "worlds"
 HEAD = """\
@@ -69,9 +67,7 @@ def experiment(config: WorldsConfig, console: Console) -> None:
         [row for name in config.worlds for row in adapted(WORLDS[name], config, stages)],
         ("world", "change", "flight", "draw", "seed", "method"),
     )
-    if hosts.is_main_process():
-        record = record_of(NAME, config, rows, stages.seconds, stages.notes())
-        write_report(config.out / NAME, report(record), Console())
+    stages.publish(NAME, config, rows, report)
 
 
 def report(record: Mapping[str, Any]) -> Report:

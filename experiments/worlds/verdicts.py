@@ -66,15 +66,8 @@ def coverage_table(rows: Results) -> Table:
             numbers = (100 * np.abs(known(own, f"{name}_{column}")) for column in ("error", "half_width"))
             medians = (f"{np.median(v):.2g}" if len(v) else EMPTY for v in numbers)
             lines.append((label(world), CALLED.get(method, method), name, share, f"{effective or EMPTY}", *medians))
-    header = (
-        "world",
-        "method",
-        "θ_p",
-        "that contain the truth",
-        "effective",
-        "median error [%]",
-        "median half-width [%]",
-    )
+    counts = "that contain the truth", "effective", "median error [%]", "median half-width [%]"
+    header = ("world", "method", "θ_p", *counts)
     return Table("Do 95 % intervals of θ_p after ten seconds of usual flight contain the truth?", header, lines)
 
 
@@ -164,22 +157,12 @@ def _expects_its_errors(rows: Results) -> Part:
 
 
 CLAIMS = (
-    Claim(
-        "W1",
-        f"In every case the error of the adapted model is at most {MEAN} times its source's in the mean, and at most "
-        f"{EACH} times in each adaptation.",
-        _never_worse,
-    ),
-    Claim(
-        "W2",
-        f"In each world {HELD[0]:.0%} to {HELD[1]:.0%} of the 95 % intervals of Ix, Iy and k contain the truth, where "
-        "these are called physical (undecided if a limit is in the share's 95 % interval over sources).",
-        _intervals_hold,
-    ),
-    Claim(
-        "W3",
-        f"In each world the 80 % intervals of the errors to expect contain the errors of other flights in "
-        f"{EXPECTED[0]:.0%} to {EXPECTED[1]:.0%} of cases, after 0.1 s and after 1 s (undecided as W2).",
-        _expects_its_errors,
-    ),
-)
+    Claim("W1", f"In every case the error of the adapted model is at most {MEAN} times its source's in the mean, and "
+          f"at most {EACH} times in each adaptation.", _never_worse),
+    Claim("W2", f"In each world {HELD[0]:.0%} to {HELD[1]:.0%} of the 95 % intervals of Ix, Iy and k contain the "
+          "truth, where these are called physical (undecided if a limit is in the share's 95 % interval over sources).",
+          _intervals_hold),
+    Claim("W3", f"In each world the 80 % intervals of the errors to expect contain the errors of other flights in "
+          f"{EXPECTED[0]:.0%} to {EXPECTED[1]:.0%} of cases, after 0.1 s and after 1 s (undecided as W2).",
+          _expects_its_errors),
+)  # fmt: skip
