@@ -38,6 +38,11 @@ def pytest_configure(config):
         os.environ.setdefault(name, value)
 
 
+def pytest_collection_modifyitems(items):
+    """The longest files first, so that the two processes end together; the last ones compile hardly anything."""
+    items.sort(key=lambda item: "tests/training" not in item.nodeid)
+
+
 def pytest_collection_finish():
     """Collect garbage seldom: to look through a million objects of JAX takes seconds, and most are there to stay."""
     gc.freeze()

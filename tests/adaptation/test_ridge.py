@@ -55,6 +55,7 @@ def with_other_output(field):
     return eqx.tree_at(where, field, layer)
 
 
+@eqx.filter_jit
 def derivatives(field, windows):
     return jax.vmap(field)(windows.x0, windows.u[:, 0])
 

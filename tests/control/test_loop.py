@@ -210,6 +210,7 @@ def test_hardware_that_cannot_be_is_refused():
         control.fly(plant(BODY), BODY, reference_of("hover"), reference_of("hover")[0], CONTROLLER, hardware=noisy)
 
 
+@eqx.filter_jit
 def watch(field, plant, bandwidth, sign, periods=100):
     """Estimates over a flight of the plant at random speeds; the observer sees quaternions of this sign."""
     speeds = hj.IRIS.hover_speed + 20 * jax.random.normal(jax.random.key(0), (periods, 4))
@@ -221,7 +222,7 @@ def watch(field, plant, bandwidth, sign, periods=100):
 
     observer = control.Observer(field, bandwidth, DT)
     start = START, observer.begin(START.at[3:7].multiply(sign))
-    return np.asarray(jax.lax.scan(tick, start, speeds)[1])
+    return jax.lax.scan(tick, start, speeds)[1]
 
 
 @pytest.fixture(scope="module")
@@ -234,7 +235,8 @@ def fields():
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("name", "bandwidth"), [("physics", 5.0), ("hybrid", 5.0), ("network", 5.0), ("physics", 0.0)])
 def test_estimate_converges_at_the_bandwidth_whatever_the_quaternion_s_sign(fields, name, bandwidth, sign):
-    found = watch(fields[name], hj.Hybrid(fields[name], ConstantDisturbance(TRUE)), bandwidth, sign)
+    given = hj.Hybrid(fields[name], ConstantDisturbance(TRUE)), jnp.asarray(bandwidth), jnp.asarray(sign)
+    found = watch(fields[name], *given)
     share = -np.expm1(-bandwidth * DT * np.arange(100))[:, None]
     # Rounding of v and ω over DT: 1e-6 / 0.01, more where a network's speeds are large.
     np.testing.assert_allclose(found, share * TRUE, rtol=0, atol=2e-2 if bandwidth else 0)

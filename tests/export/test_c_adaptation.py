@@ -13,9 +13,9 @@ from fields import double
 from jax.flatten_util import ravel_pytree
 
 import hybrid_jax as hj
-from hybrid_jax.control import advance
 from hybrid_jax.export import export_adaptation_c
 from hybrid_jax.export.c.adaptation import _about
+from hybrid_jax.integrate import rk4_step
 from hybrid_jax.online.estimator import OnlineAdaptation
 
 pytestmark = needs_compiler
@@ -25,27 +25,48 @@ DT = 0.01
 UNITS = dict.fromkeys(("theta", "trusted", "settled", "pull", "nis", "z"), 1.0)
 UNITS |= {"spread": 1e-3, "log_weights": 25.0, "evidence": 25.0, "away": 1.0, "sensitivity": 1e-2}
 HYPOTHESES = (
-    hj.Hypothesis("inertia", {"Ix": 0.3, "Iy": 0.3}),
-    hj.Hypothesis("thrust", {"k": 0.3}),
-    hj.Hypothesis("wind", {"disturbance[vx]": 2.0}, rates={"disturbance[vx]": 1.0}, lead=0.1),
+    hj.Hypothesis("spring", {"stiffness": 0.3}),
+    hj.Hypothesis("motor", {"gain": 0.3}),
+    hj.Hypothesis("wind", {"disturbance[1]": 2.0}, rates={"disturbance[1]": 1.0}, lead=0.1),
 )
 
 
+class Cart(hj.AbstractVectorField):
+    """x = (position, velocity): small, as each hypothesis has a filter of all states."""
+
+    stiffness: jax.Array
+    gain: jax.Array
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1], self.gain * u[0] - self.stiffness * x[0]])
+
+
+# With hypotheses or alone → parameters of the nominal system, changes of the one that is flown, and a late one.
+THETA = {
+    True: ({"stiffness": 1.0, "gain": 1.0}, {"stiffness": 1.3, "gain": 1.05}, {"gain": 0.3}),
+    False: ({"Ix": 0.0, "Iy": 0.0, "k": 0.0}, {"Ix": 0.3, "Iy": -0.3, "k": 0.05}, {"k": -1.0}),
+}
+
+
+def system(hypotheses, changes=0):
+    values = {name: jnp.array(value) for each in THETA[hypotheses][: 1 + changes] for name, value in each.items()}
+    return Cart(**values) if hypotheses else hj.RigidBody(values, hj.IRIS)
+
+
 @cache
-def flight(steps=90):
-    """Samples, inputs and periods of an Iris that is not nominal and that weakens; one sample is missing, another
+def flight(hypotheses, steps=90):
+    """Samples, inputs and periods of a system that is not nominal and that weakens; one sample is missing, another
     frozen, and one comes after a gap."""
-    rng, ahead = np.random.default_rng(0), eqx.filter_jit(advance)
-    x, samples = jnp.zeros(13).at[2].set(2.0).at[3].set(1.0), []
-    speeds = (hj.IRIS.hover_speed + 40 * rng.normal(size=(steps, 4))).astype(np.float32)
-    for i, u in enumerate(speeds):
-        theta = {"Ix": 0.3, "Iy": -0.3, "k": 0.05 if i < 74 else -1.0}
-        x = ahead(hj.RigidBody({name: jnp.array(value) for name, value in theta.items()}, hj.IRIS), x, u, DT)
-        samples.append(np.asarray(x) + 1e-3 * rng.normal(size=13).astype(np.float32))
+    rng, ahead, samples = np.random.default_rng(0), eqx.filter_jit(rk4_step), []
+    x = jnp.zeros(2) if hypotheses else jnp.zeros(13).at[2].set(2.0).at[3].set(1.0)
+    inputs = 2 * rng.normal(size=(steps, 1)) if hypotheses else hj.IRIS.hover_speed + 40 * rng.normal(size=(steps, 4))
+    for i, u in enumerate(inputs := inputs.astype(np.float32)):
+        x = ahead(system(hypotheses, 1 + (i >= 74)), x, u, DT)
+        samples.append(np.asarray(x) + 1e-3 * rng.normal(size=len(x)).astype(np.float32))
     samples[10][:] = np.nan
-    samples[11][4] = np.nan
-    samples[13][7:10] = samples[12][7:10]
-    return list(zip(np.array(samples, np.float32), speeds, np.where(np.arange(steps) == 21, 20.0, 1.0), strict=True))
+    samples[11][4 % len(x)] = np.nan
+    samples[13][7 % len(x) : 10] = samples[12][7 % len(x) : 10]
+    return list(zip(np.array(samples, np.float32), inputs, np.where(np.arange(steps) == 21, 20.0, 1.0), strict=True))
 
 
 @cache
@@ -56,13 +77,13 @@ def in_double(hypotheses):
 
 
 def filter_with(hypotheses):
-    hypotheses = HYPOTHESES if hypotheses else ()
-    return OnlineAdaptation(hj.rigid_body(hj.IRIS), DT, 1e-3, disturbance=2.0, process=1e-2, hypotheses=hypotheses)
+    own = {"hypotheses": HYPOTHESES, "prior": 0.5, "indices": (1,)} if hypotheses else {}
+    return OnlineAdaptation(system(hypotheses), DT, 1e-3, disturbance=2.0, process=1e-2, **own)
 
 
-def compiled(folder, adaptation, precise, size):
+def compiled(folder, adaptation, precise, size, sizes):
     """The two functions of the C, each of arrays and of one array that it fills."""
-    source = export_adaptation_c(folder, adaptation, double=precise)[1]
+    source = export_adaptation_c(folder, adaptation, double=precise, **sizes)[1]
     run("gcc", *C99, "-O0", "-fPIC", "-shared", source, "-o", folder / "adaptation.so", "-lm")
     library = ctypes.CDLL(str(folder / "adaptation.so"))
     dtype, real = (np.float64, ctypes.c_double) if precise else (np.float32, ctypes.c_float)
@@ -100,12 +121,13 @@ def error(found, expected):
 @pytest.mark.parametrize("hypotheses", [False, True], ids=["alone", "hypotheses"])
 @pytest.mark.parametrize(("precise", "allowed"), [(True, 1e-12), (False, 4e-5)])
 def test_c_is_the_filter(precise, allowed, hypotheses, tmp_path):
-    adaptation, ((first, *_), *samples) = filter_with(hypotheses), flight()
+    adaptation, ((first, u, _), *samples) = filter_with(hypotheses), flight(hypotheses)
+    sizes = {"state_size": len(first), "input_size": len(u)}
     with jax.enable_x64(True):
         exact, update_of_jax = in_double(hypotheses)
         state = exact.begin(jnp.asarray(first, float))
         flat, unravel = ravel_pytree(state)
-        begin, update = compiled(tmp_path, adaptation, precise, flat.size)
+        begin, update = compiled(tmp_path, adaptation, precise, flat.size, sizes)
         flown = begin(first)
         np.testing.assert_array_equal(flown, np.asarray(flat, flown.dtype))
         for x, u, periods in samples:

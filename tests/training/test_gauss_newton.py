@@ -21,7 +21,6 @@ from hybrid_jax.training.loss import REGULARISERS, Minibatch
 KEY = jax.random.key(0)
 GRID = hj.Grid((4, 5), 0.3, 2)
 DIFFUSION = hj.diffusion(GRID, (0.03, 0.01))
-SCOTT = gray_scott([(0.03, 0.06), (0.04, 0.05)], reacts=True)
 
 
 def field(norm="none"):
@@ -96,18 +95,19 @@ def reaction(kernel, inputs=0, **options):
 
 
 def conversion():
+    scott = gray_scott([(0.03, 0.06), (0.04, 0.05)], reacts=True)
     rate = hj.residual_network(2, 0, KEY, outputs=1, hidden=3, activation="tanh", norm="none")
-    return Conversion(GridNetwork(rate, SCOTT.grid))
+    return hj.Hybrid(scott, Conversion(GridNetwork(rate, scott.grid))), scott.grid.size, 2
 
 
 FIELDS = {  # and the numbers in x and u
-    "pendulum": (hj.Hybrid(pendulum(), network("layer")), 2, 1),
-    "batch norm": (network("batch"), 2, 1),
-    "forces elsewhere": (hj.Hybrid(Falling(jnp.asarray(0.3)), network()), 2, 1),
-    "pointwise": (hj.Hybrid(DIFFUSION, reaction(1)), GRID.size, 0),
-    "convolution with an input": (hj.Hybrid(DIFFUSION, reaction(3, 1)), GRID.size, 1),
-    "frozen physics": (hj.Hybrid(hj.Frozen(DIFFUSION), reaction(3, norm="layer")), GRID.size, 0),
-    "conversion": (hj.Hybrid(SCOTT, conversion()), SCOTT.grid.size, 2),
+    "pendulum": lambda: (hj.Hybrid(pendulum(), network("layer")), 2, 1),
+    "batch norm": lambda: (network("batch"), 2, 1),
+    "forces elsewhere": lambda: (hj.Hybrid(Falling(jnp.asarray(0.3)), network()), 2, 1),
+    "pointwise": lambda: (hj.Hybrid(DIFFUSION, reaction(1)), GRID.size, 0),
+    "convolution with an input": lambda: (hj.Hybrid(DIFFUSION, reaction(3, 1)), GRID.size, 1),
+    "frozen physics": lambda: (hj.Hybrid(hj.Frozen(DIFFUSION), reaction(3, norm="layer")), GRID.size, 0),
+    "conversion": conversion,
 }
 # Every field with one solver, every other solver with two fields: each pair would be two programs to compile.
 SOLVERS = RK4(scanned=True), diffrax.Heun(), diffrax.ImplicitEuler()
@@ -124,7 +124,7 @@ def difference(found, expected):
 
 @pytest.mark.parametrize(("name", "solver"), PAIRS)
 def test_sensitivities_are_the_derivatives_of_the_trajectory(name, solver):
-    field, size, inputs = FIELDS[name]
+    field, size, inputs = FIELDS[name]()
     x0, u = numbers(size), numbers(3, inputs)
     theta, at = ravel_learned(field)
     of_theta = lambda theta: integrate(at(theta), x0, u, 0.1, solver)  # noqa: E731
@@ -136,7 +136,7 @@ def test_sensitivities_are_the_derivatives_of_the_trajectory(name, solver):
 
 @pytest.mark.parametrize("name", sorted(FIELDS))
 def test_columns_are_those_of_the_state_and_the_input(name):
-    field, size, inputs = FIELDS[name]
+    field, size, inputs = FIELDS[name]()
     x, u, dx, du = numbers(size), numbers(inputs), numbers(size, 3) - 0.5, numbers(inputs, 3) - 0.5
 
     @jax.jit

@@ -114,15 +114,19 @@ def test_residual_norm_is_the_mean_square_of_the_residual(batch):
     np.testing.assert_allclose(regulariser("residual_norm", field, batch), 25, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", REGULARISERS)
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
-def test_gradients_are_finite_where_the_residual_is_zero(name, precision, batch):
+def test_gradients_are_finite_where_the_residual_is_zero(precision, batch):
+    def values(field, batch):
+        predicted = rollout_minibatch(field, batch.x0, batch.u, batch.dt, RK4())
+        return {name: rule(field, batch, predicted) for name, rule in REGULARISERS.items()}
+
     with jax.enable_x64(precision == np.float64):
         given = Hybrid(pendulum(), zero_output(network())), batch
-        field, here = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision), given)
-        value, slope = eqx.filter_value_and_grad(lambda field: regulariser(name, field, here))(field)
-    assert abs(value) < 1e-10
-    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+        given = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision), given)
+        found, slopes = eqx.filter_jit(lambda *given: (values(*given), jax.jacrev(values)(*given)))(*given)
+    for name, slope in slopes.items():
+        assert abs(found[name]) < 1e-10, name
+        assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope)), name
 
 
 def loss(field, batch, rule, weight):
