@@ -19,9 +19,10 @@ from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval, spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, spread_text, tabulate
 from experiments.runner.stages import Stages
+from hybrid_jax.adaptation.expectation import LEVEL
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.flights.windows import flight_of
-from hybrid_jax.identification.learning import LEVEL, STEPS, UNITS
+from hybrid_jax.identification.learning import STEPS, UNITS
 
 NAME = "real_flight"
 LABELS = names.LABELS | {

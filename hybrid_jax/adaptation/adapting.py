@@ -20,7 +20,7 @@ from hybrid_jax.adaptation.outliers import outliers
 from hybrid_jax.adaptation.plausible import groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
-from hybrid_jax.adaptation.selection import TINY, correlated, overlap
+from hybrid_jax.adaptation.selection import TINY, blocks_of, correlated, overlap
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space, trainable
 from hybrid_jax.dynamics.disturbance import (
     ConstantDisturbance,
@@ -44,7 +44,7 @@ from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.objective import UNSCALED, Settings, TrajectoryLoss
-from hybrid_jax.trajectories import Trajectories, check_like, features_of, overflows, shares_outside
+from hybrid_jax.trajectories import Trajectories, check_like, concatenate, features_of, overflows, shares_outside
 
 FEWEST = 10  # windows, of which outliers are told apart
 HELD_OUT = 5  # one in so many windows validates
@@ -76,7 +76,7 @@ METHODS: Mapping[str, Method] = {
 @entry
 def adapt(
     field: AbstractVectorField,
-    windows: Trajectories,
+    windows: Trajectories | list[Trajectories],
     *,
     method: str | Method = "auto",
     validation: Trajectories | None = None,
@@ -90,7 +90,8 @@ def adapt(
         field: a trained `Hybrid`, or any other field.
         windows: windows of the changed system, more than parameters, in the order of time and without overlap. If
             they follow each other, for example in one flight, intervals allow for errors that are correlated within a
-            fifth of the windows. NaN in x means "not measured" and counts as no error; x0 and u must be finite.
+            fifth of the windows. NaN in x means "not measured" and counts as no error; x0 and u must be finite. You
+            may pass a list with the windows of each of several flights: `expected` then counts flights.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` to write your own.
         validation: windows for early stopping and penalties; you should take them from another flight. By default the
             last fifth of `windows` is held out if the method needs validation.
@@ -106,6 +107,10 @@ def adapt(
     """
     checks.not_traced("adapt", field, windows, validation, learned_from)
     name, method = _named(method)
+    flights = None
+    if isinstance(windows, list):
+        parts = checks.list_of("windows", windows, Trajectories)
+        windows, flights = concatenate(parts), np.repeat(np.arange(len(parts)), [len(each) for each in parts])
     windows = check_windows(field, windows, missing=True)
     learned_from = motion_of(field) if learned_from is None else learned_from
     if learned_from is not None:
@@ -129,14 +134,16 @@ def adapt(
     with solver_errors(solver):
         given, errors = len(windows), np.asarray(errors_in(windows, field, compact(solver)))
     good = ~outliers(errors, windows)
-    if good.sum() >= max(FEWEST, given / 2):
-        windows, errors = (windows, errors) if good.all() else (windows[good], errors[good])
+    if good.sum() < max(FEWEST, given / 2):
+        good[:] = True
+    windows, errors = (windows, errors) if good.all() else (windows[good], errors[good])
+    flights = None if flights is None or len(set(flights[good])) < 2 else flights[good]
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
     if validation is not None:
         held_out = check_windows(field, held_out, "validation", missing=True)
     check_like(held_out, train, "validation")
     settings = Settings() if settings is None else settings
-    motion = {"learned_from": learned_from} if getattr(method, "uses_motion", False) else {}
+    motion: dict[str, Any] = {"learned_from": learned_from} if getattr(method, "uses_motion", False) else {}
     if settings.objective is UNSCALED:
         settings = replace(settings, objective=scaled_loss(field, motion.get("learned_from") or train))
     if motion and learned_from is None and has_network(field):
@@ -147,7 +154,8 @@ def adapt(
     keep_programs("adapt", windows.x.shape)
     diverged = Solution(field, status=Status.DIVERGED) if overflows(windows) or overflows(held_out) else None
     with solver_errors(solver):
-        solution = diverged or method.solve(field, train, held_out, settings, **motion)
+        units = {"flights": flights} if motion and flights is not None else {}
+        solution = diverged or method.solve(field, train, held_out, settings, **motion, **units)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
     adapted = solution.field
@@ -158,7 +166,7 @@ def adapt(
         scale = settings.objective.scale(windows.x0.shape[-1])
         compare_steps(adapted, windows, solver, scale, named=exact or None)
     space, found = state_space(field, windows.x0.shape[-1]), disturbance_of(adapted)
-    choice = {} if solution.choice is None else _chosen(solution.choice, train, space)
+    choice = {} if solution.choice is None else _chosen(solution.choice, train, space, flights)
     without = None if exact else NOT_LEAST_SQUARES
     without = NOT_FINITE if status == Status.DIVERGED else without
     ranges = [] if learned_from is None else [features_of(w, space) for w in (learned_from, windows)]
@@ -185,15 +193,16 @@ def _mse(errors, windows: Trajectories) -> float:
         return float(np.mean(np.sum(np.square(np.where(np.isnan(windows.x), 0, errors)), axis=-1)))
 
 
-def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[str, Any]:
-    seconds = windows.horizon * windows.dt
-    chain = seconds * longest_chain(windows, len(choice.ends))
+def _chosen(choice: Choice, windows: Trajectories, space: StateSpace, flights) -> dict[str, Any]:
+    seconds, ends = windows.horizon * windows.dt, np.asarray(choice.ends)
+    chain = seconds * longest_chain(windows, blocks_of(len(windows), len(ends), flights))
+    horizons = round(seconds, 9), round(chain, 9)
     return {
         "candidates": dict(zip(choice.names, np.asarray(choice.probability).tolist(), strict=True)),
         "chosen": choice.names[int(choice.taken)],
         "alone": bool(choice.alone),
         "refused": tuple(name for name, one in zip(choice.names, np.asarray(choice.refused), strict=True) if one),
-        "expected": expected_errors(np.asarray(choice.ends), (round(seconds, 9), round(chain, 9)), space),
+        "expected": expected_errors(ends, horizons, space, flights is not None),
         "units": {one.name: one.unit for one in space.quantities},
     }
 

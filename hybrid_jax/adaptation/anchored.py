@@ -71,8 +71,11 @@ def subspace(
     return Subspace(basis, effects, residuals)
 
 
-def fit_anchored(found: Subspace, noise: Float[Array, ""], error: Float[Array, ""], blocks) -> Anchored:
-    """Compute the step for each penalty and choose the best; `error` is the source's own, see `Unchanged`."""
+def fit_anchored(found: Subspace, noise: Float[Array, ""], error: Float[Array, ""], blocks, left_out) -> Anchored:
+    """Compute the step for each penalty and choose the best; `error` is the source's own, see `Unchanged`.
+
+    The variance is that between `blocks`; `left_out` are those of the steps without a block.
+    """
     basis, effects, residuals = found
     gram, score = jnp.einsum("ner,nes->nrs", effects, effects), jnp.einsum("ner,ne->nr", effects, residuals)
     values, vectors = jnp.linalg.eigh(jnp.sum(gram, axis=0))
@@ -98,7 +101,7 @@ def fit_anchored(found: Subspace, noise: Float[Array, ""], error: Float[Array, "
     held, share = penalties[best] * values[-1], sizes[best] / (sizes[best] + apparent)
     step = -vectors @ (share * jnp.sum(along, axis=0) / (values + held))
     held = held * jnp.eye(len(basis), dtype=gram.dtype)
-    without = left_out_steps(NormalEquations(gram, score, score[:, 0]), held, jnp.zeros_like(step), blocks)
+    without = left_out_steps(NormalEquations(gram, score, score[:, 0]), held, jnp.zeros_like(step), left_out)
     without = (without @ vectors * share) @ vectors.T
     odds, naive = jnp.exp(jnp.minimum(jnp.stack([with_both[best] - told_of[-1], jnp.max(naive)]), 80.0))
     return Anchored(step @ basis, without @ basis, odds, naive)

@@ -75,7 +75,7 @@ class Choice(NamedTuple):
     equations: NormalEquations  # normal equations of each window at the chosen parameters
     # Change of the network's weights in each candidate; None without a trainable network.
     change: Float[Array, "c w"] | None
-    ends: Float[Array, "b 2 d"]  # errors of left-out blocks, see `errors_at_ends`
+    ends: Float[Array, "b 2 d"]  # errors of left-out blocks or flights, see `errors_at_ends`
     inherited: Float[Array, "p p"]  # covariance at the chosen parameters from errors of those that the source keeps
     degrees: Float[Array, ""]  # degrees of freedom of `inherited`
     # Variance from what the network may have taken from each parameter, see `taken_by_network`.
@@ -107,12 +107,16 @@ class Auto(Method):
     has_intervals: ClassVar[bool] = True
     uses_motion: ClassVar[bool] = True
 
-    def solve(self, field, train, validation, settings: Settings, learned_from: Trajectories | None = None) -> Solution:
+    def solve(
+        self, field, train, validation, settings: Settings, learned_from: Trajectories | None = None, flights=None
+    ) -> Solution:
         """See `Method.solve`.
 
         Args:
             learned_from: windows that the source was trained on, by default those that it stores; without them the
                 source is assumed to be exact.
+            flights: the flight that each window is from (n,), if they are from several: errors to expect are then of
+                flights that were left out, else of blocks.
         """
         jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))
@@ -139,10 +143,12 @@ class Auto(Method):
                 (_, found, starts), fitted = _fits(larger, move, train, rows, *options), rows
                 if not traced and int(found.status) == Status.DIVERGED:
                     _, found, starts = _fits(larger, still, train, rows, *options)
-        found, starts, chosen, left_out = _confirm(self, larger, (found, starts), (first[0], first[2]), chosen)
+        units = blocks_of(len(train), self.blocks, flights)
+        fits = (found, starts), (first[0], first[2])
+        found, starts, chosen, left_out = _confirm(self, larger, *fits, chosen, None if flights is None else units)
         if self.networks and network:
             step = _anchor(larger, train, starts, found, solver, scale)
-        outcome = found, chosen, left_out, source, nothing, effect, step
+        outcome = found, chosen, left_out, source, nothing, effect, step, units
         return _conclude(self, field, larger, train, outcome, (sizes, solver))
 
 
@@ -198,15 +204,17 @@ def _judge(
 
 
 @jit_by_size(UNOPTIMISED)
-def _confirm(method: Auto, larger, changed, still, chosen: Posterior) -> tuple[Fit, Any, Posterior, Array]:
+def _confirm(method: Auto, larger, changed, still, chosen: Posterior, units) -> tuple[Fit, Any, Posterior, Array]:
     """Return the fit and the starts of the chosen change, or those of none if left-out blocks do not confirm it.
 
-    The last are the parameters fitted without each block.
+    The last are the parameters fitted without each block, or each of `units`.
     """
     free, start = jnp.stack([*free_parameters(larger).values()])[chosen.taken], ravel_parameters(larger)[0]
     blocks = blocks_of(len(still[0].equations.score), method.blocks)
     thetas = left_out_thetas(changed[0], free, chosen.sizes, start, blocks)
     sure = (chosen.taken == 0) | surely_lower(changed[0], still[0], thetas, blocks)
+    if units is not None:
+        thetas = left_out_thetas(changed[0], free, chosen.sizes, start, units)
     found, starts = jax.tree.map(partial(jnp.where, sure), changed, still)
     chosen = chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
     return found, starts, chosen, jnp.where(sure, thetas, found.theta)
@@ -220,8 +228,8 @@ def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale) -> S
 
 @jit_by_size(UNOPTIMISED)
 def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options) -> Solution:
-    """Add the network's change if it is probable, and compute the errors of left-out blocks."""
-    (found, chosen, left_out, source, nothing, effect, step), (sizes, solver) = outcome, options
+    """Add the network's change if it is probable, and compute the errors of units that were left out."""
+    (found, chosen, left_out, source, nothing, effect, step, units), (sizes, solver) = outcome, options
     start, unravel = ravel_parameters(larger)
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
@@ -236,7 +244,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     inherited = spread(found.equations, free[taken] & found.seen, of_source)
     changes = jnp.zeros((len(left_out), 0))
     if step is not None:
-        step = fit_anchored(step, found.noise, nothing.error, blocks)
+        step = fit_anchored(step, found.noise, nothing.error, blocks, units)
         removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, if physics replaced it
         odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
         better = odds > STRONG
@@ -252,8 +260,8 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
         field = unravel(theta)
         return errors_at_ends(with_change(field, change) if change.size else field, windows, counted, solver)
 
-    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[blocks[0]], train)
-    ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(blocks[1])))
+    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[units[0]], train)
+    ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(units[1])))
     absorbed = jnp.zeros_like(start)
     if effect is not None:
         # For example the velocity, the body rates and the rotor speeds, on which aerodynamic forces depend.

@@ -1,4 +1,4 @@
-"""The error on an unseen flight, from blocks of windows that were left out of the fit."""
+"""The error on an unseen flight, from flights or blocks of windows that were left out of the fit."""
 
 import warnings
 from collections.abc import Mapping
@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy  # not scipy.stats, which takes half a second to import
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from hybrid_jax.adaptation.selection import ALIKE, blocks_of
+from hybrid_jax.adaptation.selection import ALIKE
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import Solver
 from hybrid_jax.integrate import compact, rollout
@@ -21,14 +21,30 @@ JOINED = 10  # windows that touch, at most so many, are predicted as one
 Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
 
 
-def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, float], space: StateSpace) -> Expected:
-    """Return the RMSE at the end of single and of joined windows, with an 80 % prediction interval for an equal flight.
+def expected(logs: Float[np.ndarray, "n ..."], flights: int | None = None) -> Float[np.ndarray, "3 ..."]:
+    """Return the expected error on another flight and its 80 % interval, by Student's t of the flights' log-errors.
 
-    The interval (Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7) uses Student's t for the logarithm of the mean
-    `squares` over blocks, NaN where a state was not measured; `seconds` are the durations of the windows. Squares after
-    a second are skewed, and a few seldom show the largest, so that their own standard deviation is too small: they
-    count as lognormal, of which the logarithm of the mean has the variance s²/b + s⁴ / (2 (b − 1)), s² the variance of
-    the logarithm (Cox's method; Zhou and Gao, Statistics in Medicine 1997).
+    They may be log-errors of parts of fewer `flights`, of which the means differ as much as the parts.
+    """
+    n, middle = len(logs), np.mean(logs, axis=0)
+    if n < 2:
+        return np.stack([np.exp(middle), np.zeros_like(middle), np.full_like(middle, np.inf)])
+    error = np.std(logs, axis=0, ddof=1) * (1 + 1 / (flights or n)) ** 0.5
+    half = scipy.special.stdtrit(n - 1, (1 + LEVEL) / 2) * error
+    return np.exp([middle, middle - half, middle + half])
+
+
+def expected_errors(
+    squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, float], space: StateSpace, flights: bool = False
+) -> Expected:
+    """Return the RMSE at the end of single and of joined windows, with an 80 % prediction interval for another flight.
+
+    The mean `squares`, NaN where a state was not measured, are those of whole flights if `flights`, see `expected`, or
+    of blocks of one flight. The interval from blocks (Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7) uses
+    Student's t for the logarithm of their mean; `seconds` are the durations of the windows. Squares after a second are
+    skewed, and a few seldom show the largest, so that their own standard deviation is too small: they count as
+    lognormal, of which the logarithm of the mean has the variance s²/b + s⁴ / (2 (b − 1)), s² the variance of the
+    logarithm (Cox's method; Zhou and Gao, Statistics in Medicine 1997).
     """
     blocks = len(squares)
     with warnings.catch_warnings(action="ignore"):  # a state that is measured at no end
@@ -38,6 +54,9 @@ def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, f
 
     def around(group: slice, factor: float, horizon: int) -> tuple[float, float, float]:
         power = np.maximum(factor**2 * squares[:, horizon, group].sum(axis=-1), np.finfo(np.float32).tiny)
+        if flights:
+            value, low, high = expected(np.log(power) / 2)
+            return float(value), float(low), float(high)
         away = np.inf
         if blocks > 1:
             variance = np.log(power).var(ddof=1)
@@ -85,10 +104,10 @@ def errors_at_ends(
     return jnp.sum(jnp.where(weights, ends, 0), axis=0) / jnp.sum(weights, axis=0)
 
 
-def longest_chain(windows: Trajectories, blocks: int) -> int:
-    """Return the most adjacent windows that are joined."""
+def longest_chain(windows: Trajectories, blocks: tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]) -> int:
+    """Return the most adjacent windows that are joined, see `blocks_of`."""
     x0, x, longest = np.asarray(windows.x0), np.asarray(windows.x), 1
-    for places, counted in zip(*blocks_of(len(windows), blocks), strict=True):
+    for places, counted in zip(*blocks, strict=True):
         own = places[counted]
         touches = (x0[own[1:]] == x[own[:-1], -1]).all(axis=1)
         length = 1

@@ -200,8 +200,17 @@ def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Traje
     return jnp.max(jnp.mean((both[::-1] < low) | (both[::-1] > high), axis=2), axis=1)
 
 
-def blocks_of(windows: int, blocks: int) -> tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]:
-    """Return the indices of each block's consecutive windows, and which count: a short block repeats its last."""
+def blocks_of(
+    windows: int, blocks: int, flights: Int[np.ndarray, " n"] | None = None
+) -> tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]:
+    """Return the indices of each block's consecutive windows, and which count: a short block repeats its last.
+
+    With `flights`, the flight that each window is from, a block is a flight.
+    """
+    if flights is not None:
+        first, sizes = np.unique(flights, return_index=True, return_counts=True)[1:]
+        own = np.arange(sizes.max())
+        return first[:, None] + np.minimum(own, sizes[:, None] - 1), own < sizes[:, None]
     each = -(-windows // min(blocks, windows))
     index = np.arange(-(-windows // each) * each).reshape(-1, each)
     return np.minimum(index, windows - 1), index < windows

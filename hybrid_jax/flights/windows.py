@@ -173,15 +173,22 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: in
     Raises:
         ValueError: if all logs are shorter than a window, or samples are not evenly spaced.
     """
+    return concatenate(cut_each(logs, steps, stride, most))
+
+
+def cut_each(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: int | None = None) -> list[Trajectories]:
+    """Return the windows of each flight that has one, otherwise as `cut_windows`."""
     parts = []
     for log in require_length(logs, steps):
         long = [part for part in even_segments(log) if part.stop - part.start > steps]
         cut = [windows_of(log.x[p], log.u[p][:-1], log.dt, steps=steps, stride=stride) for p in long]
-        parts.append(concatenate(cut))
-    windows = jax.tree.map(lambda leaf: leaf.astype(np.float32), concatenate(parts))
-    if most is None or len(windows) <= most:
-        return windows
-    return windows[np.round(np.linspace(0, len(windows) - 1, most)).astype(int)]
+        parts.append(jax.tree.map(lambda leaf: leaf.astype(np.float32), concatenate(cut)))
+    ends = np.cumsum([len(part) for part in parts])
+    if most is None or ends[-1] <= most:
+        return parts
+    kept = np.round(np.linspace(0, ends[-1] - 1, most)).astype(int)
+    places = np.split(kept, np.searchsorted(kept, ends[:-1]))
+    return [part[own - end] for part, own, end in zip(parts, places, ends, strict=True) if len(own)]
 
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:

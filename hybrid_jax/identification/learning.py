@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-import scipy
 from jaxtyping import Float
 
 from hybrid_jax.adaptation import METHODS, Adaptation, Auto, adapt
-from hybrid_jax.adaptation.expectation import Expected
+from hybrid_jax.adaptation.expectation import Expected, expected
 from hybrid_jax.dynamics import AbstractVectorField, DisturbanceModel, Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, FrozenRates
 from hybrid_jax.dynamics.terms import OF_VELOCITY, shape_of
@@ -20,7 +19,7 @@ from hybrid_jax.dynamics.vehicle_file import LAG, LEARN, VehicleModel
 from hybrid_jax.estimation import fit_disturbance, observe
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.windows import cut_windows, flight_errors, sequences
+from hybrid_jax.flights.windows import cut_each, cut_windows, flight_errors, sequences
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.training import Settings, fit, rates_by_group
@@ -29,7 +28,6 @@ from hybrid_jax.trajectories import Trajectories, concatenate, split, windows_of
 
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}  # of prediction errors
 STEPS = 10  # intervals of a window
-LEVEL = 0.8  # of the interval of the error on a new flight
 TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
 ENOUGH = 10  # windows for each parameter that is learned by default, or its error exceeds its effect
 NAMES = "position", "velocity", "attitude", "body rates"  # of a rigid body's quantities, in the order of `UNITS`
@@ -129,7 +127,7 @@ def adapted(
         learned_from: windows that the source was trained on, see `hybrid_jax.adapt`.
         most: the largest number of windows to adapt to.
     """
-    windows = cut_windows(logs, STEPS, STEPS, most)
+    windows = cut_each(logs, STEPS, STEPS, most)
     found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)
     moved = eqx.tree_at(without_past, field, found.field)
     if not isinstance(moved, DisturbanceModel):
@@ -239,21 +237,6 @@ def choose(scores: Mapping[str, Float[np.ndarray, " flights"]]) -> str:
     worse = {name: each - best for name, each in considered.items()}
     error = {name: each.std(ddof=1) / len(each) ** 0.5 if len(each) > 1 else 0.0 for name, each in worse.items()}
     return next(name for name, each in worse.items() if each.mean() <= error[name])
-
-
-def expected(
-    logs: Float[np.ndarray, "n ..."], level: float = LEVEL, flights: int | None = None
-) -> Float[np.ndarray, "3 ..."]:
-    """Return the expected error on another flight and its interval, by Student's t of the flights' log-errors.
-
-    They may be log-errors of parts of fewer `flights`, of which the means differ as much as the parts.
-    """
-    n, middle = len(logs), np.mean(logs, axis=0)
-    if n < 2:
-        return np.stack([np.exp(middle), np.zeros_like(middle), np.full_like(middle, np.inf)])
-    error = np.std(logs, axis=0, ddof=1) * (1 + 1 / (flights or n)) ** 0.5
-    half = scipy.special.stdtrit(n - 1, (1 + level) / 2) * error
-    return np.exp([middle, middle - half, middle + half])
 
 
 def expected_from_parts(parts: Sequence[Sequence[Float[np.ndarray, " 4"]]]) -> Float[np.ndarray, "3 4"]:

@@ -122,7 +122,7 @@ def test_a_step_of_the_network_is_taken_if_the_source_does_not_err_as_much():
     truth = eqx.tree_at(lambda field: field.residual.bias_out, hybrid(), hybrid().residual.bias_out + 1.0)
     windows, blocks = flown(truth), blocks_of(40, 5)
     fit = partial(fit_anchored, subspace(hybrid(), windows, None, None, None), jnp.zeros(()))
-    found = [fit(jnp.asarray(error), blocks) for error in (0.0, 1e9)]
+    found = [fit(jnp.asarray(error), blocks, blocks) for error in (0.0, 1e9)]
     assert min(found[0].odds, found[1].naive) > STRONG > found[1].odds
     after = rollout_mse(with_change(hybrid(), found[0].change), windows)
     assert after < 0.1 * rollout_mse(hybrid(), windows)

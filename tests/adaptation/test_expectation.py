@@ -8,7 +8,8 @@ import pytest
 from pendulum import LENGTH, flown, hybrid, pendulum, swings
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.expectation import errors_at_ends, expected_errors, lines_of, longest_chain
+from hybrid_jax.adaptation.expectation import errors_at_ends, expected, expected_errors, lines_of, longest_chain
+from hybrid_jax.adaptation.selection import blocks_of
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.state_space import StateSpace
@@ -61,19 +62,36 @@ def test_errors_after_windows_that_touch_are_those_of_one_long_prediction():
     long = hj.rollout_batch(field, whole.x0, whole.u, whole.dt)[:, -1] - whole.x[:, -1]
     np.testing.assert_allclose(found[0], np.square(alone).mean(axis=0), rtol=1e-4)
     np.testing.assert_allclose(found[1], np.square(long).mean(axis=0), rtol=1e-4)
-    assert longest_chain(chained, 1) == 3
-    assert longest_chain(chained, 3) == 1  # blocks of one window
+    assert longest_chain(chained, blocks_of(3, 1)) == 3
+    assert longest_chain(chained, blocks_of(3, 3)) == 1  # blocks of one window
     padded = errors_at_ends(field, chained[np.array([0, 1, 2, 2])], jnp.array([True, True, True, False]))
     np.testing.assert_allclose(padded, found, rtol=1e-5)
 
 
-def test_a_report_says_what_to_expect():
-    found = hj.adapt(hybrid(), flown(hybrid(LENGTH)))
+@pytest.mark.parametrize("flights", [2, 3, 6])
+def test_the_interval_of_several_flights_holds_another_one_that_differs_from_them(flights):
+    rng, shape = np.random.default_rng(0), (2000, flights + 1, 10)
+    squares = np.exp(rng.normal(size=(2000, flights + 1, 1)) + 0.1 * rng.normal(size=shape)).mean(axis=-1)
+    held = []
+    for *seen, other in squares:
+        of_flights = np.broadcast_to(np.reshape(seen, (-1, 1, 1)), (flights, 2, 1))
+        ((_, low, high),) = expected_errors(of_flights, (0.1, 0.1), LINE, flights=True)["0.1 s"].values()
+        held.append(low <= np.sqrt(other) <= high)
+    assert np.mean(held) == pytest.approx(0.8, abs=0.03)
+
+
+def test_errors_to_expect_are_those_of_each_flight_with_what_the_others_teach():
+    """Flights are of different length; each has a torque of its own, which the field lacks."""
+    given = [flown(hybrid(LENGTH), n, seed=n) for n in (30, 50, 40)]
+    given = [replace(each, u=each.u + push) for each, push in zip(given, (0.0, 1.0, -0.5), strict=True)]
+    found = hj.adapt(hybrid(), given)
     assert "RMSE to expect on a new recording (80% intervals" in found.report()
-    rmse, _, _ = found.expected["0.4 s"]["x[0]"]
-    other = flown(hybrid(LENGTH), seed=5)
-    errors = hj.rollout_batch(found.field, other.x0, other.u, other.dt)[:, -1] - other.x[:, -1]
-    assert rmse == pytest.approx(float(jnp.sqrt(jnp.mean(errors[:, 0] ** 2))), rel=0.6)
+    errors = []
+    for i, one in enumerate(given):
+        field = hj.adapt(hybrid(), concatenate(given[:i] + given[i + 1 :])).field
+        errors.append(hj.rollout_batch(field, one.x0, one.u, one.dt)[:, -1] - one.x[:, -1])
+    logs = np.log([float(jnp.sqrt(jnp.mean(each[:, 0] ** 2))) for each in errors])
+    np.testing.assert_allclose(found.expected["0.4 s"]["x[0]"], expected(logs), rtol=0.1)
 
 
 def test_a_flight_unlike_those_learned_from_is_named():
