@@ -143,13 +143,10 @@ def _system(truth, changed, model, start, inputs, dt) -> System:
 def _pendulum(wrap=lambda network: network, made=pendulum, most=(2.0, 4.0)) -> System:
     residual = hj.residual_network(2, 1, jax.random.key(1), hidden=16)
     return _system(
-        truth=made(0.5, 0.8),
-        changed=made(0.7, 0.8),
-        model=hj.Hybrid(made(0.6), wrap(residual)),
+        truth=made(0.5, 0.8), changed=made(0.7, 0.8), model=hj.Hybrid(made(0.6), wrap(residual)),
         start=lambda rng, n: rng.uniform(-1, 1, (n, 2)) * most,
-        inputs=lambda rng, shape: 3 * rng.normal(size=(*shape, 1)),
-        dt=0.05,
-    )
+        inputs=lambda rng, shape: 3 * rng.normal(size=(*shape, 1)), dt=0.05,
+    )  # fmt: skip
 
 
 def _circle() -> System:
@@ -175,13 +172,10 @@ def _car() -> System:
         return [0.12, 3.0] * (rng.uniform(-1, 1, (shape[0], 1, 2)) + 0.1 * rng.normal(size=(*shape, 2)))
 
     return _system(
-        truth=car(grip=0.9, drag=1e-3),
-        changed=car(0.7, 0.8, grip=0.9, drag=1e-3),
+        truth=car(grip=0.9, drag=1e-3), changed=car(0.7, 0.8, grip=0.9, drag=1e-3),
         model=hj.Hybrid(car(1.3, 0.8), hj.residual_network(6, 2, jax.random.key(1), hidden=16)),
-        start=lambda rng, n: rng.uniform(low, high, (n, 6)),
-        inputs=inputs,
-        dt=0.05,
-    )
+        start=lambda rng, n: rng.uniform(low, high, (n, 6)), inputs=inputs, dt=0.05,
+    )  # fmt: skip
 
 
 def _flights(truth, changed, model) -> System:
@@ -213,13 +207,9 @@ def _ring(residual) -> System:
         return (0.5 * rng.normal(size=(n, 1, 3)) @ np.sin(wave) + 0.5 * rng.normal(size=(n, 1, 3)) @ np.cos(wave))[:, 0]
 
     return _system(
-        truth=burgers(0.01, 1.0),
-        changed=burgers(0.015, 1.0),
-        model=hj.Hybrid(burgers(0.02), residual),
-        start=start,
-        inputs=lambda rng, shape: rng.normal(size=(*shape, 1)),
-        dt=0.01,
-    )
+        truth=burgers(0.01, 1.0), changed=burgers(0.015, 1.0), model=hj.Hybrid(burgers(0.02), residual), start=start,
+        inputs=lambda rng, shape: rng.normal(size=(*shape, 1)), dt=0.01,
+    )  # fmt: skip
 
 
 def _convolution() -> System:

@@ -163,7 +163,7 @@ def test_an_attitude_stays_one_however_long_it_turns():
 LAGGED = [np.random.default_rng(0).normal(size=size).astype(np.float32) for size in ((24, 1), (24, 10, 1))]
 
 
-@pytest.mark.parametrize("name", ["ImplicitEuler", "Kvaerno3", "Kvaerno5"])
+@pytest.mark.parametrize("name", ["ImplicitEuler", "Kvaerno5", *slow("Kvaerno3")])
 def test_an_implicit_solver_solves_its_equations_or_says_that_it_did_not(name):
     """A state that follows the sine of a slow one, from a start beside it; a lag of 1 ms; one without a step."""
 

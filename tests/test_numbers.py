@@ -28,14 +28,11 @@ REAL = "adapted", "scratch", "linear_residual", "hold", "thrust"  # the lines of
 # Of the table of ten methods: the report of each column, and the model of each line.
 PROTOCOLS = ("random-1000-noise0", "contiguous-own-noise1")
 COMPARED = {
-    "source, not adapted": ("hybrid", "source_only"),
-    "hybrid": ("hybrid", "fine_tuned"),
-    "no-physics": ("no_physics", "fine_tuned"),
-    "physics-only": ("physics_only", "fine_tuned"),
-    "last layer (ridge)": ("last_layer", "fine_tuned"),
-    "source + linear residual": ("linear_residual", "fine_tuned"),
+    "source, not adapted": ("hybrid", "source_only"), "hybrid": ("hybrid", "fine_tuned"),
+    "no-physics": ("no_physics", "fine_tuned"), "physics-only": ("physics_only", "fine_tuned"),
+    "last layer (ridge)": ("last_layer", "fine_tuned"), "source + linear residual": ("linear_residual", "fine_tuned"),
     "hj.adapt (θ_p + disturbance)": ("constant_disturbance", "fine_tuned"),
-}
+}  # fmt: skip
 
 
 @cache
@@ -192,16 +189,14 @@ def said():
     expected = np.mean(committed("changes").where(lambda row: row["expected_inside"] is not None)["expected_inside"])
     claimed = {
         "control": [
-            f"{min(better):.1f} to {max(better):.1f} times",
-            f"{max(settled):.2f} times",
-            f"{100 * min(inside):.0f} to {100 * max(inside):.0f} %",
-            f"{sum(lost)} of {len(lost)} hovers",
+            f"{min(better):.1f} to {max(better):.1f} times", f"{max(settled):.2f} times",
+            f"{100 * min(inside):.0f} to {100 * max(inside):.0f} %", f"{sum(lost)} of {len(lost)} hovers",
         ],
         "intervals": [
             *(f"{min(each):.1f} to {max(each):.1f} times as wide" for each in wide.values()),
             f"error on another flight in {100 * expected:.0f} %",
         ],
-    }
+    }  # fmt: skip
     for page, sentences in claimed.items():
         text = " ".join((DOCS / f"results/{page}.md").read_text().split())
         assert [sentence for sentence in sentences if " ".join(sentence.split()) not in text] == []

@@ -120,12 +120,10 @@ OF_WINDOWS = {
     "linear": lambda w, n: ridge.linear_residual(SWING, w, n),
     "last layer": lambda w, n: ridge.last_layer(MIXED, w, n),
     "adapted": lambda w, n: ridge.fit_ridge(ridge.last_layer, MIXED, w, WINDOWS, (1.0, n)),
-    "mse": lambda w, n: metrics.rollout_mse(SWING, w, n),
-    "split": lambda w, n: split(check(w), n),
+    "mse": lambda w, n: metrics.rollout_mse(SWING, w, n), "split": lambda w, n: split(check(w), n),
     "windows_of": lambda w, n: check(windows_of(w.u[0], w.u[0, :-1], w.dt, steps=n)),
-    "concatenate": lambda w, n: check(concatenate([w, WINDOWS])),
-    "subset": lambda w, n: check(w[:2]),
-}
+    "concatenate": lambda w, n: check(concatenate([w, WINDOWS])), "subset": lambda w, n: check(w[:2]),
+}  # fmt: skip
 
 
 @cases(0.1)

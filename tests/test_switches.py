@@ -11,11 +11,9 @@ import hybrid_jax as hj
 from hybrid_jax import export
 
 SWITCHES = {
-    "x64": lambda: jax.enable_x64(True),
-    "strict types": lambda: jax.numpy_dtype_promotion("strict"),
-    "strict ranks": lambda: jax.numpy_rank_promotion("raise"),
-    "NaN is an error": lambda: jax.debug_nans(True),
-}
+    "x64": lambda: jax.enable_x64(True), "strict types": lambda: jax.numpy_dtype_promotion("strict"),
+    "strict ranks": lambda: jax.numpy_rank_promotion("raise"), "NaN is an error": lambda: jax.debug_nans(True),
+}  # fmt: skip
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 

@@ -140,18 +140,13 @@ def test_terms_and_learned_names_are_read(written):
     ("above", "below", "message"),
     [
         ('learn = ["weight"]', "", "learn must be names of"),
-        ('learn = ["k", "k_rotors"]', "", "both k and k_rotors"),
-        ('learn = "k"', "", "learn must be a list"),
-        ("learn = [1]", "", "learn must be a list"),
-        ("", 'learn = ["k"]', "above all tables"),
-        ('lern = ["k"]', "", "'lern'"),
-        ("", "[terms]\ndarg = [1, 2, 3]", "'darg': must be one of torque_gain,"),
+        ('learn = ["k", "k_rotors"]', "", "both k and k_rotors"), ('learn = "k"', "", "learn must be a list"),
+        ("learn = [1]", "", "learn must be a list"), ("", 'learn = ["k"]', "above all tables"),
+        ('lern = ["k"]', "", "'lern'"), ("", "[terms]\ndarg = [1, 2, 3]", "'darg': must be one of torque_gain,"),
         ("", "[terms]\ndrag = [1, 2]", "drag must be"),
-        ("", "[terms]\nmotor_time_constant = -1", "motor_time_constant"),
-        ("terms = 3", "", "table [terms]"),
-        ("actuator = 1", "", "actuator"),
-        ("vehicle", "", "readable TOML"),
+        ("", "[terms]\nmotor_time_constant = -1", "motor_time_constant"), ("terms = 3", "", "table [terms]"),
+        ("actuator = 1", "", "actuator"), ("vehicle", "", "readable TOML"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_learned_is_refused(written, above, below, message):
     assert message in refusal(written(above, below), load_vehicle_model)

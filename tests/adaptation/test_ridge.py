@@ -63,12 +63,11 @@ def derivatives(field, windows):
 @pytest.mark.parametrize(
     ("method", "start", "change"),
     [
-        (_linear_residual, source, with_linear),
-        (_last_layer, source, with_other_output),
+        (_linear_residual, source, with_linear), (_last_layer, source, with_other_output),
         (_last_layer, lambda: source().residual, with_other_output),
     ],
     ids=["linear", "output layer", "output layer without physics"],
-)
+)  # fmt: skip
 def test_a_correction_of_the_method_s_own_form_is_recovered(method, start, change):
     with jax.enable_x64(True):
         field, truth = start(), change(start())

@@ -98,14 +98,13 @@ def test_a_model_without_parameters_has_no_filter(tmp_path, called):
     [
         ({"dt": 0.02}, ["--state-size", "12"], "field: RigidBody does not take"),
         ({"dt": 0.02}, ["--dt", "nan"], "--dt must be a positive number of seconds, got nan"),
-        ({}, [], "--dt is needed"),
-        ({"dt": 0.02}, ["--smooth", "-1"], "--smooth must be"),
+        ({}, [], "--dt is needed"), ({"dt": 0.02}, ["--smooth", "-1"], "--smooth must be"),
         ({"dt": 0.02}, ["--name", "1"], "name must be a lower-case C identifier"),
         ({"dt": 0.02}, ["--noise", "1", "--to", "casadi"], "needs --to c"),
         ({"dt": 0.02}, ["--noise", "1", "2"], "--noise must be 1, 4 or 13 numbers, got 2"),
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_bad_input_ends_in_one_line(about, options, message, field, tmp_path, called, monkeypatch):
     monkeypatch.chdir(tmp_path)
     hj.save("model.npz", field, about)

@@ -22,12 +22,11 @@ errors = partial(learning.errors_of, steps=learning.STEPS)
 @pytest.mark.parametrize(
     ("given", "learned", "told"),
     [
-        ((LEARN, 23, True), LEARN, ""),
-        ((("Ix", "drag"), 1, False), ("Ix", "drag"), ""),
+        ((LEARN, 23, True), LEARN, ""), ((("Ix", "drag"), 1, False), ("Ix", "drag"), ""),
         ((LEARN, 23, False), LEARN[:5], "Not learned, as not all logs have a velocity: drag, aerodynamic_moment."),
         ((LEARN, 21, True), ("Ix", "Iy", "k"), "Not learned, as 21 s of flight are too few, 22 s are needed: Iz, k"),
     ],
-)
+)  # fmt: skip
 def test_what_is_learned_by_default_follows_from_the_logs(given, learned, told):
     learn, seconds, moves = given
     model, left = learning.learnable(VehicleModel(IRIS, learn=learn), seconds, 0.1, moves)

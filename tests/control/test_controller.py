@@ -97,13 +97,11 @@ def test_quaternion_length_is_ignored_if_traced_and_refused_if_concrete(still):
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"steps": 1}, "steps"),
-        ({"interval": 0.055}, "interval must be a multiple"),
-        ({"interval": 0.005}, "interval must be a multiple"),
-        ({"min_speed": 700.0}, "hover speed"),
+        ({"steps": 1}, "steps"), ({"interval": 0.055}, "interval must be a multiple"),
+        ({"interval": 0.005}, "interval must be a multiple"), ({"min_speed": 700.0}, "hover speed"),
         ({"weights": {"position": 1.0}}, r"weights must be a Weights, got \{'position': 1.0\}"),
     ],
-)
+)  # fmt: skip
 def test_invalid_hyper_parameters_are_refused(wrong, said):
     with pytest.raises(ValueError, match=said):
         Controller(**{"vehicle": hj.IRIS, **wrong})
@@ -184,14 +182,12 @@ def test_low_flyby_is_low_for_two_fifths_of_the_time():
     [
         (lambda: hover((0.0, 0.0)), r"position must be three numbers \(x, y, z\), got \(0.0, 0.0\)"),
         (lambda: hover((0.0, 0.0, np.nan)), r"position\[2\] is not finite"),
-        (lambda: hover(yaw=np.inf), "yaw must be a finite number"),
-        (lambda: low_flyby(low=1.0, high=0.5), "high"),
-        (lambda: sample(hover(), REGULAR, -1.0), "duration"),
-        (lambda: figure_eight(0.0), "top_speed"),
+        (lambda: hover(yaw=np.inf), "yaw must be a finite number"), (lambda: low_flyby(low=1.0, high=0.5), "high"),
+        (lambda: sample(hover(), REGULAR, -1.0), "duration"), (lambda: figure_eight(0.0), "top_speed"),
         (lambda: add_body_rates(jnp.zeros(4)), r"state \(13,\) expected"),
         (lambda: sample(None, REGULAR, 1.0), "path must be a function of time"),
     ],
-)
+)  # fmt: skip
 def test_invalid_arguments_are_refused(make, said):
     with pytest.raises(ValueError, match=said):
         make()

@@ -42,15 +42,13 @@ def invariant():
 
 
 FIELDS = {
-    "physics": body,
-    "paper": lambda: hj.Hybrid(body(), network()),
+    "physics": body, "paper": lambda: hj.Hybrid(body(), network()),
     "layer norm": lambda: hj.Hybrid(body(), network(norm="layer")),
     "no x, y": lambda: hj.Hybrid(body(), network("no_xy", norm="none")),
     "body frame": lambda: hj.Hybrid(body(), network("body", "accelerations")),
     "invariant, disturbed": lambda: hj.Hybrid(invariant(), ConstantDisturbance(jnp.ones(6))),
-    "frozen": lambda: hj.Hybrid(body(), Frozen(LinearResidual(jnp.ones((13, 17)) / 50, jnp.ones(13)))),
-    "user": Spun,
-}
+    "frozen": lambda: hj.Hybrid(body(), Frozen(LinearResidual(jnp.ones((13, 17)) / 50, jnp.ones(13)))), "user": Spun,
+}  # fmt: skip
 
 
 def samples(count=3):

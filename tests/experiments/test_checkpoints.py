@@ -10,10 +10,8 @@ from experiments.runner.checkpoint import Checkpoints, DeferredSignals
 
 ARRAYS = {
     "field/weight": np.random.default_rng(0).normal(size=(3, 50)).astype(np.float32),
-    "epoch": np.array([3, 4, 5], np.int32),
-    "scalar": np.array(np.nan),
-    "key": np.array([[1, 2**32 - 1]], np.uint32),
-}
+    "epoch": np.array([3, 4, 5], np.int32), "scalar": np.array(np.nan), "key": np.array([[1, 2**32 - 1]], np.uint32),
+}  # fmt: skip
 
 
 def saved(folder, count):

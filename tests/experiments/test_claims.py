@@ -95,13 +95,11 @@ def test_claims_are_undecided_without_the_rows_they_need():
 
 # As in Table 2, and other baselines behind: means for the hybrid, the best of the seeds for the rest.
 ERRORS = {
-    ("hybrid", "fine_tuned"): (3.26e-3, 2.64e-3),
-    ("expert_augmentation", "source_only"): (3.68e-3, 4.02e-3),
+    ("hybrid", "fine_tuned"): (3.26e-3, 2.64e-3), ("expert_augmentation", "source_only"): (3.68e-3, 4.02e-3),
     ("physics_only", "fine_tuned"): (3.76e-3, 4.53e-3),
     **{(model, "fine_tuned"): (5e-3, 5e-3) for model in BASELINES if model != "expert_augmentation"},
-    ("hybrid", "source_only"): (0.02, 0.03),
-    ("physics_only", "source_only"): (0.01, 0.01),
-}
+    ("hybrid", "source_only"): (0.02, 0.03), ("physics_only", "source_only"): (0.01, 0.01),
+}  # fmt: skip
 TRUTHS = {"parameter_shift": TRUTH, "external_force": TRUTH | {"Ix": 0.029, "Iy": 0.029}}
 
 

@@ -57,13 +57,10 @@ def test_the_paper_preset_is_the_paper():
 @pytest.mark.parametrize(
     ("model", "mode", "table"),
     [
-        ("hybrid", "fine_tuned", HYBRID),
-        ("hybrid", "target_only", HYBRID),
-        ("no_physics", "fine_tuned", NO_PHYSICS),
-        ("no_physics", "target_only", NO_PHYSICS_TARGET_ONLY),
-        ("physics_only", "fine_tuned", HYBRID),
+        ("hybrid", "fine_tuned", HYBRID), ("hybrid", "target_only", HYBRID), ("no_physics", "fine_tuned", NO_PHYSICS),
+        ("no_physics", "target_only", NO_PHYSICS_TARGET_ONLY), ("physics_only", "fine_tuned", HYBRID),
     ],
-)
+)  # fmt: skip
 def test_runs_have_the_table_s_rates_and_patience(model, mode, table):
     for n, _, plan in plans_by_lane(model, mode):
         rate, *rule = table[n]
@@ -177,18 +174,16 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
 
 REFUSED = [
     *(({"sizes": sizes}, "--n-target") for sizes in ((10,), (), (100, 100))),
-    ({"sizes": (9,), "batch_size": 9}, "constant_disturbance"),
-    ({"models": ()}, "--models"),
+    ({"sizes": (9,), "batch_size": 9}, "constant_disturbance"), ({"models": ()}, "--models"),
     ({"batch_size": 1}, "--batch-size must be at least 2 with --norm batch, got 1"),
-    ({"source_train": 50}, "--source-train"),
-    ({"seeds": 0}, "--seeds"),
+    ({"source_train": 50}, "--source-train"), ({"seeds": 0}, "--seeds"),
     *(({"guess": box}, "--init-range must be two factors") for box in ((1.2, 0.8), (-1.0, 0.8), (0.8, math.inf))),
     ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
     ({"draw": "contiguous", "pool": 2000}, "--pool is for --draw random: leave it out"),
     ({"rates": replace(PAPER.rates, hybrid=(1e-3,))}, "--rates.hybrid"),
     ({"rates": replace(PAPER.rates, no_physics=(1e-4,) * 4 + (math.nan,))}, "--rates.no-physics must be a finite"),
     ({"patience": replace(PAPER.patience, no_physics=Stopping(-1, 5))}, "--patience.no-physics.minimum must be"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("change", "named"), REFUSED, ids=str)

@@ -56,10 +56,9 @@ def test_too_few_or_short_flights_are_refused_before_training(options, sets, mes
     ("options", "message"),
     [
         ({"simulated": True, "source": Path("a")}, "--simulated makes its own logs"),
-        ({"learn": ("wings",)}, "learn must be names of"),
-        ({"dt": 0.0}, "--dt must be a positive finite number"),
+        ({"learn": ("wings",)}, "learn must be names of"), ({"dt": 0.0}, "--dt must be a positive finite number"),
     ],
-)
+)  # fmt: skip
 def test_invalid_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         replace(CONFIG, **options)

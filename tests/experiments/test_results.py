@@ -66,11 +66,10 @@ def test_pairs_are_of_the_same_seed():
     ("rows", "words"),
     [
         ([{"seed": 0}, {"seed": 0}], "2 rows have seed 0"),
-        ([{"model": "a"}], r"rows\[0\] must be an object with seed"),
-        ([1], r"rows\[0\] must be an object"),
+        ([{"model": "a"}], r"rows\[0\] must be an object with seed"), ([1], r"rows\[0\] must be an object"),
         ([{"seed": 0, "thing": object()}], "has no JSON form"),
     ],
-)
+)  # fmt: skip
 def test_malformed_rows_are_refused(rows, words):
     with pytest.raises(ValueError, match=words):
         Results(rows, ("seed",))

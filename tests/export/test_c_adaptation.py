@@ -41,16 +41,8 @@ class Cart(hj.AbstractVectorField):
         return jnp.stack([x[1], self.gain * u[0] - self.stiffness * x[0]])
 
 
-# With hypotheses or alone → parameters of the nominal system, changes of the one that is flown, and a late one.
-THETA = {
-    True: ({"stiffness": 1.0, "gain": 1.0}, {"stiffness": 1.3, "gain": 1.05}, {"gain": 0.3}),
-    False: ({"Ix": 0.0, "Iy": 0.0, "k": 0.0}, {"Ix": 0.3, "Iy": -0.3, "k": 0.05}, {"k": -1.0}),
-}
-
-
-def system(hypotheses, changes=0):
-    values = {name: jnp.array(value) for each in THETA[hypotheses][: 1 + changes] for name, value in each.items()}
-    return Cart(**values) if hypotheses else hj.RigidBody(values, hj.IRIS)
+NOMINAL = {True: Cart(jnp.ones(()), jnp.ones(())), False: hj.rigid_body(hj.IRIS)}  # with hypotheses, and alone
+AWAY = {True: (0.3, 0.05), False: (0.3, -0.3, 0.05)}  # from the nominal parameters
 
 
 @cache
@@ -58,10 +50,12 @@ def flight(hypotheses, steps=90):
     """Samples, inputs and periods of a system that is not nominal and that weakens; one sample is missing, another
     frozen, and one comes after a gap."""
     rng, ahead, samples = np.random.default_rng(0), eqx.filter_jit(rk4_step), []
+    leaves, structure = jax.tree.flatten(NOMINAL[hypotheses])
     x = jnp.zeros(2) if hypotheses else jnp.zeros(13).at[2].set(2.0).at[3].set(1.0)
     inputs = 2 * rng.normal(size=(steps, 1)) if hypotheses else hj.IRIS.hover_speed + 40 * rng.normal(size=(steps, 4))
     for i, u in enumerate(inputs := inputs.astype(np.float32)):
-        x = ahead(system(hypotheses, 1 + (i >= 74)), x, u, DT)
+        away = AWAY[hypotheses] if i < 74 else (*AWAY[hypotheses][:-1], -0.7)
+        x = ahead(structure.unflatten([leaf + by for leaf, by in zip(leaves, away, strict=True)]), x, u, DT)
         samples.append(np.asarray(x) + 1e-3 * rng.normal(size=len(x)).astype(np.float32))
     samples[10][:] = np.nan
     samples[11][4 % len(x)] = np.nan
@@ -78,7 +72,7 @@ def in_double(hypotheses):
 
 def filter_with(hypotheses):
     own = {"hypotheses": HYPOTHESES, "prior": 0.5, "indices": (1,)} if hypotheses else {}
-    return OnlineAdaptation(system(hypotheses), DT, 1e-3, disturbance=2.0, process=1e-2, **own)
+    return OnlineAdaptation(NOMINAL[hypotheses], DT, 1e-3, disturbance=2.0, process=1e-2, **own)
 
 
 def compiled(folder, adaptation, precise, size, sizes):

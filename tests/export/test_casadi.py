@@ -60,8 +60,7 @@ def everything(x, u):
     matrix = jnp.outer(x, u)
     batch = jnp.stack([matrix, 2 * matrix])
     parts = [
-        jnp.linalg.norm(x),
-        jnp.einsum("bij,bkj->b", batch, batch[:, ::-1]).sum(),
+        jnp.linalg.norm(x), jnp.einsum("bij,bkj->b", batch, batch[:, ::-1]).sum(),
         jnp.cumsum(x)[-2] + jnp.prod(u) + jnp.max(x) + jnp.min(u),
         jnp.arctan2(x[0], x[1]) + jnp.clip(x[2], -0.1, 0.1) + jnp.sign(x[3]),
         jax.nn.sigmoid(x[4]) + jax.nn.softplus(x[0]) + jax.nn.gelu(x[1], approximate=False),
@@ -70,10 +69,8 @@ def everything(x, u):
         x[jnp.array([0, 0, 5])].sum() + x.at[jnp.array([1, 1])].add(x[2]).sum(),
         (x**3).sum() + jnp.abs(x[0]) ** 1.5 + 2.0 ** x[1] + jnp.log1p(x[2] ** 2) + jnp.expm1(x[3]),
         jax.checkpoint(jnp.sin)(x[0]) + jnp.roll(x, 2)[0] + jax.lax.dynamic_slice(x, (3,), (2,)).sum(),
-        sum(jnp.split(x[:12], 3))[0] + jnp.remainder(x[0], 1.3),
-        jnp.floor(x[0]),
-        jnp.mean(x) + jnp.var(x),
-    ]
+        sum(jnp.split(x[:12], 3))[0] + jnp.remainder(x[0], 1.3), jnp.floor(x[0]), jnp.mean(x) + jnp.var(x),
+    ]  # fmt: skip
     return jnp.stack(parts)
 
 

@@ -76,17 +76,13 @@ def test_the_arrays_given_must_agree_and_are_not_changed(flight):
 @pytest.mark.parametrize(
     ("array", "at", "value", "words"),
     [
-        ("t", 5, np.nan, ("sample 5", "field t", "nan")),
-        ("t", 5, 0.0, ("sample 5", "field t", "goes back")),
-        ("t", 6, 0.05, ("sample 6", "repeats")),
-        ("x", (7, 8), np.inf, ("sample 7", "field vy", "inf")),
-        ("u", (3, 2), np.nan, ("sample 3", "field u2")),
-        ("u", (3, 2), -1.0, ("sample 3", "field u2", "negative")),
+        ("t", 5, np.nan, ("sample 5", "field t", "nan")), ("t", 5, 0.0, ("sample 5", "field t", "goes back")),
+        ("t", 6, 0.05, ("sample 6", "repeats")), ("x", (7, 8), np.inf, ("sample 7", "field vy", "inf")),
+        ("u", (3, 2), np.nan, ("sample 3", "field u2")), ("u", (3, 2), -1.0, ("sample 3", "field u2", "negative")),
         ("x", (9, slice(3, 7)), 0.0, ("sample 9", "qw", "norm is 0")),
-        ("x", (9, 3), 1e200, ("sample 9", "qw", "is 1e+200")),
-        ("x", (9, 0), 2e9, ("sample 9", "px", "is 2e+09")),
+        ("x", (9, 3), 1e200, ("sample 9", "qw", "is 1e+200")), ("x", (9, 0), 2e9, ("sample 9", "px", "is 2e+09")),
     ],
-)
+)  # fmt: skip
 def test_impossible_values_are_named(flight, array, at, value, words):
     broken = {"t": flight.t.copy(), "x": flight.x.copy(), "u": flight.u.copy()}
     broken[array][at] = value
@@ -96,16 +92,12 @@ def test_impossible_values_are_named(flight, array, at, value, words):
 @pytest.mark.parametrize(
     ("name", "own", "manoeuvre"),
     [
-        ("/a/b/chirp_run2.csv.gz", "chirp_run2", "chirp"),
-        ("melon-03.csv", "melon-03", "melon"),
-        ("flight_17.csv", "flight_17", "flight_17"),
-        ("figure8_run2.ULG", "figure8_run2", "figure8"),
-        ("squarerun3.csv", "squarerun3", "square"),
-        ("hover flight-4.csv", "hover flight-4", "hover"),
-        ("2024.05.01_hover_2.Csv.Gz", "2024.05.01_hover_2", "2024.05.01_hover"),
-        ("17.csv", "17", "17"),
+        ("/a/b/chirp_run2.csv.gz", "chirp_run2", "chirp"), ("melon-03.csv", "melon-03", "melon"),
+        ("flight_17.csv", "flight_17", "flight_17"), ("figure8_run2.ULG", "figure8_run2", "figure8"),
+        ("squarerun3.csv", "squarerun3", "square"), ("hover flight-4.csv", "hover flight-4", "hover"),
+        ("2024.05.01_hover_2.Csv.Gz", "2024.05.01_hover_2", "2024.05.01_hover"), ("17.csv", "17", "17"),
     ],
-)
+)  # fmt: skip
 def test_names_of_flights_and_manoeuvres(name, own, manoeuvre):
     log = replace(LOGS[0], name=name)
     assert (flight_of(log), manoeuvre_of(log)) == (own, manoeuvre)

@@ -219,10 +219,8 @@ LINEAR = "equinox.nn._linear:Linear"
 HOSTILE = {
     "class that is a function": {"class": "os:system", "fields": {"command": "touch sprung"}},
     "class of another kind": {"class": "subprocess:Popen", "fields": {"args": "touch sprung"}},
-    "module as class": {"class": "os", "fields": {}},
-    "function of an imported module": {"named": "os.system"},
-    "builtin": {"named": "builtins.eval"},
-    "function that reads files": {"named": "jax.numpy.load"},
+    "module as class": {"class": "os", "fields": {}}, "function of an imported module": {"named": "os.system"},
+    "builtin": {"named": "builtins.eval"}, "function that reads files": {"named": "jax.numpy.load"},
     "module that is not imported": {"class": "antigravity:Module", "fields": {}},
     "class by another name": {"class": "hybrid_jax:Hybrid", "fields": {"physics": 1, "residual": 1}},
     "method": {"class": f"{LINEAR}.__call__", "fields": {}},
@@ -230,7 +228,7 @@ HOSTILE = {
     "abstract class": {"class": "hybrid_jax.dynamics.base:AbstractVectorField", "fields": {}},
     "fields of another class": {"class": LINEAR, "fields": {"__class__": "os", "__dict__": 1}},
     "unknown entry": {"run": "touch sprung"},
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -1,7 +1,7 @@
 """The kernels of whole rollouts do what JAX does, and JAX does it where they do not serve."""
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ from hybrid_jax.training.objective import Settings, compiler_options
 PLACES = tuple((float(0.2 * np.cos(angle)), float(0.3 * np.sin(angle))) for angle in 0.1 + np.arange(6))
 HEXACOPTER = replace(ODD, rotor_positions=PLACES, spin=(1.0, -1.0) * 3)
 THETA = dict(zip(LEARNED, jnp.array([0.3, -0.4, 0.1]), strict=True))
-BODY = RigidBody(THETA, ODD)
+BODY, KEY = RigidBody(THETA, ODD), jax.random.key(2)
 needs_kernels = pytest.mark.skipif(library.obstacle() is not None, reason=kernels.status())
 
 
@@ -56,11 +56,7 @@ FIELDS = {
     "layer norm": lambda: network(4, 1, norm="layer", activation="silu"),
     "a view of the state": lambda: Hybrid(BODY, multirotor_network(IRIS, jax.random.key(2), inputs="no_xy", hidden=32)),
 }
-
-
-@cache
-def field_of(name="the paper's"):
-    return FIELDS[name]()
+paper = FIELDS["the paper's"]
 
 
 def windows(field, b, steps=3, lanes=()):
@@ -102,7 +98,7 @@ def calls(function, *arguments):
 @needs_kernels
 @pytest.mark.parametrize("name", FIELDS)
 def test_values_and_derivatives_are_those_of_jax_in_double_precision(name):
-    field = field_of(name)
+    field = FIELDS[name]()
     arguments = windows(field, 33, steps=2)
     assert calls(trained, field, *arguments[:2])
     found = eqx.filter_jit(partial(both_ways, trained))(field, *arguments)
@@ -116,8 +112,8 @@ def test_values_and_derivatives_are_those_of_jax_in_double_precision(name):
 
 @needs_kernels
 def test_a_lane_is_the_same_alone_to_the_bit():
-    lanes = windows(field_of(), 20, lanes=(2, 3))
-    function = partial(both_ways, trained, field_of())
+    lanes = windows(paper(), 20, lanes=(2, 3))
+    function = partial(both_ways, trained, paper())
     together = jax.jit(jax.vmap(jax.vmap(function)))(*lanes)
     single = jax.jit(function)(*(part[1, 2] for part in lanes))
     for one, other in zip(jax.tree.leaves(together), jax.tree.leaves(single), strict=True):
@@ -130,8 +126,8 @@ class Own(RigidBody):
 
 
 OTHERS = {
-    "physics of one's own": lambda: (Hybrid(Own(THETA, IRIS), field_of().residual), 16),
-    "few windows": lambda: (field_of(), 9),
+    "physics of one's own": lambda: (Hybrid(Own(THETA, IRIS), paper().residual), 16),
+    "few windows": lambda: (paper(), 9),
 }
 
 
@@ -149,25 +145,25 @@ def test_the_reason_is_told_why_a_field_has_no_kernel():
 
 @pytest.mark.parametrize("name", ["the paper's", *OTHERS])
 def test_others_are_plain_jax_and_fusion_emitters_are_spared_where_kernels_serve(name):
-    field, b = OTHERS.get(name, lambda: (field_of(), 16))()
+    field, b = OTHERS.get(name, lambda: (paper(), 16))()
     served = name not in OTHERS and library.obstacle() is None
-    assert calls(trained, field, *windows(field_of(), b)[:2]) == served
-    x0, u, states = (np.moveaxis(part, -1, 0) for part in windows(field_of(), 40))
+    assert calls(trained, field, *windows(paper(), b)[:2]) == served
+    x0, u, states = (np.moveaxis(part, -1, 0) for part in windows(paper(), 40))
     found = compiler_options(field, Trajectories(x0, u, states, DT), Settings(batch_size=b))
     assert found == (FAST_COMPILE if served else {})
 
 
 @pytest.mark.parametrize("solver", [RK4(substeps=2), RK4(scanned=True)])
 def test_only_one_step_of_rk4_an_interval_is_a_kernel(solver):
-    x0, u, _ = windows(field_of(), 16)
-    found = calls(lambda field, x0, u: rollout_minibatch(field, x0, u, DT, solver), field_of(), x0, u)
+    x0, u, _ = windows(paper(), 16)
+    found = calls(lambda field, x0, u: rollout_minibatch(field, x0, u, DT, solver), paper(), x0, u)
     assert found == (solver.substeps == 1 and (library.obstacle() is None))
 
 
 @needs_kernels
 @pytest.mark.parametrize("name", FIELDS)
 def test_windows_are_predicted_as_by_jax_in_double_precision(name):
-    field = field_of(name)
+    field = FIELDS[name]()
     x0, u, _ = windows(field, 150, steps=5)  # no multiple of a vector
     x0, u = x0.T, np.moveaxis(u, -1, 0)
     assert calls(predict, field, x0, u, DT)
@@ -179,7 +175,7 @@ def test_windows_are_predicted_as_by_jax_in_double_precision(name):
 
 @needs_kernels
 def test_a_prediction_has_the_derivative_of_jax():
-    field = field_of("a force and a torque")
+    field = FIELDS["a force and a torque"]()
     x0, u, _ = windows(field, 16)
     x0, u = x0.T, np.moveaxis(u, -1, 0)
 

@@ -127,11 +127,10 @@ def test_a_parameter_that_nothing_excites_is_named():
         ({"model": Doubled(jnp.array(1.0), jnp.array(2.0))}, "no input distinguishes a and b"),
         ({"bounds": hj.FlightBounds()}, "bounds must be InputBounds"),
         ({"bounds": hj.InputBounds((-1.0,), (1.0,), (2.0,), (-1.0,), (1.0,))}, "x0 leaves its limits even at rest"),
-        ({"noise": None}, "noise must be given"),
-        ({"window": 0.05}, "window must be a multiple of dt"),
+        ({"noise": None}, "noise must be given"), ({"window": 0.05}, "window must be a multiple of dt"),
         ({"bandwidth": 0.1}, "bandwidth must be from"),
     ],
-)
+)  # fmt: skip
 def test_bad_input_is_refused_in_one_line(change, said):
     given = {"model": GAIN, "bounds": FREE, "steps": 0} | change
     refusal(lambda: search(**given), said)

@@ -5,7 +5,6 @@ from collections import Counter
 import jax
 import numpy as np
 import pytest
-from smoke import script
 from surface import refusal
 
 from experiments import make_flights
@@ -168,11 +167,6 @@ def test_the_command_writes_a_dataset_prints_a_table_and_keeps_what_exists(tmp_p
         (message,) = capsys.readouterr().err.strip().splitlines()
         assert said in message
     assert file.read_bytes() == before
-
-
-@pytest.mark.slow
-def test_importing_the_simulator_prints_nothing():
-    assert not script("-c", "import hybrid_jax.sim.flight")
 
 
 @pytest.mark.slow

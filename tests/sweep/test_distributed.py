@@ -169,20 +169,6 @@ def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, la
         assert all(said.split()[-2] == str(2 * processes) for said, _ in texts)
 
 
-def test_a_stopped_process_is_named_and_the_state_saved(whole, tmp_path):
-    _, programs = whole
-    both = pair(programs, tmp_path)
-    assert any("3 runs, epoch" in line for line in both[0].stderr)
-    both[1].send_signal(signal.SIGSTOP)
-    try:
-        _, said = both[0].communicate(timeout=120)
-    finally:
-        both[1].kill()
-    assert said.strip().splitlines()[-1] == "gone: process 1 has not answered for 10 s"
-    assert both[0].returncode == 2
-    assert len(list(tmp_path.glob("*.begun"))) == 1
-
-
 @pytest.mark.parametrize("options", [("--processes", "2"), ("--distributed",)], ids=["alone", "no cluster"])
 def test_processes_that_do_not_fit_together_are_refused_in_one_line(options, tmp_path):
     process = experiment(tmp_path / "out", tmp_path / "cache", *options)

@@ -111,8 +111,8 @@ def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
     assert compilations(caplog) == 1
 
 
-def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
-    own, capacity = replace(SETTINGS, batch_size=4), (3, 40)
+def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog, final):
+    own, capacity = SETTINGS, (4, 50)  # no other test's
     states, plans = lane((starts(), stack(PLANS)), np.array([2]))
     few = states, replace(plans, subset=plans.subset % 20), TRAIN[:20]
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
@@ -122,7 +122,7 @@ def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
         ]
         errors = [evaluate(each.best, VALIDATION, 2, own, capacity[0]) for each in shared]
     assert compilations(caplog) == 2  # one to train, one to test
-    apart = [swept(starts(), PLANS, settings=own, width=1), sweep(*few, VALIDATION, own, width=1)]
+    apart = [final, sweep(*few, VALIDATION, own, width=1)]
     for one, other, error in zip(shared, apart, errors, strict=True):
         np.testing.assert_array_equal(one.epoch, other.epoch)
         np.testing.assert_allclose(one.field.log_length, other.field.log_length, rtol=0, atol=1e-6)

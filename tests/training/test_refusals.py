@@ -56,11 +56,9 @@ REFUSED = {
     "one output": (NARROW, {}, r"train: field: ResidualNetwork must return .* \(2,\) for .* returned float32\[1\]$"),
 }
 STAGES = {
-    "none": ([], "stages"),
-    "no list": (Stage({"": 0.1}), "stages must be a list of Stage, got Stage"),
-    "too long": ([Stage({"": 0.1}, steps=9)], "steps"),
-    "no such part": ([Stage({"wing": 0.1})], "'wing'"),
-}
+    "none": ([], "stages"), "no list": (Stage({"": 0.1}), "stages must be a list of Stage, got Stage"),
+    "too long": ([Stage({"": 0.1}, steps=9)], "steps"), "no such part": ([Stage({"wing": 0.1})], "'wing'"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", REFUSED)
