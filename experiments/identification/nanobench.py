@@ -172,8 +172,7 @@ def show(console: Console, forces: Float[np.ndarray, "f 3"], scores: dict[str, F
             own = {name: pooled(each[other[:, j], j])[part] for name, each in pairs.items()}
             best = np.min([each for name, each in own.items() if "adapted" not in name], axis=0)
             lines += [(flight, *cells(own[TEN + OBSERVED])), ("best baseline", *cells(best))]
-        title = f"Ten seconds of a flight{OBSERVED}: the others after {at} s"
-        tables.append(Table(title, ("flight", *names), lines))
+        tables.append(Table(f"Ten seconds of a flight{OBSERVED}: the others after {at} s", ("flight", *names), lines))
     for table in tables:
         print_table(console, table)
 

@@ -72,10 +72,7 @@ def subspace(
 
 
 def fit_anchored(found: Subspace, noise: Float[Array, ""], error: Float[Array, ""], blocks, left_out) -> Anchored:
-    """Compute the step for each penalty and choose the best; `error` is the source's own, see `Unchanged`.
-
-    The variance is that between `blocks`; `left_out` are those of the steps without a block.
-    """
+    """Choose a penalty by the variance between `blocks`, and compute its step; for `error` see `Unchanged`."""
     basis, effects, residuals = found
     gram, score = jnp.einsum("ner,nes->nrs", effects, effects), jnp.einsum("ner,ne->nr", effects, residuals)
     values, vectors = jnp.linalg.eigh(jnp.sum(gram, axis=0))

@@ -107,9 +107,7 @@ class Auto(Method):
     has_intervals: ClassVar[bool] = True
     uses_motion: ClassVar[bool] = True
 
-    def solve(
-        self, field, train, validation, settings: Settings, learned_from: Trajectories | None = None, flights=None
-    ) -> Solution:
+    def solve(self, field, train, validation, settings: Settings, learned_from=None, flights=None) -> Solution:
         """See `Method.solve`.
 
         Args:

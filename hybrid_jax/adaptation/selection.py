@@ -203,10 +203,7 @@ def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Traje
 def blocks_of(
     windows: int, blocks: int, flights: Int[np.ndarray, " n"] | None = None
 ) -> tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]:
-    """Return the indices of each block's consecutive windows, and which count: a short block repeats its last.
-
-    With `flights`, the flight that each window is from, a block is a flight.
-    """
+    """Return the indices of each block's, or flight's, windows, and which count: a short block repeats its last."""
     if flights is not None:
         first, sizes = np.unique(flights, return_index=True, return_counts=True)[1:]
         own = np.arange(sizes.max())
