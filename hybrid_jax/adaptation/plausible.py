@@ -19,13 +19,15 @@ from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
 # Parameters of a corrected rigid body; the others are its own, θ_p.
-GROUPS = {"efficiency": "efficiency", "reaction_torque": "efficiency", "added_drag": "drag"}
+GROUPS = {"efficiency": "efficiency", "reaction_torque": "reaction_torque", "added_drag": "drag"}
 GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
 
 # What each candidate fits, as groups of parameters. Those apply of which the field has all groups.
 CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "source": (),
     "theta": ("theta",),
+    "reaction_torque": ("reaction_torque",),
+    "theta_reaction_torque": ("theta", "reaction_torque"),
     "disturbance": ("theta", "disturbance"),
     "force": ("theta", "force"),
     "drag": ("theta", "drag"),
@@ -34,7 +36,7 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "force_drag": ("theta", "force", "drag"),
     "force_efficiency": ("theta", "force", "efficiency"),
     "force_torque_drag": ("theta", "force", "torque", "drag"),
-    "all": ("theta", "force", "torque", "drag", "efficiency"),
+    "all": ("theta", "force", "torque", "drag", "efficiency", "reaction_torque"),
 }
 CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
@@ -50,7 +52,8 @@ class Plausible:
         force: constant force over the mass [m/s²].
         torque: constant torque over the inertia [rad/s²].
         drag: added drag over the mass [1/s].
-        efficiency: logarithm of each rotor's efficiency, and of the factor of all reaction torques.
+        efficiency: logarithm of each rotor's efficiency.
+        reaction_torque: logarithm of a factor of all reaction torques.
         disturbance: constant disturbance of another system, over the RMS rate of each state in the windows.
 
     Raises:
@@ -63,6 +66,7 @@ class Plausible:
     torque: float = 5.0
     drag: float = 0.5
     efficiency: float = 0.3
+    reaction_torque: float = 0.3
     disturbance: float = 1.0
 
     def __post_init__(self):

@@ -153,7 +153,7 @@ def test_candidates_of_a_rigid_body_fit_what_their_names_say():
     assert fitted["theta"] == {"Ix", "Iy", "k"}
     assert fitted["drag"] == {"Ix", "Iy", "k", *(f"added_drag[{i}]" for i in range(3))}
     # Four efficiencies and k would be five numbers for four.
-    assert fitted["efficiency"] == {"Ix", "Iy", "reaction_torque", *(f"efficiency[{i}]" for i in range(4))}
+    assert fitted["efficiency"] == {"Ix", "Iy", *(f"efficiency[{i}]" for i in range(4))}
 
 
 def test_a_heavy_penalty_holds_fine_tuning_at_the_source():

@@ -67,7 +67,7 @@ def test_hover_changes_what_the_source_does_not_err_on_its_own_motion(force, tak
 def test_other_propellers_are_found_by_their_reaction_torque():
     other = replace(hj.IRIS, torque_coefficient=1.6 * hj.IRIS.torque_coefficient)
     found = hj.adapt(body(1.0), flown(0, 1.0, vehicle=other))
-    assert found.chosen == "efficiency"
+    assert found.chosen == "reaction_torque"
     np.testing.assert_allclose(found.parameters["reaction_torque"].value, 1.6, rtol=0.03)
 
 
