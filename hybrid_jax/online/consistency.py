@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.online import kalman
 from hybrid_jax.online.multiple_model import Verdict
-from hybrid_jax.online.rotor_order import ACCEPT, RotorOrder
+from hybrid_jax.online.rotor_order import ACCEPT, CLEAR, RotorOrder
 from hybrid_jax.online.samples import HUGE, Sample
 from hybrid_jax.online.state import OnlineState
 from hybrid_jax.online.tuning import ALARMS, BOUND, BURST, REJECT, TRIAL, WINDOW
@@ -41,9 +41,15 @@ def believed(
     doubt = jnp.where(begins, 2 * ALARMS, jnp.minimum(counted, 2 * ALARMS))
     trusted = jnp.where(nis < REJECT, verdict.theta, state.trusted)
     burst = state.burst * jnp.exp(-periods * sample.elapsed) + jnp.where(verdict.changed, 1.0, 0.0)
-    trusted = jnp.where((doubt < ALARMS) & (burst < BURST), trusted, state.settled)
+    # Hypotheses weigh what they knew before an alarm against what they have learned since; one filter cannot.
+    still = (doubt < ALARMS) & ((burst < BURST) if state.mixture is None else True)
+    trusted = jnp.where(still, trusted, state.settled)
     # A mean, as the last value may be that of a gust, or of a fault before its first alarm.
-    rate = jnp.where(doubt < SETTLED, -jnp.expm1(-periods / TRIAL), 0.0)
+    kept = doubt < SETTLED
+    if order is not None:
+        # While an exchange may be true, what is learned may be wrong.
+        kept = kept & (jnp.max(order.evidence) <= -CLEAR)
+    rate = jnp.where(kept, -jnp.expm1(-periods / TRIAL), 0.0)
     settled = state.settled + rate * (trusted - state.settled)
     return {"nis": nis, "doubt": doubt, "burst": burst, "trusted": trusted, "settled": settled}
 

@@ -4,8 +4,7 @@ The filter state is z = [x, θ]: the state x of the system, because one-step pre
 all parameters of the physics and the disturbance.
 
 - A test of the innovations detects a change (`change_test`); an alarm resets the variance of what takes part in it.
-- θ follows a slow random walk. The process noise of the disturbance (of all parameters if there is none) grows while
-  the innovations are biased, for example in a gust.
+- θ follows a slow random walk, that of the disturbance (or, without one, of all) a faster one while they are biased.
 - Filters of a few parameters may compete with the filter of all (`multiple_model`).
 - Directions of θ that are not excited keep their value and variance (`excitation`).
 - An inconsistent estimate is replaced by the last good one (`consistency`).
@@ -65,8 +64,7 @@ class OnlineAdaptation(AbstractEstimator):
         disturbance: standard deviation of the constant part of ẋ at each disturbed state; 0 for none.
         indices: indices of the disturbed states, by default the field's or its state space's.
         process: standard deviation of the white process noise of each state [1/√s].
-        hypotheses: mutually exclusive changes of a few parameters, weighted by how well they explain the samples. The
-            model stays the given field until a change is detected.
+        hypotheses: exclusive changes of a few parameters, weighted by likelihood; until a change the model is `field`.
         tuning: settings of forgetting and change detection.
         names: names of the parameters, in the order of θ.
         scales: the prior standard deviation of each parameter, in the same order.
@@ -127,11 +125,9 @@ class OnlineAdaptation(AbstractEstimator):
                 raise ValueError(f"{name} must be one number, or {len(x)}, one for each state, got {len(values)}")
         if indices is not None:
             checks.places("indices", indices, len(x))
-        p, none = ravel_parameters(self.field)[0].size, jnp.zeros_like(x)
-        zero, theta = jnp.zeros((), x.dtype), jnp.zeros(p, x.dtype)
-        variances, mixture = self._variances(x), None
-        if self.hypotheses:
-            mixture = multiple_model.initial(self._models(), x, variances)
+        p, none, zero = ravel_parameters(self.field)[0].size, jnp.zeros_like(x), jnp.zeros((), x.dtype)
+        theta, variances = jnp.zeros(p, x.dtype), self._variances(x)
+        mixture = multiple_model.initial(self._models(), x, variances) if self.hypotheses else None
         return OnlineState(
             x=x,
             theta=theta,
@@ -260,9 +256,8 @@ class OnlineAdaptation(AbstractEstimator):
         return model_set(self.hypotheses, len(self.names), self.dt)
 
     def _filter_model(self, sample: Sample, each: Each) -> FilterModel:
-        x = sample.x
+        x, unit = sample.x, state_space(self.field, len(sample.x)).normalise
         added = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, x.dtype)), x.shape)
-        unit = state_space(self.field, len(x)).normalise
         return FilterModel(self._rates(sample.u), unit, self._variances(x), added, self.dt, self.tuning, each)
 
     def _rates(self, u) -> Field:
@@ -273,18 +268,17 @@ class OnlineAdaptation(AbstractEstimator):
         self, state: OnlineState, model: FilterModel, sample: Sample
     ) -> tuple[Belief, Excitation, Array, Correction]:
         """Update the filter of all parameters along excited directions; also return the Jacobian of the next x."""
-        d, tuning, ones = len(state.x), self.tuning, jnp.ones_like(state.theta)
+        d, tuning, ones, told = len(state.x), self.tuning, jnp.ones_like(state.theta), state.excitation
         walk, periods = tuning.drift * jnp.exp(state.haste), self.dt / tuning.pace
         diffusion = periods * sample.elapsed * jnp.square(walk)
         diffusion = diffusion + state.opened * jnp.maximum(1 - jnp.sum(jnp.square(state.root[d:]), axis=1), 0.0)
         varies, share = (jnp.asarray(np.where(self._varies(), *each), ones.dtype) for each in ((1, 0), (TAKEN, 1)))
         # A disturbance takes what is not estimated. Hypotheses compete by likelihood, for which all doubt counts.
         alone = tuning.excitation and self._varies().any() and not self.hypotheses
-        part = state.excitation.estimated(share) if alone else None
+        part = told.estimated(share) if alone else None
         belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted, part)
         predicted = kalman.reset_state(kalman.limit_covariance(belief, ones), sample, sample.restart, model.variances)
         belief, correction = kalman.correct(predicted, sample, model)
-        told = state.excitation
         if tuning.excitation:
             # Each alarm but the first in 10 s is like a step of a random walk by the prior: a gust that has just begun.
             begun = jnp.sqrt(jnp.maximum(state.doubt - 1, 0.0) / MEMORY)

@@ -3,8 +3,9 @@
 A disturbance that moves quickly explains a wrong order of the rotors, so innovations stay small; the right order
 explains the samples better still. For each pair a second filter, with the gains of the first, has its inputs exchanged.
 A sequential test compares their likelihoods (Wald, "Sequential analysis", 1947, ch. 3): it accepts the exchange at a
-logarithm of ACCEPT, and begins anew at −REFUSE. What one sample adds is limited (Huber, "A robust version of the
-probability ratio test", 1965), so that a short error of the model, for example as a gust begins, decides nothing.
+logarithm of ACCEPT, and at −REFUSE begins anew at −CLEAR. What one sample adds is limited (Huber, "A robust version of
+the probability ratio test", 1965), so that a short error of the model, for example as a gust begins, decides nothing.
+If two rotors are exchanged, the logarithm falls to −CLEAR with a probability of at most e⁻⁵ (Ville's inequality).
 """
 
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from hybrid_jax.online.kalman import Belief, Correction, Field, FilterModel
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import BOUND
 
-ACCEPT, REFUSE = 25.0, 10.0  # logarithms of likelihood ratios
+ACCEPT, REFUSE, CLEAR = 25.0, 10.0, 5.0  # logarithms of likelihood ratios
 FASTEST = 50.0  # by which they change at most [1/s], for a pace of 1: half a second decides
 
 
@@ -75,5 +76,5 @@ class RotorOrder(eqx.Module):
         away = jnp.concatenate([jnp.where(opens, 0.0, away[:, :d]), bounded], axis=1)
         evidence = self.evidence + jnp.clip(ratio, -most, most)
         goes_on = evidence > -REFUSE  # false if it is not a number
-        evidence = jnp.where(goes_on, jnp.minimum(evidence, 2 * ACCEPT), 0.0)
+        evidence = jnp.where(goes_on, jnp.minimum(evidence, 2 * ACCEPT), -CLEAR)
         return RotorOrder(jnp.where(goes_on[:, None], away, 0.0), evidence, self.orders)

@@ -105,12 +105,13 @@ class Flags(NamedTuple):
 def flags_of(state: OnlineState, tuning: Tuning) -> Flags:
     """Evaluate the flags of a state or of stacked states."""
     considered, test = state.excitation.considered(), state.test if state.mixture is None else state.mixture.test
+    moving = (state.burst >= BURST) & (state.mixture is None)
     return Flags(
         missing=state.history.unseen > 0,
         frozen=state.history.equal >= FROZEN,
         gap=state.history.silent > tuning.gap,
         changed=test.quiet < 1,
-        inconsistent=(state.nis >= REJECT) | (state.doubt >= ALARMS) | (state.burst >= BURST),
+        inconsistent=(state.nis >= REJECT) | (state.doubt >= ALARMS) | moving,
         exchanged=jnp.zeros((*state.nis.shape, 0), bool) if state.order is None else state.order.exchanged,
         unexcited=jnp.diagonal(considered, axis1=-2, axis2=-1) > TAKES_PART,
         at_bound=jnp.abs(state.trusted) >= BOUND,

@@ -2,11 +2,12 @@
 
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_online import watch
+from test_online import last, watch
 
 import hybrid_jax as hj
 from hybrid_jax.integrate import rk4_step
@@ -95,6 +96,17 @@ def test_a_cause_is_found_and_told_better_than_by_all_parameters(name):
     kind = found.mixture.previous + np.where(found.mixture.log_weights[:, 1:-1] == 0, 1.0, 0.0)
     assert (kind[:, place - 1] > 0).mean() >= 0.8
     assert errors(theta, cart(**after)) < 0.8 * errors(watched(False, cart(**after))[1], cart(**after))
+
+
+def test_alarms_that_follow_each_other_do_not_make_it_forget_a_cause():
+    """What was known before them is a hypothesis, too."""
+    samples, inputs = flown(cart(stiffness=1.6), jax.random.key(3))
+    found = last(watch(adaptation(), samples, inputs))
+    alarmed = eqx.tree_at(lambda state: state.burst, found, jnp.asarray(9.0))
+    state = eqx.filter_jit(adaptation().update)(alarmed, samples[-1] + 0.1 * NOISE, inputs[-1])
+    np.testing.assert_allclose(state.trusted, found.trusted, atol=0.1)
+    assert np.abs(found.trusted - found.settled).max() > 0.5
+    assert not adaptation().flags(state).inconsistent
 
 
 def test_what_is_outside_all_causes_is_found_no_worse_than_by_the_filter_of_all():
