@@ -131,7 +131,7 @@ def test_the_most_informative_flight():
 
 
 def test_adapting_in_flight():
-    page, rows = (ROOT / "docs/howto/online.md").read_text(), committed("online").where(agent="online")
+    page, rows = (DOCS / "notes/online.md").read_text(), committed("online").where(agent="online")
     low = rows.where(reference="low_pass").group("change")
     shares = [100 * np.mean([[*row["inside"].values()] for row in own]) for own in low.values()]
     assert f"{min(shares):.0f} to {max(shares):.0f} % of the intervals" in page
