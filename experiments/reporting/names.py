@@ -35,6 +35,8 @@ LABELS = {
     "gusty_wind": "gusty wind",
     "load_and_wind": "load and wind",
     "reaction_torque": "other reaction torque",
+    "motor_lag": "slower motors",
+    "battery": "weaker battery",
     "nothing": "no change",
     "moving": "usual flight",
     "near_ground": "near the ground",
