@@ -122,7 +122,7 @@ def damage(fresh: Any, flight: RecordedFlight) -> tuple[np.ndarray, Float[np.nda
 
 
 def changed(field: Any, log_efficiency) -> Any:
-    body: Any = corrected(field.body)
+    body: Any = corrected(field.body, ("efficiency", "added_drag"))
     return replace(field, body=replace(body, deviations=body.deviations | {"efficiency": jnp.asarray(log_efficiency)}))
 
 

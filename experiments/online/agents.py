@@ -74,7 +74,7 @@ HYPOTHESES = (
 def nominal() -> AbstractVectorField:
     """The Iris with drag and without ground effect; inertia, centre of mass, efficiencies and drag may change."""
     body = rigid_body(IRIS, LEARNED, Terms(drag=(DRAG_COEFFICIENT, DRAG_COEFFICIENT, DRAG_COEFFICIENT)))
-    return corrected(body)
+    return corrected(body, ("efficiency", "added_drag"))
 
 
 def true_theta(domain: Domain) -> Float[np.ndarray, " 12"]:

@@ -1,6 +1,6 @@
 """f_p: the Newton–Euler equations of a multirotor, by default with unknown Ix, Iy and k (paper, Eq. 10); baselines."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -186,12 +186,12 @@ def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: fl
     return RigidBody(dict(zip(LEARNED, factors, strict=True)), vehicle)
 
 
-def corrected(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with corrections of its rigid bodies, initially without effect, unless it has them already."""
+def corrected(field: AbstractVectorField, names: Iterable[str] = CORRECTIONS) -> AbstractVectorField:
+    """The field with corrections of its rigid bodies, initially without effect, unless it has any already."""
 
     def larger(body: RigidBody) -> RigidBody:
         dtype = jnp.result_type(*jax.tree.leaves(body) or [float])
-        zero = {name: jnp.zeros(shape_of(body.vehicle, name), dtype) for name in CORRECTIONS}
+        zero = {name: jnp.zeros(shape_of(body.vehicle, name), dtype) for name in names}
         return body if body.deviations.keys() & CORRECTIONS else replace(body, deviations=body.deviations | zero)
 
     return _with_bodies(field, larger)
