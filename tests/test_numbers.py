@@ -57,7 +57,7 @@ def test_seven_changes():
         name = names.get(domain, label(domain))
         assert shown[name] == [*errors, f"{rho.mean():.3g}, {rho.min():.3g}"], domain
     ratios = regret(committed("changes"))
-    assert (f"{np.mean(ratios <= 1.1):.0%}", f"{ratios.max():.2f}") == ("98%", "1.75")
+    assert (f"{np.mean(ratios <= 1.1):.0%}", f"{ratios.max():.2f}") == ("94%", "1.58")
 
 
 @pytest.mark.parametrize("change", PAPER)
