@@ -107,7 +107,15 @@ class Auto(Method):
     has_intervals: ClassVar[bool] = True
     uses_motion: ClassVar[bool] = True
 
-    def solve(self, field, train, validation, settings: Settings, learned_from=None, flights=None) -> Solution:
+    def solve(
+        self,
+        field,
+        train,
+        validation,
+        settings: Settings,
+        learned_from: Trajectories | None = None,
+        flights: Int[np.ndarray, " n"] | None = None,
+    ) -> Solution:
         """See `Method.solve`.
 
         Args:
