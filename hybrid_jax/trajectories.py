@@ -172,16 +172,16 @@ def windows_of(
     return Trajectories(x0=states[starts], u=inputs[inside], x=states[inside + 1], dt=dt)
 
 
-def concatenate(parts: Iterable[Trajectories]) -> Trajectories:
-    """Join windows in their order; ValueError if dt, horizon, or sizes of state or input differ.
+def concatenate(windows: Iterable[Trajectories]) -> Trajectories:
+    """Join windows in their order; ValueError if there are none, or dt, horizon, or sizes of state or input differ.
 
     Args:
-        parts: windows with the same dt, horizon, and sizes of state and input.
+        windows: parts with the same dt, horizon, and sizes of state and input.
     """
-    parts = checks.list_of("parts", parts, Trajectories)
+    parts = checks.list_of("windows", windows, Trajectories)
     if not parts or len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:
         sizes = [(part.dt, part.horizon, part.x.shape[-1], part.u.shape[-1]) for part in parts]
-        raise ValueError(f"parts must share dt and horizon, and sizes of state and input, got {sizes}")
+        raise ValueError(f"windows must share dt and horizon, and sizes of state and input, got {sizes}")
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
