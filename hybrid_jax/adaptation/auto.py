@@ -38,6 +38,7 @@ from hybrid_jax.adaptation.selection import (
     fit_each,
     left_out_thetas,
     posterior,
+    shares_outside,
     spread,
     surely_lower,
     unchanged,
@@ -132,8 +133,9 @@ class Auto(Method):
         options, effect, step = (sizes, solver, scale, self.max_steps), None, None
         still, network = np.zeros(sizes.shape, sizes.dtype), has_network(field)
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
-        learned_from = motion_of(field) if learned_from is None else learned_from
+        learned_from, shares = motion_of(field) if learned_from is None else learned_from, None
         if learned_from is not None:
+            shares = _shares(field, learned_from, train)
             distinct, learned_from = jnp.array(min(len(learned_from), len(train))), alike(learned_from, train)
             own = _fits(larger, still, learned_from, both, *options, distinct)[0]
             rival = None if physics is None else _fits(physics, still, learned_from, both, *options, distinct)[:2]
@@ -143,7 +145,7 @@ class Auto(Method):
         for _ in range(ROUNDS):
             if network:  # also if physics replaced the source: then it is the difference of two models
                 effect = network_effect(field, train, solver, scale, starts)
-            chosen, nothing, move, rows = _judge(larger, train, found, every, source, learned_from, effect, sizes)
+            chosen, nothing, move, rows = _judge(larger, found, every, source, learned_from, shares, effect, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
                 options = chosen.sizes, *options[1:]
                 (_, found, starts), fitted = _fits(larger, move, train, rows, *options), rows
@@ -156,6 +158,9 @@ class Auto(Method):
             step = _anchor(larger, train, starts, found, solver, scale)
         outcome = found, chosen, left_out, source, nothing, effect, step, units
         return _conclude(self, field, larger, train, outcome, (sizes, solver))
+
+
+_shares = jit_by_size(UNOPTIMISED)(shares_outside)
 
 
 class OfSource(NamedTuple):
@@ -198,12 +203,12 @@ def _replace(method: Auto, larger, own: Fit, rival: tuple[Fit, Fit] | None, dist
 
 @jit_by_size(UNOPTIMISED)
 def _judge(
-    larger, train: Trajectories, around: Fit, every: Fit, source: OfSource | None, learned_from, effect, sizes
+    larger, around: Fit, every: Fit, source: OfSource | None, learned_from, shares, effect, sizes
 ) -> tuple[Posterior, Unchanged, Float[Array, " p"], Bool[Array, "2 p"]]:
     start = ravel_parameters(larger)[0]
     free, nothing = np.stack([*free_parameters(larger).values()]), Unchanged(jnp.zeros_like(start), jnp.zeros(()))
     if source is not None:
-        nothing = unchanged(source.own, around, effect.total if effect else 0.0, larger, learned_from, train)
+        nothing = unchanged(source.own, around, effect.total if effect else 0.0, learned_from, shares)
     found = posterior(around, every, start, free, sizes, nothing.apparent)
     rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
     return found, nothing, without_others(every, rows[1], start).astype(sizes.dtype), rows

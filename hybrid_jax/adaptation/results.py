@@ -17,6 +17,8 @@ from hybrid_jax.trajectories import WARN
 
 NETWORK = "network"  # the candidate that changes the network
 SHOWN = 0.01  # less probable candidates are not reported
+NOT_CONFIRMED = "errors in windows that were left out of the fit do not confirm it"
+AS_LARGE = "the source's own errors may be as large without any change"
 
 
 @dataclass(frozen=True)
@@ -134,8 +136,10 @@ class Adaptation:
                 yield f"Probability that the network changed, rather than the most probable of these: {rather:.2g}."
         if self.alone:
             yield "Physics without the network predicts the source's own motion better and replaces the source."
-        if self.refused:
-            yield f"Rejected: {', '.join(self.refused)}: the source's own errors may be as large without any change."
+        likely = [name for name in self.refused if self.candidates[name] > self.candidates.get(self.chosen or "", 1.0)]
+        for names, reason in ((likely, NOT_CONFIRMED), ([n for n in self.refused if n not in likely], AS_LARGE)):
+            if names:
+                yield f"Rejected: {', '.join(names)}: {reason}."
         if self.expected:
             yield "RMSE to expect on a new recording (80% intervals, from blocks of windows that were left out):"
             yield from lines_of(self.expected, self.units)

@@ -30,6 +30,7 @@ FEW = 10  # windows, of which no order is seen
 SHIFTS = 20  # other windows that each is compared with
 SURELY = 2.0  # standard errors by which one model must predict better to replace another
 ENOUGH = 5  # blocks, to know a standard error
+MOST = 1.0  # gain of a block, a logarithm: more would only add to the standard error
 ALIKE = 2  # so many blocks of one flight count as one: neighbours are alike, and another flight differs more
 STRONG = 20.0  # odds against no change from which one is believed (Kass and Raftery 1995)
 TINY = float(np.finfo(np.float32).tiny)
@@ -94,13 +95,13 @@ class Unchanged(NamedTuple):
     error: Float[Array, ""]
 
 
-def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, field, learned_from, windows) -> Unchanged:
+def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, learned_from, shares) -> Unchanged:
     """Estimate apparent changes beyond noise from the source's own motion (DerSimonian and Laird 1986).
 
-    Where windows are unlike that motion, the network's error is assumed to be as large as its effect.
+    Where windows are unlike that motion, by `shares_outside`, the network's error is assumed as large as its effect.
     """
-    outside, missed = shares_outside(field, learned_from, windows)
-    places = jnp.maximum(1.0, (1 - missed) * len(windows))
+    outside, missed = shares
+    places = jnp.maximum(1.0, (1 - missed) * len(found.equations.score))
     known, information = (jnp.diagonal(each.equations.gram, axis1=1, axis2=2) for each in (own, found))
     beyond = jnp.sum(jnp.square(own.equations.score) - own.noise * known, axis=0)
     apparent = jnp.maximum(beyond, 0.0) / jnp.maximum(jnp.sum(jnp.square(known), axis=0), TINY)
@@ -186,8 +187,8 @@ def dispersion(found: Fit, sizes) -> Float[Array, ""]:
 def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Trajectories) -> Float[Array, "2"]:
     """Return the largest share of samples outside the other windows' 1 to 99 % range, over quantities of the state.
 
-    The first is of `asked` outside `known`; both are as many windows. Inputs do not count: a vehicle that has changed,
-    for example by a load, needs other ones for the same motion. It compiles.
+    The first is of `asked` outside `known`: all that is known, since a few windows have a narrower range. Inputs do not
+    count: a vehicle that has changed, for example by a load, needs other ones for the same motion. It compiles.
     """
     space, t = state_space(field, known.x0.shape[-1]), min(known.horizon, asked.horizon)
 
@@ -195,9 +196,12 @@ def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Traje
         x: Any = jnp.asarray(windows.x)[:, :t].reshape(-1, windows.x.shape[-1])
         return jnp.stack([*space.features(x, 0 * x[:, :1]).values()])
 
-    both = jnp.stack([features(known), features(asked)])
-    low, high = jnp.nanquantile(both, jnp.asarray(RANGE), axis=2, keepdims=True)
-    return jnp.max(jnp.mean((both[::-1] < low) | (both[::-1] > high), axis=2), axis=1)
+    def share(inside: Array, other: Array) -> Float[Array, ""]:
+        low, high = jnp.nanquantile(inside, jnp.asarray(RANGE), axis=1, keepdims=True)
+        return jnp.max(jnp.mean((other < low) | (other > high), axis=1))
+
+    of_known, of_asked = features(known), features(asked)
+    return jnp.stack([share(of_known, of_asked), share(of_asked, of_known)])
 
 
 def blocks_of(
@@ -245,13 +249,14 @@ def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) ->
     """Whether a change lowers the logarithm of the error of blocks left out by more than `SURELY` standard errors.
 
     `ALIKE` neighbouring blocks count as one. Evidence assumes independent errors; where physics lacks something they
-    are not. The logarithm is the likelihood of a block of unknown variance, in which no block outweighs the others. See
+    are not. The logarithm is the likelihood of a block of unknown variance, in which no block outweighs the others. It
+    counts as at most `MOST`: a change that a few blocks show clearly, and the others a little, is no less sure. See
     `left_out_thetas`.
     """
     after = jax.vmap(lambda theta, place: found.at(theta).square[place])(thetas, blocks[0])
     before, after = (jnp.sum(square * blocks[1], axis=1) for square in (still.equations.square[blocks[0]], after))
     least = jnp.maximum(jnp.finfo(before.dtype).eps * before, TINY)
-    gain = jnp.log(jnp.maximum(before, least) / jnp.maximum(after, least))
+    gain = jnp.minimum(jnp.log(jnp.maximum(before, least) / jnp.maximum(after, least)), MOST)
     enough = jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) * (ALIKE / len(gain)) ** 0.5
     return enough if len(gain) >= ENOUGH else jnp.array(True)
 

@@ -103,6 +103,17 @@ def test_left_out_blocks_confirm_a_change_of_all_and_not_of_two():
     assert [confirmed(each) for each in (np.linspace(0.5, 1.5, 10), np.repeat([3.0, 0.0], [2, 8]))] == [True, False]
 
 
+@pytest.mark.parametrize(("least", "sure"), [(0.1, True), (-0.5, False)])
+def test_large_gains_of_some_blocks_do_not_hide_the_small_ones_of_others(least, sure):
+    gains, blocks = np.repeat([4.0, 1.0, least], [2, 3, 5]), blocks_of(10, 10)
+    still = NormalEquations(jnp.ones((10, 1, 1)), jnp.zeros((10, 1)), jnp.ones(10))
+    before, after = (
+        Fit(jnp.zeros(1), still._replace(square=jnp.exp(-own)), jnp.ones((1, 1, 1)), 0.01, jnp.array([True]), 1, 0)
+        for own in (0 * gains, gains)
+    )
+    assert selection.surely_lower(after, before, jnp.zeros((10, 1)), blocks) == sure
+
+
 @pytest.mark.parametrize("chosen", ["source", "theta", "disturbance"])
 def test_windows_choose_what_changed(chosen):
     physics = pendulum(0.7 if chosen == "source" else LENGTH)
