@@ -24,6 +24,7 @@ from hybrid_jax.state_space import StateSpace
 APPROACH = (1.0, 0.1, 0.01)  # what a segment's end may be off, over the size of a state, in turn
 MOST = 3000  # unknowns
 CLUSTERS = 20  # of a simulation's errors, each taken as one observation
+GAP = 5.0  # intervals between samples, which is a gap
 TINY, SMALL = 1e-12, 1e-3
 
 
@@ -195,8 +196,12 @@ def check_rates(model: Model, records: Sequence[Record]) -> None:
         for record in records if same else ():
             moved, measured = record.signals[name], record.signals[rate]
             inside = (moved.t >= measured.t[0]) & (moved.t <= measured.t[-1])
-            both = moved.values[inside], integral(measured, moved.t[inside], "linear")
-            a, b = ((each - each.sum(axis=0) / max(inside.sum(), 1)).reshape(-1, 1) for each in both)
+            t, steps = moved.t[inside], np.diff(measured.t)
+            # What changed while the rate was not measured is unknown.
+            seen = steps[np.searchsorted(measured.t, t[1:]) - 1] < GAP * np.sum(steps) / len(measured.t)
+            both = moved.values[inside], integral(measured, t, "linear")
+            both = (np.cumsum(np.diff(each, axis=0) * seen[:, None], axis=0) for each in both)
+            a, b = ((each - each.sum(axis=0) / max(len(each), 1)).reshape(-1, 1) for each in both)
             if gain := float(foreign_units(a, b)[0, 0]):
                 raise ValueError(f"{record.name}: {rate} is {gain:.3g} times the rate of {name}: check their units")
 

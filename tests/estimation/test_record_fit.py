@@ -247,12 +247,12 @@ def test_inputs_that_nobody_knows_between_past_and_future_are_not_held():
 def test_a_rate_in_another_unit_than_its_angle_is_said(factor):
     outputs = {"angle": angle, "rate": lambda x, u: x[1]}
     model = StateSpaceModel(pendulum(), ("torque",), outputs, (1.0, 0.0), (0.1, 0.1))
-    t = np.arange(0.0, 4.0, 0.05)
+    t = np.delete(np.arange(0.0, 4.0, 0.05), np.s_[20:55])
     y = simulate(model, Record.of("r", torque=(t, 0 * t), angle=(t, t), rate=(t, t)), dt=0.05)[0]
     noisy = y["angle"] + 0.02 * np.random.default_rng(0).normal(size=y["angle"].shape)
     right, wrong = (Record.of("r", torque=(t, 0 * t), angle=(t, noisy), rate=(t, f * y["rate"])) for f in (1, factor))
     check_rates(model, [right])
-    with pytest.raises(ValueError, match=r"r: rate is (56|0\.0009).* times the rate of angle: check their units"):
+    with pytest.raises(ValueError, match=r"r: rate is (5[67]|0\.0009).* times the rate of angle: check their units"):
         fit_records(model, [wrong], dt=0.05)
 
 
