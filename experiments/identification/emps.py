@@ -83,7 +83,7 @@ BENCHMARK = Benchmark(
         "direction, drift, and a force that lags": lambda: candidate(True, True, True),
         "and a guide that is not uniform": lambda: candidate(True, True, True, True),
     },
-    options={"dt": 0.01, "substeps": 8, "between": "linear", "rounds": 1, "max_steps": 200, "noise": {"q": 3e-3}},
+    options={"dt": 0.01, "substeps": 16, "between": "linear", "rounds": 1, "max_steps": 200, "noise": {"q": 3e-3}},
     # At rest and cold; the force has acted for longer than its lag.
     start=lambda u, q, model: (q, 0.0, 0.0, u)[: len(model.start)],
     parts=3,

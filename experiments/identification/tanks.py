@@ -94,7 +94,7 @@ BENCHMARK = Benchmark(
         "the sensor has play": lambda: candidate("log_play"),
         "play, walls that are not straight": lambda: candidate("log_play", "shape"),
     },
-    options={"dt": 4.0, "substeps": 3, "rounds": 1, "max_steps": 200, "starts": 3, "noise": {"y": 0.2}},
+    options={"dt": 4.0, "substeps": 6, "rounds": 1, "max_steps": 200, "starts": 3, "noise": {"y": 0.2}},
     # The hidden states at the start are the same in both records.
     start=lambda u, y, model: (model.start[0], y + sum(model.start[2:]), *model.start[2:]),
 )
