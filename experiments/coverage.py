@@ -215,7 +215,8 @@ def coverage_figure(rows: Results) -> Figure:
         axes.set(title="without noise" if noise == "none" else "with sensor noise", xlim=(60, 100.5))
         axes.set_xlabel("intervals that contain\nthe true value [%]")
         name_lines(axes, [*map(names.label, changes)])
-    return legend_below(figure, "Do 95 % intervals contain the true value?")
+    meaning = "Ix, Iy: moments of inertia; k: thrust coefficient"
+    return legend_below(figure, "Do 95 % intervals contain the true value?", meaning)
 
 
 def conclusion(rows: Results) -> list[str]:

@@ -14,7 +14,7 @@ from experiments.reporting.plots import DRAWABLE, STYLE, WIDTH, colour, legend_b
 from hybrid_jax.vehicle import POSITION
 
 MIN_HALF_WIDTH = 0.2  # m, of a view: a hovering vehicle is not magnified beyond it
-VIEW_RATIO = 1.3  # width of a view over the extent of the truth
+VIEW_RATIO = 1.7  # width of a view over the extent of the truth
 SMALLEST = 1e-6  # m, of an error on a log axis
 DECADES = 4  # of errors that are shown
 MOST = 100.0  # m: no error beyond it is shown
@@ -61,7 +61,7 @@ def predictions(paths: Mapping[str, Any], title: str) -> Figure:
     assert first is not None
     top = min(first.get_ylim()[1], MOST)
     first.set_ylim(top / 10.0**DECADES, top)
-    meaning = "from above ●: end, ×: where a prediction leaves the view; errors: median and 10 to 90 % of flights"
+    meaning = "seen from above, ●: end, ×: where a prediction leaves the view; errors: median and 10 to 90 % of flights"
     return legend_below(figure, f"{title}: predictions of {paths['flights']} test flights", meaning, columns=4)
 
 
