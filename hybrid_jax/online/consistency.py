@@ -2,8 +2,8 @@
 
 A large mean of the normalised innovations squared (NIS) means that no θ explains the samples (Bar-Shalom, Li,
 Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4). Persistent alarms, or a
-parameter at its bound, indicate a sensor with a wrong sign, unit or position: the estimate returns to its value before
-the alarms, as with exchanged rotors (`rotor_order`). A filter with a number that is not finite restarts.
+parameter at its bound, indicate a sensor with a wrong sign, unit or position. The estimate then returns to its value
+before the alarms, as with exchanged rotors (`rotor_order`). A filter with a number that is not finite restarts.
 """
 
 import equinox as eqx
@@ -20,7 +20,7 @@ from hybrid_jax.online.tuning import ALARMS, BOUND, BURST, REJECT, TRIAL, WINDOW
 
 NEAR = 0.95  # share of its bound from which a parameter counts as at it
 PERSISTENT = 5.0  # alarms as which a parameter at its bound, or an unlikely error, counts in a second
-UNLIKELY = 0.5  # share of REJECT from which errors count as alarms, if they last
+UNLIKELY = 0.5  # share of REJECT from which errors count as alarms, and as a burst after half a second
 SETTLED = 0.5  # count of alarms below which an estimate is kept
 
 
@@ -31,19 +31,19 @@ def believed(
     share = jnp.sum(verdict.squares) / jnp.maximum(jnp.sum(jnp.where(sample.seen, 1.0, 0.0)), 1.0)
     nis = state.nis + jnp.where(sample.measured, -jnp.expm1(-periods / WINDOW), 0.0) * (share - state.nis)
     at_bound = sample.measured & (jnp.max(jnp.abs(verdict.theta)) >= NEAR * BOUND)
-    wrong = at_bound | (nis > UNLIKELY * REJECT)
-    added = jnp.where(verdict.changed, 1.0, 0.0) + jnp.where(wrong, PERSISTENT * periods, 0.0)
+    alarm, unlikely = jnp.where(verdict.changed, 1.0, 0.0), nis > UNLIKELY * REJECT
+    added = alarm + jnp.where(at_bound | unlikely, PERSISTENT * periods, 0.0)
     counted = state.doubt * jnp.exp(-periods * sample.elapsed / TRIAL) + added
     # Once it is too large it is doubled, and so takes time to fall.
     begins = (counted >= ALARMS) & (state.doubt < ALARMS)
     if order is not None:
         begins = begins | (jnp.max(order.evidence) >= ACCEPT)
     doubt = jnp.where(begins, 2 * ALARMS, jnp.minimum(counted, 2 * ALARMS))
-    trusted = jnp.where(nis < REJECT, verdict.theta, state.trusted)
-    burst = state.burst * jnp.exp(-periods * sample.elapsed) + jnp.where(verdict.changed, 1.0, 0.0)
     # Hypotheses weigh what they knew before an alarm against what they have learned since; one filter cannot.
-    still = (doubt < ALARMS) & ((burst < BURST) if state.mixture is None else True)
-    trusted = jnp.where(still, trusted, state.settled)
+    moves = jnp.where(unlikely, PERSISTENT * periods, 0.0) + (alarm if state.mixture is None else 0.0)
+    burst = state.burst * jnp.exp(-periods * sample.elapsed) + moves
+    good = (nis < REJECT) & (doubt < ALARMS) & (burst < BURST)
+    trusted = jnp.where(good, verdict.theta, state.settled)
     # A mean, as the last value may be that of a gust, or of a fault before its first alarm.
     kept = doubt < SETTLED
     if order is not None:

@@ -36,9 +36,9 @@ class OnlineState(eqx.Module):
         test: the change test of the filter of all parameters.
         mixture: the filters of the hypotheses and their weights; None without hypotheses.
         trusted: the last consistent θ, which the model uses.
-        settled: their mean over the last 10 s without alarms, restored if alarms persist.
+        settled: their mean over the last 10 s without alarms, restored if alarms or unlikely errors persist.
         doubt: number of alarms in the last 10 s.
-        burst: number of alarms in the last second.
+        burst: number of alarms in the last second (of the filter of all parameters alone), and of unlikely errors.
         opened: 1 for each parameter whose variance rises to its prior before the next sample, after an alarm; else 0.
         haste: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.
         nis: mean normalised innovation squared, 1 if noise and model are correct.
@@ -86,7 +86,7 @@ class Flags(NamedTuple):
         gap: whether nothing was measured for longer than `Tuning.gap`.
         changed: whether there was an alarm in the last second.
         inconsistent: whether errors are too large for the model at any θ, or alarms persist, for example because a
-            sensor has a wrong sign, unit or position, or rotors are exchanged. The last good estimate is then used.
+            sensor has a wrong sign, unit or position, or rotors are exchanged. The estimate from before is then used.
         exchanged: which rotors seem to be exchanged with another in the input; empty without rotors.
         unexcited: which parameters recent samples do not excite, alone or in combination with others.
         at_bound: which parameters are at the end of their range.
@@ -105,13 +105,12 @@ class Flags(NamedTuple):
 def flags_of(state: OnlineState, tuning: Tuning) -> Flags:
     """Evaluate the flags of a state or of stacked states."""
     considered, test = state.excitation.considered(), state.test if state.mixture is None else state.mixture.test
-    moving = (state.burst >= BURST) & (state.mixture is None)
     return Flags(
         missing=state.history.unseen > 0,
         frozen=state.history.equal >= FROZEN,
         gap=state.history.silent > tuning.gap,
         changed=test.quiet < 1,
-        inconsistent=(state.nis >= REJECT) | (state.doubt >= ALARMS) | moving,
+        inconsistent=(state.nis >= REJECT) | (state.doubt >= ALARMS) | (state.burst >= BURST),
         exchanged=jnp.zeros((*state.nis.shape, 0), bool) if state.order is None else state.order.exchanged,
         unexcited=jnp.diagonal(considered, axis1=-2, axis2=-1) > TAKES_PART,
         at_bound=jnp.abs(state.trusted) >= BOUND,

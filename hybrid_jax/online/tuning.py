@@ -9,7 +9,7 @@ from hybrid_jax import checks
 SPANS = (0.05, 0.5)  # of the two sums of the change test
 PAUSE, SETTLE, HOLD = 0.1, 0.3, 0.6  # least time from an alarm to the next, of a mixture, and to an unexplained one
 WINDOW, TRIAL, MEMORY = 0.2, 10.0, 2.0  # time constants of the mean NIS, the count of alarms, and the information
-BURST = 2.0  # alarms in a second (weighted by e⁻ᵗ) from which an estimate is not used: they mean that it is moving
+BURST = 2.0  # alarms in a second (weighted by e⁻ᵗ) from which an estimate is not used: it is moving
 REJECT = 6.0  # mean normalised innovation squared (NIS) from which an estimate is not used
 ALARMS = 10.0  # alarms in 10 s from which it is not, until their count has halved from twice as many
 FROZEN = 3  # equal samples in a row that mark a sensor as frozen
