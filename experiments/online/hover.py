@@ -20,14 +20,16 @@ from hybrid_jax.online import Hypothesis, OnlineAdaptation
 from hybrid_jax.runtime import FASTEST_COMPILE, configure, jit_with
 from hybrid_jax.sim import SOURCE, pilot
 from hybrid_jax.sim.forces import Wrench, parameters_of
-from hybrid_jax.vehicle import BODY_RATES, IRIS, VELOCITY, State
+from hybrid_jax.vehicle import BODY_RATES, IRIS, POSITION, VELOCITY, State
 
-HOME, BLOCK = np.array([0.0, 0.0, 2.0], np.float32), 10  # m; periods of a prediction
-MEMORY = 1.0  # s, of a gust
+HOVER, PATH, BLOCK = control.hover((0.0, 0.0, 2.0)), control.figure_eight(2.0, 1.5, 2.0), 10  # periods of a prediction
 CHANGE = np.array([0.0, -8 / 3, 0.0])  # m/s²: the side wind at the end
-AFTER = 30  # blocks after it
+MEMORY, AFTER = 1.0, 30  # s, of a gust; blocks after the change
 RIGHT = np.arange(4)[None]  # the order of rotors in what the filter is given
+SOUND = RIGHT, np.ones((1, 3))  # with a factor of each rate
 EXCHANGED = np.array([order for order in permutations(range(4)) if sum(np.array(order) != range(4)) == 2])
+SENSORS = np.concatenate([1 - 2 * np.eye(3), np.full((1, 3), np.degrees(1))])  # wrong signs, and degrees
+FAULTS = np.concatenate([np.tile(RIGHT, (4, 1)), EXCHANGED, RIGHT]), np.concatenate([SENSORS, np.ones((7, 3))])
 PRIOR = {"Ix": 0.3, "Iy": 0.3, "k": 0.2}
 DISTURBANCE, PROCESS = (3.0,) * 3 + (5.0,) * 3, (0.0,) * 7 + (0.003,) * 3 + (0.005,) * 3
 PUSHES = tuple(f"disturbance[v{axis}]" for axis in "xyz")
@@ -38,18 +40,18 @@ HYPOTHESES = (
 )
 
 
-def _iris(integral, x: State, seen: State, push: Float[Array, "3"]):
-    course = pilot.Course(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(()), jnp.zeros(4))
+def _iris(integral, x: State, seen: State, push: Float[Array, "3"], goal: tuple[Array, Array]):
+    course = pilot.Course(*goal, jnp.zeros(()), jnp.zeros(4))
     integral, u = pilot.act(integral, seen, course, parameters_of(IRIS), IRIS, pilot.scale_of(IRIS))
     truth = SOURCE.quadrotor()
     moved = type(truth)(truth.parameters, (lambda x, u, t, p: Wrench(p.mass * push, jnp.zeros(3)),))
     return integral, moved.step(x, u, jnp.zeros(()), DT), u
 
 
-def _hummingbird(speeds, x: State, seen: State, push: Float[Array, "3"]):
+def _hummingbird(speeds, x: State, seen: State, push: Float[Array, "3"], goal: tuple[Array, Array]):
     """Simulate a period of RotorPy, in a wind with about the same effect."""
-    still = Reference(jnp.asarray(HOME), jnp.zeros(3), jnp.zeros(3), jnp.zeros(()), jnp.zeros(()))
-    command = jnp.clip(decide(HUMMINGBIRD, seen, still), 0.0, HUMMINGBIRD.fastest)
+    aim = Reference(*goal, jnp.zeros(3), jnp.zeros(()), jnp.zeros(()))
+    command = jnp.clip(decide(HUMMINGBIRD, seen, aim), 0.0, HUMMINGBIRD.fastest)
     (x, speeds), mean = advance(HUMMINGBIRD._replace(wind=1.5 * push), x, speeds, command, jnp.zeros(()))
     return speeds, x, mean
 
@@ -95,9 +97,9 @@ def adaptation_of(world: str, noise: float, named: bool = False) -> OnlineAdapta
 
 @jit_with(FASTEST_COMPILE)
 def hover(
-    adaptation: OnlineAdaptation, world: str, noise: float, blocks: int, gusts: Float[Array, " n"], keys, orders=RIGHT
+    adaptation: OnlineAdaptation, world: str, noise: float, blocks: int, gusts, keys, faults=SOUND, path=HOVER
 ) -> Hovered:
-    """Hover for some blocks and AFTER more in a side wind, for each rms of gusts [m/s²], key and order of rotors."""
+    """Fly for some blocks and AFTER more in a side wind, for each rms of gusts [m/s²], key and fault."""
     (step, _, start), device, kept = WORLDS[world], hardware(noise, 0, 0), np.exp(-DT / MEMORY)
     first, sizes = with_disturbance(adaptation.field), np.square(device.sizes())
 
@@ -106,29 +108,40 @@ def hover(
         squares = jnp.square(after - expected) + sizes
         return jnp.stack([jnp.sum(squares[VELOCITY]), jnp.sum(squares[BODY_RATES])])
 
-    def flight(gust, key, order):
+    def goal(t):
+        return jax.jvp(lambda t: path(t)[0], (t,), (jnp.ones(()),))
+
+    def flight(gust, key, fault):
         def period(now, given):
-            (own, x, seen, push, state), (key, steady) = now, given
+            (own, x, seen, push, state), (key, steady, t) = now, given
             one, two = jax.random.split(key)
             push = kept * push + gust * np.sqrt(1 - kept**2) * jax.random.normal(one, (3,))
-            own, x, u = step(own, x, seen, push + steady * CHANGE)
+            own, x, u = step(own, x, seen, push + steady * CHANGE, goal(t))
             seen = device.measure(x, two)
-            return (own, x, seen, push, adaptation.update(state, seen, u[order])), u
+            return (
+                own,
+                x,
+                seen,
+                push,
+                adaptation.update(state, seen.at[BODY_RATES].multiply(fault[1]), u[fault[0]]),
+            ), u
 
         def block(now, given):
-            after, inputs = jax.lax.scan(period, now, (jax.random.split(given[0], BLOCK), jnp.full(BLOCK, given[1])))
+            key, steady, times = given
+            after, inputs = jax.lax.scan(period, now, (jax.random.split(key, BLOCK), jnp.full(BLOCK, steady), times))
             models, state = (adaptation.model(now[4]), first), after[4]
             errors = jnp.stack([error(model, now[1], after[1], inputs) for model in models])
             (theta, covariance), flags = adaptation.estimate(state), adaptation.flags(state)
             deviation = jnp.sqrt(jnp.diagonal(covariance))
             return after, Hovered(errors, theta, deviation, flags.inconsistent, flags.exchanged, state.changes)
 
-        x = jnp.zeros(13).at[2].set(HOME[2]).at[3].set(1.0)
+        (place, speed), times = goal(jnp.zeros(())), DT * jnp.arange((blocks + AFTER) * BLOCK).reshape(-1, BLOCK)
+        x = jnp.zeros(13).at[POSITION].set(place).at[3].set(1.0).at[VELOCITY].set(speed)
         now = start, x, x, jnp.zeros(3), adaptation.begin(x)
         steady = jnp.where(jnp.arange(blocks + AFTER) < blocks, 0.0, 1.0)
-        return jax.lax.scan(block, now, (jax.random.split(key, blocks + AFTER), steady))[1]
+        return jax.lax.scan(block, now, (jax.random.split(key, blocks + AFTER), steady, times))[1]
 
-    return jax.vmap(flight)(gusts, keys, jnp.broadcast_to(orders, (len(keys), 4)))
+    return jax.vmap(flight)(gusts, keys, [jnp.broadcast_to(each, (len(keys), each.shape[1])) for each in faults])
 
 
 @dataclass(frozen=True)
@@ -146,8 +159,9 @@ def run(options: Options) -> None:
     print("filter, noise, world, gusts | error of v, ω over the first model's | v from 1 s after a wind |")
     print("its error is halved after [s] | alarm after [s] | largest change of Ix, Iy, k [%] |")
     print("their intervals contain the truth [%] | inconsistent [%]")
-    for named, noise, world in product((False, True), (0.1, 1.0), WORLDS):
-        both = Hovered(*map(np.asarray, hover(adaptation_of(world, noise, named), world, noise, blocks, gusts, keys)))
+    for name, noise, world in product(("all", "hypotheses"), (0.1, 1.0), WORLDS):
+        adaptation = adaptation_of(world, noise, name != "all")
+        both = Hovered(*map(np.asarray, hover(adaptation, world, noise, blocks, gusts, keys)))
         for i, gust in enumerate(gusts.tolist()):
             own = Hovered(*(leaf[i] for leaf in both))
             (v, omega), late = own.ratios(10, blocks), own.ratios(blocks + 10, blocks + AFTER)[0]
@@ -155,18 +169,20 @@ def run(options: Options) -> None:
             alarm = f"{DT * BLOCK * (alarms[0] + 1):.1f}" if len(alarms) else "-"
             parts = " ".join(f"{100 * part:.1f}" for part in np.abs(own.theta[:blocks, :3]).max(axis=0))
             inside = 100 * (np.abs(own.theta) < 1.96 * own.deviation)[10:blocks, :3].mean()
-            name = "hypotheses" if named else "all"
             print(
                 f"{name}, {noise:g}, {world}, {gust:g} | {v:.2f} {omega:.2f} | {late:.2f} | {own.found(blocks):.1f} | "
-                f"{alarm} | {parts} | {inside:.0f} | {100 * own.inconsistent[:blocks].mean():.0f}",
-                flush=True,
+                f"{alarm} | {parts} | {inside:.0f} | {100 * own.inconsistent[:blocks].mean():.0f}"
             )
-    given = jnp.zeros(12), jax.random.split(jax.random.key(8), 12), np.concatenate([np.tile(RIGHT, (6, 1)), EXCHANGED])
-    print("noise, world | exchanged rotors seen in how many of 6 flights with none | time to name two that are [s]")
-    for noise, world in product((0.1, 1.0), WORLDS):
-        seen = np.asarray(hover(adaptation_of(world, noise), world, noise, 300, *given).exchanged)
-        named = _first((seen[6:] == (EXCHANGED != RIGHT)[:, None]).all(axis=-1))
-        print(f"{noise:g}, {world} | {seen[:6].any(axis=(1, 2)).sum()} | {' '.join(map('{:.1f}'.format, named))}")
+    given = jnp.zeros(11), jax.random.split(jax.random.key(77), 11), FAULTS, PATH
+    print("filter, noise, world | on a path of 3 m a wrong sign of each rate, degrees, exchanged rotors and no fault")
+    print("end the adaptation for good after [s] | largest error of v, ω over the first model's from then on")
+    for name, noise, world in product(("all", "hypotheses"), (0.1, 1.0), WORLDS):
+        found = Hovered(*map(np.asarray, hover(adaptation_of(world, noise, name != "all"), world, noise, 150, *given)))
+        stopped = (found.inconsistent | found.exchanged.any(axis=-1))[:, :150]
+        ends = _first(np.logical_and.accumulate(stopped[:, ::-1], axis=1)[:, ::-1])
+        late = [found.ratios(round(10 * end), 150)[i] for i, end in enumerate(ends) if end < 15]
+        times, (v, omega) = " ".join(map("{:.1f}".format, ends)), np.max(late, axis=0)
+        print(f"{name}, {noise:g}, {world} | {times} | {v:.2f} {omega:.2f}", flush=True)
 
 
 main = partial(command.call, "online.hover", Options, run)

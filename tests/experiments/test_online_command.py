@@ -84,7 +84,7 @@ def test_each_claim_fails_where_it_should(change, times, fails):
 def test_exchanged_rotors_are_named_and_end_the_adaptation_and_others_are_not():
     """Each pair of the Iris' rotors in two seconds of hover; the right order in a wind, too."""
     orders, keys = np.concatenate([RIGHT, EXCHANGED]), jax.random.split(jax.random.key(0), 7)
-    found = hover(adaptation_of("iris", 1.0), "iris", 1.0, 20, jnp.zeros(7), keys, orders)
+    found = hover(adaptation_of("iris", 1.0), "iris", 1.0, 20, jnp.zeros(7), keys, (orders, np.ones((7, 3))))
     np.testing.assert_array_equal(found.exchanged[1:, 19], EXCHANGED != RIGHT)
     assert found.inconsistent[1:, 19].all()
     assert not found.theta[1:, 19].any()  # the first model, since they were exchanged from the beginning
