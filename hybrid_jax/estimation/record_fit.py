@@ -96,8 +96,8 @@ def fit_records(
 ) -> RecordFit:
     """Fit the learned numbers of a model and the initial states to all measured outputs.
 
-    You get a warning if half the solver's step would give other numbers (`RecordFit.discretisation`), and of what no
-    sample determines (`RecordFit.directions`).
+    You get a warning if the fit did not converge, if half the solver's step gives other numbers (`discretisation`), and
+    of what no sample determines (`directions`).
 
     Args:
         model: the initial model.
@@ -167,6 +167,8 @@ def fit_records(
                 search = search.weighted(errors, robust)
         found = _result(search, end._replace(steps=total), records, gridded, errors, robust, level)
     warn_of_steps(found.discretisation, f"a smaller dt, or substeps={2 * substeps}")
+    if found.status != Status.OK:
+        warnings.warn(f"records: the fit {found.status.message}; check all units and the model", stacklevel=3)
     if found.directions:
         warnings.warn(f"records: no sample determines {'; '.join(found.directions)}", stacklevel=3)
     return found

@@ -83,6 +83,11 @@ def test_steps_that_are_too_long_are_said(records, fitted):
     assert coarse.discretisation > 1
 
 
+def test_a_fit_that_does_not_converge_is_said(records):
+    with pytest.warns(UserWarning, match=r"records: the fit stopped at the limit of steps; check all units"):
+        assert fit_records(model_of(pendulum()), records, dt=0.02, max_steps=1).status.name == "CAPPED"
+
+
 def test_multiple_shooting_ends_where_the_simulation_does_from_a_worse_start(records, fitted):
     shot = fit_records(model_of(pendulum(2.0, 1.0)), records, dt=0.02, segment=0.5)
     for name, interval in shot.intervals.items():
