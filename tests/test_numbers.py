@@ -49,13 +49,20 @@ def lines(page):
 
 
 def test_seven_changes():
-    shown = lines("docs/results/index.md")
+    shown, readme, removed, found = lines("docs/results/index.md"), lines("README.md"), [], 0
     for domain, own in committed("changes").group("domain").items():
         rho = 1 - over(own, "source")
         errors = [f"{of_each_case(own, name).mean():.3g}" for name in ("source", "fine_tune", AUTO)]
         names = {"off_centre_load": "a load off centre", "gusty_wind": "slanted, gusty wind"}
         name = names.get(domain, label(domain))
         assert shown[name] == [*errors, f"{rho.mean():.3g}, {rho.min():.3g}"], domain
+        removed.append(rho.mean())
+        in_readme = f"{label(domain)}, one noisy flight of 10 s"
+        found += in_readme in readme
+        assert readme.get(in_readme, errors) == errors
+    assert found == 3
+    said = f"removes {100 * min(removed):.0f} to {100 * max(removed):.0f} % of"
+    assert said in (DOCS / "results/index.md").read_text()
     ratios = regret(committed("changes"))
     assert (f"{np.mean(ratios <= 1.1):.0%}", f"{ratios.max():.2f}") == ("94%", "1.58")
 
@@ -66,6 +73,9 @@ def test_the_paper(change, n):
     rows = committed(PAPER[change])
     found = [rows.where(model=model, mode=mode, n_train=n).spread("test_mse") for model, mode in METHODS]
     assert lines("docs/results/paper.md")[f"{change}, {n}"] == [measured(each.mean, each.std) for each in found]
+    not_adapted = rows.where(model="hybrid", mode="source_only").spread("test_mse")
+    (in_readme,) = (row for name, row in lines("README.md").items() if f"{change}, the paper's protocol" in name)
+    assert n != 100 or in_readme == [f"{each.mean:.3g}" for each in (not_adapted, found[0], found[3])]
 
 
 def test_the_verdicts():
@@ -86,6 +96,13 @@ def test_ten_methods(line):
         assert float(lines("docs/notes/findings.md")[line][i].strip("✗* ")) == pytest.approx(mean, rel=0.05)
 
 
+def test_another_simulator():
+    (shown,) = (row for name, row in lines("README.md").items() if "Hummingbird" in name)
+    own = committed("worlds").where(world="hummingbird", change="parameter_shift", flight="moving", draw=0)
+    errors = [own.where(method=method).numbers("test_mse")[:6] for method in ("source", "fine_tune", "auto")]
+    assert shown == [f"{np.median(values):.3g}" for values in errors]
+
+
 def test_intervals():
     fitted = committed("coverage").where(lambda row: row["inside"] is not None)
     kinds = ("inside", np.mean, 100, ".0f"), ("alone", np.mean, 100, ".0f"), ("half_width", np.median, 1, ".1f")
@@ -99,6 +116,8 @@ def test_intervals():
         assert lines("docs/results/intervals.md")[label(domain)] == cells
     alone = np.mean([row["alone"] for row in fitted if row["alone"] is not None])
     assert (len(fitted), f"{np.mean(fitted['inside']):.0%}", f"{alone:.0%}") == (682, "99%", "98%")
+    page = (DOCS / "results/intervals.md").read_text()
+    assert re.findall(r"(\d+) % of the 95 % intervals.*?(\d+) % of 682", page, flags=re.DOTALL) == [("98", "99")]
 
 
 @pytest.mark.parametrize(("page", "horizon"), [("results/real_flights", "50"), ("notes/public_logs", "10")])
@@ -130,7 +149,23 @@ def test_the_most_informative_flight():
                 assert float(cell.strip("±* %")) == pytest.approx(width, rel=0.05), (flight, name)
 
 
+def against_oracle(part):
+    """The error of the filter over that of a controller that knows the change, by change and reference."""
+    means = {
+        case: [np.mean(own.where(agent=agent).numbers(error(part))) for agent in ("online", "oracle")]
+        for case, own in committed("online").group("change", "reference").items()
+    }
+    return {case: online / oracle for case, (online, oracle) in means.items()}
+
+
 def test_adapting_in_flight():
+    settled, first = against_oracle("settled"), [*against_oracle("first_second").values()]
+    low, other = ([settled[case] for case in settled if (case[1] == "low_pass") == is_low] for is_low in (True, False))
+    *most, worst = sorted(other)
+    guide = (DOCS / "howto/online.md").read_text()
+    assert f"| {most[0]:.2f} to {most[-1]:.2f}; side wind on the fast figure-8 {worst:.2f} |" in guide
+    for few in (low, first):
+        assert f"| {min(few):.2f} to {max(few):.2f} |" in guide
     page, rows = (DOCS / "notes/online.md").read_text(), committed("online").where(agent="online")
     low = rows.where(reference="low_pass").group("change")
     shares = [100 * np.mean([[*row["inside"].values()] for row in own]) for own in low.values()]
@@ -174,10 +209,7 @@ def said():
     online, flown = committed("online"), committed("closed_loop")
     wind = flown.where(domain="external_force", reference="hover", distance=60.0, model="hybrid", n_train=100)
     lost = wind.where(observer=False)["crashed"]
-    settled = [
-        np.divide(*(np.mean(own.where(agent=agent).numbers(error("settled"))) for agent in ("online", "oracle")))
-        for own in online.group("change", "reference").values()
-    ]
+    settled = [*against_oracle("settled").values()]
     changes = online.where(agent="online").group("change").values()
     inside = [np.mean([np.mean([*row["inside"].values()]) for row in own]) for own in changes]
     better = [float(lines("docs/results/control.md")[name][-1]) for name in ("hover", "figure-8, 3.5 m/s", "low pass")]
