@@ -180,7 +180,7 @@ def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int, int]:
     single = all(value.dtype == np.float32 for value in (*given, result))
     trees = (exported.in_tree, exported.out_tree) == tuple(map(jax.tree.structure, (((0,) * len(given), {}), 0)))
     if not (fits and single and trees):
-        raise ValueError(f"the program maps {exported.in_avals} to {exported.out_avals}")
+        raise ValueError(f"the program must map float32 x, u to an x, not {exported.in_avals} to {exported.out_avals}")
     return batched, int(d), int(m), int(n[0]) if n else 0
 
 

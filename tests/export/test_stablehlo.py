@@ -97,7 +97,7 @@ def test_what_is_no_program_is_refused_by_its_name(path):
 def test_a_forged_program_is_refused(path):
     d, m = (13,), (4,)
     assert "calls lapack" in refusal(forged(path, solved, d, m))
-    assert "the program maps" in refusal(forged(path, lambda x, u: x[:2], d, m))
+    assert "the program must map" in refusal(forged(path, lambda x, u: x[:2], d, m))
     assert "not a program" in refusal(forged(path, lambda x: x, d))
     assert "dt must be" in refusal(forged(path, lambda x, u: x, d, m, dt="0.01"))
     assert "not a program" in refusal(forged(path, lambda x, u: x, d, m, about=3))
