@@ -100,7 +100,8 @@ def test_hover_is_never_worse_than_without_adapting_and_a_wind_is_found(world, n
     keys, gusts = jax.random.split(jax.random.key(0)), jnp.array([0.0, 1.0])
     found = Hovered(*map(np.asarray, hover(adaptation_of(world, noise, named), world, noise, 300, gusts, keys)))
     assert found.ratios(10, 300).max() < 1.05
-    assert np.abs(found.theta[0, :300, :3]).max() < 0.1  # the calm flight; gusts move parameters that they hide
+    # The calm flight after its start, which moves; gusts move parameters that they hide.
+    assert np.abs(found.theta[0, 10:300, :3]).max() < 0.05
     inside = np.abs(found.theta) < 1.96 * found.deviation
     assert inside[:, 10:300, :3].mean(axis=1).min() > 0.9  # of the time
     assert found.found(300).max() <= 1  # s, in calm air and in gusts
