@@ -118,13 +118,8 @@ def hover(
             push = kept * push + gust * np.sqrt(1 - kept**2) * jax.random.normal(one, (3,))
             own, x, u = step(own, x, seen, push + steady * CHANGE, goal(t))
             seen = device.measure(x, two)
-            return (
-                own,
-                x,
-                seen,
-                push,
-                adaptation.update(state, seen.at[BODY_RATES].multiply(fault[1]), u[fault[0]]),
-            ), u
+            state = adaptation.update(state, seen.at[BODY_RATES].multiply(fault[1]), u[fault[0]])
+            return (own, x, seen, push, state), u
 
         def block(now, given):
             key, steady, times = given
