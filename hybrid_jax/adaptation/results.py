@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.adaptation.expectation import Expected, lines_of
+from hybrid_jax.adaptation.selection import STRONG
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.files import json_value
 from hybrid_jax.status import Status
@@ -134,12 +135,14 @@ class Adaptation:
             yield f"Chosen: {self.chosen}. Probability of each change: {found}."
             if rather is not None:
                 yield f"Probability that the network changed, rather than the most probable of these: {rather:.2g}."
+            # If the evidence of the most probable change is strong, left-out windows refused it.
+            likely = next(iter(known))
+            strong = known[likely] > STRONG * known.get("source", 1.0)
+            for reason, sure in ((NOT_CONFIRMED, True), (AS_LARGE, False)):
+                if names := [name for name in self.refused if (strong and name == likely) == sure]:
+                    yield f"Rejected: {', '.join(names)}: {reason}."
         if self.alone:
             yield "Physics without the network predicts the source's own motion better and replaces the source."
-        likely = [name for name in self.refused if self.candidates[name] > self.candidates.get(self.chosen or "", 1.0)]
-        for names, reason in ((likely, NOT_CONFIRMED), ([n for n in self.refused if n not in likely], AS_LARGE)):
-            if names:
-                yield f"Rejected: {', '.join(names)}: {reason}."
         if self.expected:
             yield "RMSE to expect on a new recording (80% intervals, from blocks of windows that were left out):"
             yield from lines_of(self.expected, self.units)

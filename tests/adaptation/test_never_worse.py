@@ -64,6 +64,15 @@ def test_hover_changes_what_the_source_does_not_err_on_its_own_motion(force, tak
     assert "hj.excitation plans an experiment" in found.report()
 
 
+@pytest.mark.parametrize(("share", "reason"), [(0.99, "left out of the fit"), (0.9, "the source's own errors")])
+def test_the_report_says_why_a_change_was_refused(share, reason):
+    """Evidence that was strong enough was refused by left-out windows."""
+    found = hj.adapt(body(0.5), flown(0, 0.003, 0.3), method="source")
+    shares = {"source": 1 - share, "theta": share, "network": 0.5}
+    found = replace(found, candidates=shares, chosen="source", refused=("theta",))
+    assert next(line for line in found.report().splitlines() if reason in line).startswith("Rejected: theta: ")
+
+
 def test_other_propellers_are_found_by_their_reaction_torque():
     other = replace(hj.IRIS, torque_coefficient=1.6 * hj.IRIS.torque_coefficient)
     found = hj.adapt(body(1.0), flown(0, 1.0, vehicle=other))
