@@ -133,9 +133,9 @@ class Auto(Method):
         options, effect, step = (sizes, solver, scale, self.max_steps), None, None
         still, network = np.zeros(sizes.shape, sizes.dtype), has_network(field)
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
-        learned_from, shares = motion_of(field) if learned_from is None else learned_from, None
+        learned_from = motion_of(field) if learned_from is None else learned_from
+        shares = None if learned_from is None else _shares(field, learned_from, train)
         if learned_from is not None:
-            shares = _shares(field, learned_from, train)
             distinct, learned_from = jnp.array(min(len(learned_from), len(train))), alike(learned_from, train)
             own = _fits(larger, still, learned_from, both, *options, distinct)[0]
             rival = None if physics is None else _fits(physics, still, learned_from, both, *options, distinct)[:2]
