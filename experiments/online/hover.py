@@ -166,7 +166,8 @@ def run(options: Options) -> None:
             inside = 100 * (np.abs(own.theta) < 1.96 * own.deviation)[10:blocks, :3].mean()
             print(
                 f"{name}, {noise:g}, {world}, {gust:g} | {v:.2f} {omega:.2f} | {late:.2f} | {own.found(blocks):.1f} | "
-                f"{alarm} | {parts} | {inside:.0f} | {100 * own.inconsistent[:blocks].mean():.0f}"
+                f"{alarm} | {parts} | {inside:.0f} | {100 * own.inconsistent[:blocks].mean():.0f}",
+                flush=True,
             )
     given = jnp.zeros(11), jax.random.split(jax.random.key(77), 11), FAULTS, PATH
     print("filter, noise, world | on a path of 3 m a wrong sign of each rate, degrees, exchanged rotors and no fault")
