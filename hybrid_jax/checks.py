@@ -123,11 +123,13 @@ def instance(name: str, value: Any, kind: type) -> None:
         raise ValueError(f"{name} must be a {kind.__name__}, got {short_repr(value)}")
 
 
-def list_of(name: str, values: Any, kind: type[T]) -> list[T]:
+def list_of(name: str, values: Any, kind: type[T], least: int = 1) -> list[T]:
     """The values as a list of instances of `kind`; a single instance outside a list is an error."""
     found = list(values) if isinstance(values, Iterable) else [values]
     if not isinstance(values, Iterable) or not all(isinstance(value, kind) for value in found):
         raise ValueError(f"{name} must be a list of {kind.__name__}, got {short_repr(values)}")
+    if len(found) < least:
+        raise ValueError(f"{name} must contain at least one {kind.__name__}, but the list is empty")
     return found
 
 

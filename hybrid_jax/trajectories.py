@@ -62,7 +62,7 @@ def check(trajectories: Trajectories, name: str = "trajectories", missing: bool 
     If `missing`, x may contain NaN, but not everywhere.
     """
     if not isinstance(trajectories, Trajectories):
-        raise ValueError(f"{name}: must be Trajectories, got {type(trajectories).__name__}")
+        raise ValueError(f"{name}: must be Trajectories (see `concatenate`), got {type(trajectories).__name__}")
     x0, u, x = trajectories.x0, trajectories.u, trajectories.x
     parts = {"x0": x0, "u": u, "x": x}
     for part, array in parts.items():
@@ -179,7 +179,7 @@ def concatenate(windows: Iterable[Trajectories]) -> Trajectories:
         windows: parts with the same dt, horizon, and sizes of state and input.
     """
     parts = checks.list_of("windows", windows, Trajectories)
-    if not parts or len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:
+    if len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:
         sizes = [(part.dt, part.horizon, part.x.shape[-1], part.u.shape[-1]) for part in parts]
         raise ValueError(f"windows must share dt and horizon, and sizes of state and input, got {sizes}")
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

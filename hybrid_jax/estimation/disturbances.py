@@ -131,12 +131,10 @@ def _parts(field: AbstractVectorField, sequences: Sequence[Trajectories], steps:
         for j, each in enumerate(checks.list_of("sequences", sequences, Trajectories))
         for i in range(len(check_windows(field, each, f"sequences[{j}]")))
     ]
-    if not found:
-        raise ValueError("sequences: at least one is needed")
     if len(found) < PARTS:
         pieces = -(-PARTS // len(found))
         found = [piece[i : i + 1] for one in found for piece in [_cut(one, pieces)] for i in range(len(piece))]
-    shortest = min((one.horizon for one in found), default=0)
+    shortest = min(one.horizon for one in found)
     if shortest < 2 * steps:
         raise ValueError(f"sequences: each needs at least {2 * steps} intervals, but one has {shortest}")
     return found

@@ -124,8 +124,6 @@ def fit_records(
         ValueError: if a record lacks a signal, there are too many unknowns, or an implicit solver finds no step.
     """
     records = checks.list_of("records", records, Record)
-    if not records:
-        raise ValueError("records: at least one is needed")
     checks.positive("dt", dt, "a positive number of seconds")
     if not robust > 0:
         raise ValueError(f"robust must be a positive number, got {checks.short_repr(robust)}")

@@ -111,8 +111,8 @@ class OnlineAdaptation(AbstractEstimator):
         self.field, self.dt = field, float(dt)
         self.noise, self.process = (tuple(np.ravel(numbers).tolist()) for numbers in (noise, process))
         self.names, self.scales = named_priors(field, prior, disturbance)
-        given = (subspace_of(h, self.names, self.scales) for h in checks.list_of("hypotheses", hypotheses, Hypothesis))
-        self.hypotheses = tuple(given)
+        given = checks.list_of("hypotheses", hypotheses, Hypothesis, least=0)
+        self.hypotheses = tuple(subspace_of(each, self.names, self.scales) for each in given)
 
     @entry
     def begin(self, x: Float[Array, " d"]) -> OnlineState:

@@ -118,8 +118,7 @@ def fit_in_stages(
         ValueError: as in `fit`, or if there are no stages, windows are too short for a stage, or a group is unknown.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
-    if not (stages := checks.list_of("stages", stages, Stage)):
-        raise ValueError("stages must contain at least one Stage")
+    stages = checks.list_of("stages", stages, Stage)
     field, results = ready(field, train), []
     steps = [(rates_by_group(field, stage.rates), cut(data, stage.steps), stage) for stage in stages]
     for (rates, windows, stage), stage_key in zip(steps, jax.random.split(key, len(stages)), strict=True):
