@@ -67,6 +67,8 @@ WORK = {
 
 
 def main() -> None:
+    if {"-h", "--help"} & {*sys.argv[1:]}:
+        sys.exit(print(__doc__))
     n, names = int(float(sys.argv[1])) if sys.argv[1:] else 10**6, sys.argv[2:]
     if names:
         hj.runtime.configure()

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results, Row
 from experiments.runner import command
 from experiments.runner.cache import identity_of
-from experiments.runner.options import distinct
+from experiments.runner.options import Named, distinct
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate
@@ -70,14 +70,14 @@ adaptation removes. Test error: L^T_MSE over 1 s of other flights.
 class ChangesConfig(OneFlight):
     """Adapt to one flight after each change of the vehicle, and test every candidate to see what the choice missed."""
 
-    compared: tuple[Compared, ...] = get_args(Compared)
+    compared: Annotated[tuple[Compared, ...], Named(name="methods")] = get_args(Compared)
     """Methods to compare with. fine_tune: Adam, as in the paper. fine_tune_offset: with --rates.offset 0.3. l2_sp: with
     a penalty on the distance from the source's parameters."""
 
     def __post_init__(self):
         OneFlight.__post_init__(self)
         if self.compared:
-            distinct("--compared", self.compared)
+            distinct("--methods", self.compared)
 
 
 PRESETS = {

@@ -19,8 +19,9 @@ HEADER = "| set | hybrid-jax … | s, wall s | answer | RMSE after 0.1, 0.5 s; o
 
 def main() -> None:
     """Run the sets of public_sets.toml, or the given ones, and print a line of Markdown for each command."""
-    if len(sys.argv) < 4:
-        sys.exit(f"usage: {(__doc__ or '').partition(': ')[2]}")
+    asked = {"-h", "--help"} & {*sys.argv[1:]}
+    if asked or len(sys.argv) < 4:
+        sys.exit(print(__doc__) if asked else f"usage: {(__doc__ or '').partition(': ')[2]}")
     flights, logs, out = (Path(each).resolve() for each in sys.argv[1:4])
     values = {"flights": flights, "maps": Path(__file__).parent / "identification", "learn": LEARN}
     sets = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
 from rich.console import Console
 
@@ -76,9 +77,9 @@ class ExcitationConfig(Run):
     """Parameters to identify."""
     noise: NotNegative = 1.0
     """Sensor noise; 1 is typical."""
-    bounds: FlightBounds = field(default_factory=FlightBounds)
+    bounds: tyro.conf.OmitArgPrefixes[FlightBounds] = field(default_factory=FlightBounds)
     """The box of the designed flight."""
-    speed: Positive = 3.5
+    speed: Annotated[Positive, Named(name="figure-eight-speed")] = 3.5
     """Top speed of the figure-8 [m/s]."""
     bandwidth: Positive = 2.0
     """Highest frequency of the design [Hz]."""

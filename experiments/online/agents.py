@@ -25,19 +25,19 @@ from hybrid_jax.sim.forces import DRAG_COEFFICIENT
 from hybrid_jax.vehicle import IRIS, QUATERNION
 
 CHANGES: Mapping[str, Domain] = {
-    "inertia": PARAMETER_SHIFT,
-    "load": OFF_CENTRE_LOAD,
-    "wind": EXTERNAL_FORCE,
+    "parameter_shift": PARAMETER_SHIFT,
+    "off_centre_load": OFF_CENTRE_LOAD,
+    "external_force": EXTERNAL_FORCE,
     "weak_rotor": WEAK_ROTOR,
-    "drag": DOUBLED_DRAG,
+    "doubled_drag": DOUBLED_DRAG,
     "nothing": SOURCE,
 }
 CHANGE_NAMES = {
-    "inertia": "other inertia",
-    "load": "load of 20 % off centre",
-    "wind": "side wind",
+    "parameter_shift": "other inertia",
+    "off_centre_load": "load of 20 % off centre",
+    "external_force": "side wind",
     "weak_rotor": "one rotor 15 % weaker",
-    "drag": "twice the drag",
+    "doubled_drag": "twice the drag",
     "nothing": "no change",
 }
 AGENTS = {

@@ -8,7 +8,7 @@ from experiments.runner.options import NotNegative, Positive, Run, distinct
 from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.vehicle import IRIS
 
-Change = Literal["inertia", "load", "wind", "weak_rotor", "drag", "nothing"]
+Change = Literal["parameter_shift", "off_centre_load", "external_force", "weak_rotor", "doubled_drag", "nothing"]
 Agent = Literal["unadapted", "observer", "l1", "least_squares", "online", "oracle"]
 
 
@@ -61,7 +61,7 @@ PRESETS = {
     "paper": OnlineConfig(),
     "quick": OnlineConfig(preset="quick", seeds=2),
     "smoke": OnlineConfig(
-        preset="smoke", seeds=1, seconds=1.5, changes=("wind", "nothing"), references=("hover",),
+        preset="smoke", seeds=1, seconds=1.5, changes=("external_force", "nothing"), references=("hover",),
         agents=("unadapted", "online", "oracle"),
     ),
 }  # fmt: skip

@@ -64,7 +64,7 @@ class Config(Run):
     """N, target trajectories to train on. Rates and patience are those of the nearest size in the paper's table."""
     pool: int | None = None
     """Target trajectories from which a seed draws its N; by default as many as the largest N."""
-    draw: Literal["random", "contiguous"] = "random"
+    draw: Annotated[Literal["random", "contiguous"], options.Named(name="sampling")] = "random"
     """Which N target trajectories. random: from many flights, as in the paper. contiguous: from the start of
     one flight (ten seconds for 100 trajectories), or of as few flights as possible."""
     draws: Count = 1
@@ -147,7 +147,7 @@ class Config(Run):
 
     def _check_draws(self) -> None:
         if self.draw == "contiguous" and self.pool is not None:
-            raise ValueError("--pool is for --draw random: leave it out")
+            raise ValueError("--pool is for --sampling random: leave it out")
         if self.validation == "own" and min(self.sizes) < HELD_BACK:
             raise ValueError(f"--n-target must each be at least {HELD_BACK} with --validation own, got {self.sizes}")
 
@@ -208,7 +208,7 @@ class OneFlight(Config):
 
     sizes: Annotated[tuple[int, ...], options.Target] = (100,)
     """N, windows of 0.1 s: one number."""
-    draw: Literal["random", "contiguous"] = "contiguous"
+    draw: Annotated[Literal["random", "contiguous"], options.Named(name="sampling")] = "contiguous"
     """Which N target trajectories. contiguous: from the start of one flight (ten seconds for 100
     trajectories). random: from many flights, as in the paper."""
     draws: Count = 4

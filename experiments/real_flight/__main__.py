@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from rich.console import Console
 
-from experiments.real_flight.config import PRESETS, RealFlightConfig
+from experiments.real_flight.config import OPTIONS, PRESETS, RealFlightConfig
 from experiments.real_flight.report import NAME, write
 from experiments.real_flight.simulated import write_logs
 from experiments.real_flight.study import run_folds
@@ -19,7 +19,7 @@ from hybrid_jax.identification.learning import STEPS, learnable
 
 ABOUT = "How well do models that `hybrid-jax fit` and `adapt` learn predict other flights?"
 GUIDE = """\
-real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--test FOLDER], or --simulated.
+real_flight needs flights: --vehicle FILE --before FOLDER [--after FOLDER] [--test FOLDER], or --simulated.
 
   No logs at hand?  python -m experiments.real_flight --simulated --preset smoke
   writes logs of a simulated vehicle before and after a change to runs/real_flight/logs and trains on them. The files
@@ -35,7 +35,7 @@ real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--t
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the experiment; without any flights, explain how to get some and exit with code 2."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if not any(word.startswith(("--simulated", "--source", "--vehicle")) for word in given):
+    if not any(word.startswith(("--simulated", "--before", "--vehicle")) for word in given):
         command.check(NAME, ABOUT, given, PRESETS)  # a wrong option is named before flights are asked for
         print(GUIDE, file=sys.stderr)
         sys.exit(BAD_INPUT)
@@ -55,7 +55,7 @@ def prepare(config: RealFlightConfig) -> tuple[VehicleModel, dict[str, Flights]]
     if config.simulated:
         path, folders = write_logs(config.out / NAME / "logs", config.data_seed)
     if path is None or "source" not in folders:
-        raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; see --help")
+        raise ValueError("--vehicle FILE and --before FOLDER are needed, or --simulated; see --help")
     model = load_vehicle_model(path)
     model = replace(model, learn=config.learn or model.learn)
     changed = "target" in folders
@@ -66,7 +66,7 @@ def prepare(config: RealFlightConfig) -> tuple[VehicleModel, dict[str, Flights]]
     # Source and test may share flights where each is tested by models that were trained on other manoeuvres.
     shared = not changed and config.folds_by == "manoeuvre"
     contents = [(each, name, content) for each, found in sets.items() for name, content in found.contents.items()]
-    require_distinct([(f"--{each} {name}", (each * shared, content)) for each, name, content in contents])
+    require_distinct([(f"{OPTIONS[each]} {name}", (each * shared, content)) for each, name, content in contents])
     source = sets["source"]
     return learnable(model, source.seconds, STEPS * config.dt)[0], sets
 

@@ -4,29 +4,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from experiments.runner.options import Count, Positive, Run, Target, distinct
+from experiments.runner.options import Count, Named, Positive, Run, Target, distinct
 from hybrid_jax.cli.logs import FlightOptions
 from hybrid_jax.dynamics.vehicle_file import check_learned
 
 PATHS = ("source", "target", "test", "vehicle", "columns")
+OPTIONS = {name: f"--{name}" for name in PATHS} | {"source": "--before", "target": "--after"}
 
 
 @dataclass(frozen=True)
 class RealFlightConfig(FlightOptions, Run):
-    """Learn from the flights in --source, adapt to N windows of --target, test on held-out flights.
+    """Learn from the flights in --before, adapt to N windows of --after, test on held-out flights.
 
     Learning, adaptation and log readers are those of `hybrid-jax fit` and `adapt`, so you get the scores of the tool.
-    Without --test, the target's flights are held out in turn (--folds). Without --target, nothing is adapted and the
+    Without --test, the target's flights are held out in turn (--folds). Without --after, nothing is adapted and the
     source's models are tested. No data? Try --simulated.
 
-    Example: python -m experiments.real_flight --vehicle v.toml --source before/ --target after/ --n-target 100,600
+    Example: python -m experiments.real_flight --vehicle v.toml --before before/ --after after/ --n-target 100,600
     """
 
     vehicle: Path | None = None
     """TOML file with a table [vehicle] (mass, inertia, rotor positions, …); see docs/howto/vehicle.md."""
-    source: Path | None = None
+    source: Annotated[Path | None, Named(name="before")] = None
     """Folder of the flights before the change, preferably many."""
-    target: Path | None = None
+    target: Annotated[Path | None, Named(name="after")] = None
     """Folder of the few flights after the change."""
     test: Path | None = None
     """Folder of test flights; by default the target's flights are held out in turn."""
@@ -44,7 +45,7 @@ class RealFlightConfig(FlightOptions, Run):
     """Without --test: number of folds, or as many as there are names."""
     folds_by: Literal["flight", "manoeuvre"] = "flight"
     """Test and training share no flight, or no manoeuvre (file name without number).
-    With manoeuvre and without --target, flights in --test are held out by manoeuvre as well."""
+    With manoeuvre and without --after, flights in --test are held out by manoeuvre as well."""
     data_seed: int = 0
     """Seed of the folds and of simulated flights."""
 
@@ -55,7 +56,7 @@ class RealFlightConfig(FlightOptions, Run):
         distinct("--n-target", self.n)
         check_learned(self.learn)
         if self.simulated and any(getattr(self, name) for name in PATHS):
-            raise ValueError(f"--simulated makes its own logs: leave out {', '.join(f'--{name}' for name in PATHS)}")
+            raise ValueError(f"--simulated makes its own logs: leave out {', '.join(OPTIONS.values())}")
 
     def described(self) -> dict[str, Any]:
         """Return all inputs of the results; folders and files by name only, since flights are described by content."""

@@ -65,7 +65,7 @@ def run_folds(
     made = make_folds(sets.get("target", sets["source"]).logs, tested, config)
     for fold in made:
         if not adapts and len(fold.train) < 2:
-            raise ValueError(f"--source: without {fold.name} one flight is left; two at least, one for validation")
+            raise ValueError(f"--before: without {fold.name} one flight is left; two at least, one for validation")
         for log in fold.test:
             if all(part.stop - part.start <= max(config.horizon) for part in segments(log)):
                 raise ValueError(f"--horizon: no window of {max(config.horizon)} intervals without gaps in {log.name}")

@@ -48,7 +48,7 @@ Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."
 # Arguments that messages of the library name, and the options of the commands that have them.
 READ_LOGS = ("inspect", "fit", "adapt", "check", "replay", "real_flight")
 _SAME = ("columns", "polynomial", "topics", "motor_order", "dt", "delay")
-FLAGS = {name: f"--{name.replace('_', '-')}" for name in _SAME} | {"failed": "--anyway"}
+FLAGS = {name: f"--{name.replace('_', '-')}" for name in _SAME} | {"failed": "--ignore-checks"}
 _KEYS = ("columns", "polynomial")  # words of column maps as well: options only before a value
 _NAMED, _FREE = "|".join(FLAGS), "|".join(name for name in FLAGS if name not in _KEYS)
 _VALUE = r"\([^)]*\)|\{[^}]*\}|\"[^\"]*\"|[^\s,;:)]+"

@@ -89,8 +89,8 @@ def run(options: Options) -> int:
     flights = read_flights(options.before, model.vehicle, dt, options, lagging=lagging)
     if len(flights.logs) < 2:
         raise ValueError(f"{options.before}: has one flight; you need at least two, because one is held out")
-    if flights.still and not options.anyway:
-        raise ValueError(f"{options.before}: no flight excites a parameter: fly manoeuvres, or continue with --anyway")
+    if flights.still and not options.ignore_checks:
+        raise ValueError(f"{options.before}: no flight excites a parameter; fly manoeuvres, or use --ignore-checks")
     model, left = learnable(model, flights.seconds, STEPS * dt)
     with step(f"learning from {len(flights.logs)} flights") as told:
         found = learn(model, flights.logs, options.seed)

@@ -37,8 +37,8 @@ LINES = 5  # of what is not folded
 FITS = ("dt", "steps", "windows", "disturbance")  # options that a model remembers
 NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
 STOPPED = "The fit stopped before it converged: start closer, or learn fewer parameters."
-MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
-ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below counts until they pass."
+MEND = "nothing was identified; mend the logs as the lines above say, or go on with --ignore-checks"
+IGNORED = "{} checks of the logs failed, and --ignore-checks went on: no number below counts until they pass."
 
 
 def run(options: Any, path: Path, model: VehicleModel) -> int:
@@ -62,7 +62,7 @@ def layout_of(fits: Mapping[str, Any]) -> Layout:
 
 
 def checked(options: Any, path: Path, model: VehicleModel) -> tuple[Flights, Any]:
-    """Read the logs of a folder and leave out those that fail checks, except with --anyway; also make a field."""
+    """Read the logs of a folder, except those that fail checks unless --ignore-checks; also make a field."""
     if LAG in model.learn:
         mend = _learn(model.learn, (LAG,))
         raise ValueError(f"{path}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
@@ -81,7 +81,7 @@ def read_checked(
         for name, log in [*raws.items()]:
             fails = [each for each in checks_of(log) if each.verdict == FAILS and each.name not in NOT_NEEDED]
             failed.extend((name, each.name, each.suggestion) for each in fails)
-            if fails and not options.anyway:
+            if fails and not options.ignore_checks:
                 del raws[name], contents[name]
         if not raws:
             raise ChecksFailed(*grouped(failed), MEND)
@@ -93,7 +93,7 @@ def read_checked(
     said += [f"{name}: {note}" for name, log in raws.items() for note in log.notes] + lines
     for line in lines:
         print(f"  {line}", file=sys.stderr)
-    warnings = [ANYWAY.format(len(lines))] * (bool(lines) and options.anyway) + [left] * bool(left)
+    warnings = [IGNORED.format(len(lines))] * (bool(lines) and options.ignore_checks) + [left] * bool(left)
     return Flights([*raws.values()], contents, said, warnings), field
 
 

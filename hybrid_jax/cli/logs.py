@@ -77,7 +77,7 @@ class LogOptions:
 class FlightOptions(LogOptions):
     """Options for converting logs to flights."""
 
-    anyway: bool = False
+    ignore_checks: bool = False
     """Also use logs that fail checks. The page then warns about them."""
 
 
@@ -185,7 +185,7 @@ def read_flights(
             failed += (lines := lines or [(name, "no flight", one.refusal)] * bool(one.refusal))
             told = *one.notes, *(f"{check}: {why}" for _, check, why in lines)
             said += [f"{name}: {in_flags(line)}" for line in told]
-            if one.log is not None and (options.anyway or not lines):
+            if one.log is not None and (options.ignore_checks or not lines):
                 logs.append(one.log)
                 warned += [(name, each.name, each.suggestion) for each in one.checks if each.verdict == WARNS]
                 moving |= {each.verdict for each in one.checks if each.name in (RATES, THRUST, ORDER)} != {UNKNOWN}
@@ -195,7 +195,7 @@ def read_flights(
         if not logs:
             other = all({RATIO, ROTORS} & {check for log, check, _ in failed if log == name} for name in raws)
             why = f"; or are they of another vehicle than {vehicle.name}?" * other
-            raise ChecksFailed(*short, f"no log passed its checks; correct them as said above, or use --anyway{why}")
+            raise ChecksFailed(*short, f"no log passed its checks; correct them as said, or use --ignore-checks{why}")
         for line in short:
             print(f"  {printable(in_flags(line))}", file=sys.stderr)
         found = Flights(logs, contents, said, list(map(in_flags, grouped(warned))), not moving)

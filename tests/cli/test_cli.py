@@ -190,7 +190,7 @@ SAID = {
     "v.toml: [motors]: polynomial must be numbers": "v.toml: [motors]: polynomial must be numbers",  # a key
     "polynomial=(c0, c1, …) maps them": "--polynomial c0,c1 maps them",
     "11.9 ms later: delay=0.0119, or learn": "11.9 ms later: --delay 0.0119, or learn",
-    'use what is whole: failed="warn"': "use what is whole: --anyway",
+    'use what is whole: failed="warn"': "use what is whole: --ignore-checks",
 }
 
 

@@ -123,11 +123,13 @@ def test_a_check_that_fails_ends_in_what_to_type(folder):
     assert "nothing was identified" in failed.value.args[-1]
 
 
-@pytest.mark.parametrize(("more", "failed"), [({"anyway": True}, 1), ({"motor_order": (3, 0, 1, 2)}, 0)], ids=str)
+@pytest.mark.parametrize(
+    ("more", "failed"), [({"ignore_checks": True}, 1), ({"motor_order": (3, 0, 1, 2)}, 0)], ids=str
+)
 def test_it_goes_on_when_asked_or_mended(folder, more, failed):
     write(folder / "logs", [SWAPPED])
     read, _ = checked(Options(folder / "logs", folder / "m.npz", **more), folder / "v.toml", VehicleModel(IRIS))
-    assert [f"{failed} checks" in line for line in read.warnings if "--anyway" in line] == [True] * failed
+    assert [f"{failed} checks" in line for line in read.warnings if "--ignore-checks" in line] == [True] * failed
 
 
 def test_a_log_that_fails_is_left_out_where_another_passes(folder):

@@ -92,7 +92,7 @@ def test_from_logs_of_every_format_to_pages_and_a_program(fitted, ran, seen):
     ran(fitted, "plan adapted.npz -o plan.csv --seconds 2 --starts 1 --steps 5")
     ran(fitted, "replay adapted.npz other/flight0.csv.gz --other source.npz --seconds 1")
     (fitted / "commands.toml").write_text((fitted / "v.toml").read_text() + ACTUATOR)
-    options = "--learn Ix,Iy --windows 20 --anyway --out runs/identified"
+    options = "--learn Ix,Iy --windows 20 --ignore-checks --out runs/identified"
     ran(fitted, f"fit before/z.bbl -o body.npz --vehicle commands.toml {options}")
     ran(fitted, "export adapted.npz -o board --name iris")
     runs_as(fitted / "adapted.npz", fitted / "board")

@@ -51,7 +51,7 @@ def test_what_l1_commands_is_what_its_model_lacks():
 def rows(online=1.1, unchanged=1.0, inside=0.95, crash=False):
     """Three seeds in which the oracle errs by 1 cm and the unadapted model by 3; online adaptation as given."""
     found = []
-    for change in ("wind", "nothing"):
+    for change in ("external_force", "nothing"):
         for agent in ("unadapted", "online", "oracle"):
             for seed in range(3):
                 own = {"unadapted": 1.0 if change == "nothing" else 3.0, "oracle": 1.0}.get(agent, online)
@@ -65,7 +65,7 @@ def rows(online=1.1, unchanged=1.0, inside=0.95, crash=False):
 
 def judged(rows, step_ms=0.1, seconds=1.0):
     evidence = GoalEvidence(rows, step_ms, seconds, processor_seconds=1.0)
-    return {each.id: each.holds for each in evaluate(claims(["wind", "nothing"]), evidence)}
+    return {each.id: each.holds for each in evaluate(claims(["external_force", "nothing"]), evidence)}
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,7 @@ REFUSED = [
     ({"source_train": 50}, "--source-train"), ({"seeds": 0}, "--seeds"),
     *(({"guess": box}, "--init-range must be two factors") for box in ((1.2, 0.8), (-1.0, 0.8), (0.8, math.inf))),
     ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
-    ({"draw": "contiguous", "pool": 2000}, "--pool is for --draw random: leave it out"),
+    ({"draw": "contiguous", "pool": 2000}, "--pool is for --sampling random: leave it out"),
     ({"rates": replace(PAPER.rates, hybrid=(1e-3,))}, "--rates.hybrid"),
     ({"rates": replace(PAPER.rates, no_physics=(1e-4,) * 4 + (math.nan,))}, "--rates.no-physics must be a finite"),
     ({"patience": replace(PAPER.patience, no_physics=Stopping(-1, 5))}, "--patience.no-physics.minimum must be"),
