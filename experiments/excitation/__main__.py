@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
 from rich.console import Console
 
@@ -77,7 +76,7 @@ class ExcitationConfig(Run):
     """Parameters to identify."""
     noise: NotNegative = 1.0
     """Sensor noise; 1 is typical."""
-    bounds: tyro.conf.OmitArgPrefixes[FlightBounds] = field(default_factory=FlightBounds)
+    bounds: FlightBounds = field(default_factory=FlightBounds)
     """The box of the designed flight."""
     speed: Annotated[Positive, Named(name="figure-eight-speed")] = 3.5
     """Top speed of the figure-8 [m/s]."""

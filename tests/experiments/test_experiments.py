@@ -94,7 +94,7 @@ REFUSED = {
     "excitation": [
         (("--change", "rain"), "--change must be one of source, parameter_shift"),
         (("--seconds", "30"), "--seconds must be from 3 to 11"),
-        (("--low", "0", "0", "5"), "low must be below high, else the box is empty"),
+        (("--bounds.low", "0", "0", "5"), "low must be below high, else the box is empty"),
     ],
     "online": [(("--latency", "0.015"), "latency must be a multiple")],
     "reaction_diffusion": [
