@@ -159,7 +159,8 @@ class StateSpace:
 
     Attributes:
         quantities: in the order of the state; empty if nothing is known about it.
-        disturbed: indices of the states on which a constant disturbance acts by default; None for all.
+        disturbed: indices of the states on which a constant disturbance acts by default; None for all. The rates of
+            the others should follow from the state alone, as that of a position from the velocity.
     """
 
     quantities: tuple[Quantity, ...] = ()

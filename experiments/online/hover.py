@@ -70,6 +70,7 @@ class Hovered(NamedTuple):
     deviation: Float[Any, "*n t p"]
     inconsistent: Float[Any, "*n t"]
     exchanged: Float[Any, "*n t 4"]
+    reversed: Float[Any, "*n t d"]
     changes: Float[Any, "*n t"]
 
     def ratios(self, first: int, last: int) -> Float[Any, "*n 2"]:
@@ -128,7 +129,8 @@ def hover(
             errors = jnp.stack([error(model, now[1], after[1], inputs) for model in models])
             (theta, covariance), flags = adaptation.estimate(state), adaptation.flags(state)
             deviation = jnp.sqrt(jnp.diagonal(covariance))
-            return after, Hovered(errors, theta, deviation, flags.inconsistent, flags.exchanged, state.changes)
+            wrong = flags.inconsistent, flags.exchanged, flags.reversed
+            return after, Hovered(errors, theta, deviation, *wrong, state.changes)
 
         (place, speed), times = goal(jnp.zeros(())), DT * jnp.arange((blocks + AFTER) * BLOCK).reshape(-1, BLOCK)
         x = jnp.zeros(13).at[POSITION].set(place).at[3].set(1.0).at[VELOCITY].set(speed)

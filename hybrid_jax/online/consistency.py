@@ -3,7 +3,8 @@
 A large mean of the normalised innovations squared (NIS) means that no θ explains the samples (Bar-Shalom, Li,
 Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4). Persistent alarms, or a
 parameter at its bound, indicate a sensor with a wrong sign, unit or position. The estimate then returns to its value
-before the alarms, as with exchanged rotors (`rotor_order`). A filter with a number that is not finite restarts.
+before the alarms, as with exchanged rotors (`rotor_order`) or a wrong sign (`sensor_signs`). A filter with a number
+that is not finite restarts.
 """
 
 import equinox as eqx
@@ -13,8 +14,9 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.online import kalman
 from hybrid_jax.online.multiple_model import Verdict
-from hybrid_jax.online.rotor_order import ACCEPT, CLEAR, RotorOrder
+from hybrid_jax.online.rotor_order import RotorOrder
 from hybrid_jax.online.samples import HUGE, Sample
+from hybrid_jax.online.sensor_signs import SensorSigns
 from hybrid_jax.online.state import OnlineState
 from hybrid_jax.online.tuning import ALARMS, BOUND, BURST, REJECT, TRIAL, WINDOW
 
@@ -25,7 +27,11 @@ SETTLED = 0.5  # count of alarms below which an estimate is kept
 
 
 def believed(
-    state: OnlineState, verdict: Verdict, order: RotorOrder | None, sample: Sample, periods: float
+    state: OnlineState,
+    verdict: Verdict,
+    faults: tuple[RotorOrder | SensorSigns | None, ...],
+    sample: Sample,
+    periods: float,
 ) -> dict[str, Float[Array, "..."]]:
     """Compute the consistency fields of the next state: mean NIS, alarms, and θ in use and before the alarms."""
     share = jnp.sum(verdict.squares) / jnp.maximum(jnp.sum(jnp.where(sample.seen, 1.0, 0.0)), 1.0)
@@ -36,8 +42,8 @@ def believed(
     counted = state.doubt * jnp.exp(-periods * sample.elapsed / TRIAL) + added
     # Once it is too large it is doubled, and so takes time to fall.
     begins = (counted >= ALARMS) & (state.doubt < ALARMS)
-    if order is not None:
-        begins = begins | (jnp.max(order.evidence) >= ACCEPT)
+    for fault in filter(None, faults):
+        begins = begins | fault.found
     doubt = jnp.where(begins, 2 * ALARMS, jnp.minimum(counted, 2 * ALARMS))
     # Hypotheses weigh what they knew before an alarm against what they have learned since; one filter cannot.
     moves = jnp.where(unlikely, PERSISTENT * periods, 0.0) + (alarm if state.mixture is None else 0.0)
@@ -46,9 +52,9 @@ def believed(
     trusted = jnp.where(good, verdict.theta, state.settled)
     # A mean, as the last value may be that of a gust, or of a fault before its first alarm.
     kept = doubt < SETTLED
-    if order is not None:
-        # While an exchange may be true, what is learned may be wrong.
-        kept = kept & (jnp.max(order.evidence) <= -CLEAR)
+    for fault in filter(None, faults):
+        # While an exchange or a wrong sign may be true, what is learned may be wrong.
+        kept = kept & ~fault.possible
     rate = jnp.where(kept, -jnp.expm1(-periods / TRIAL), 0.0)
     settled = state.settled + rate * (trusted - state.settled)
     return {"nis": nis, "doubt": doubt, "burst": burst, "trusted": trusted, "settled": settled}

@@ -34,14 +34,12 @@ from hybrid_jax.online.kalman import Belief, Correction, Each, Field, FilterMode
 from hybrid_jax.online.multiple_model import Verdict
 from hybrid_jax.online.rotor_order import RotorOrder
 from hybrid_jax.online.samples import HUGE, Sample, SampleHistory, classify
+from hybrid_jax.online.sensor_signs import SensorSigns
 from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, flags_of, named_priors
-from hybrid_jax.online.tuning import HOLD, MEMORY, PAUSE, Tuning
+from hybrid_jax.online.tuning import BREEZE, HOLD, MEMORY, PAUSE, TAKEN, Tuning
 from hybrid_jax.runtime import entry
 
 RISE, FALL = 10.0, 0.2  # of the logarithm of how much faster [1/s]
-# Random walk of a disturbance, in its prior [1/√s], which a parameter's effect must exceed: a gust of a sixth of it.
-BREEZE = 0.25
-TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a parameter explains
 
 
 class OnlineAdaptation(AbstractEstimator):
@@ -142,6 +140,7 @@ class OnlineAdaptation(AbstractEstimator):
             opened=theta,
             haste=theta,
             nis=zero + 1,
+            signs=SensorSigns.begin(state_space(self.field, len(x)), x),
             order=RotorOrder.begin(vehicle.rotors if (vehicle := vehicle_in(self.field)) else 0, len(x) + p, x.dtype),
             history=SampleHistory(x, none, zero, none),
             changes=zero,
@@ -186,6 +185,7 @@ class OnlineAdaptation(AbstractEstimator):
             opened = jnp.where(unexplained, 1.0, opened)
         if (order := state.order) is not None:
             order = order.after(state.joint, self._rates, slope, belief, correction, sample, opens, model)
+        signs = state.signs if state.signs is None else state.signs.after(slope, belief, sample, model)
         # What changed opens to its prior. The state, too, has followed the wrong model since then.
         belief = kalman.reset_state(belief, sample, opens, variances)
         new = OnlineState(
@@ -198,10 +198,11 @@ class OnlineAdaptation(AbstractEstimator):
             opened=opened,
             haste=self._haste(state, sample, opens),
             order=order,
+            signs=signs,
             history=history,
             changes=state.changes + jnp.where(verdict.changed, 1.0, 0.0),
             restarts=state.restarts,
-            **consistency.believed(state, verdict, order, sample, periods),
+            **consistency.believed(state, verdict, (order, signs), sample, periods),
         )
         begun = self.begin(jnp.where(jnp.abs(history.last) < HUGE, history.last, 0.0))
         return consistency.sound(new, begun, state, variances)

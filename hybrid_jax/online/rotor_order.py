@@ -39,6 +39,16 @@ class RotorOrder(eqx.Module):
         return cls(jnp.zeros((len(pairs), n), dtype), jnp.zeros(len(pairs), dtype), orders) if pairs else None
 
     @property
+    def found(self) -> Bool[Array, "*n"]:
+        """Whether two rotors are exchanged."""
+        return jnp.max(self.evidence, axis=-1) >= ACCEPT
+
+    @property
+    def possible(self) -> Bool[Array, "*n"]:
+        """Whether two may be."""
+        return jnp.max(self.evidence, axis=-1) > -CLEAR
+
+    @property
     def exchanged(self) -> Bool[Array, "*n m"]:
         """Which rotors seem to be exchanged with another."""
         moved = np.array(self.orders) != np.arange(len(self.orders[0]))[None]

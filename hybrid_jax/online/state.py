@@ -19,6 +19,7 @@ from hybrid_jax.online.kalman import Belief
 from hybrid_jax.online.multiple_model import Mixture
 from hybrid_jax.online.rotor_order import RotorOrder
 from hybrid_jax.online.samples import SampleHistory
+from hybrid_jax.online.sensor_signs import SensorSigns
 from hybrid_jax.online.tuning import ALARMS, BOUND, BURST, FROZEN, REJECT, Tuning
 
 DISTURBANCE = "disturbance"
@@ -43,6 +44,7 @@ class OnlineState(eqx.Module):
         haste: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.
         nis: mean normalised innovation squared, 1 if noise and model are correct.
         order: how likely an exchange of two rotors is; None without rotors.
+        signs: how likely a wrong sign of a disturbed state is; None if no other state tells.
         history: statistics of the past samples.
         changes: number of alarms.
         restarts: number of restarts after a number that was not finite.
@@ -62,6 +64,7 @@ class OnlineState(eqx.Module):
     haste: Float[Array, "*n p"]
     nis: Float[Array, "*n"]
     order: RotorOrder | None
+    signs: SensorSigns | None
     history: SampleHistory
     changes: Float[Array, "*n"]
     restarts: Float[Array, "*n"]
@@ -88,6 +91,7 @@ class Flags(NamedTuple):
         inconsistent: whether errors are too large for the model at any θ, or alarms persist, for example because a
             sensor has a wrong sign, unit or position, or rotors are exchanged. The estimate from before is then used.
         exchanged: which rotors seem to be exchanged with another in the input; empty without rotors.
+        reversed: which states seem to be measured with the wrong sign, as those whose rate they are say.
         unexcited: which parameters recent samples do not excite, alone or in combination with others.
         at_bound: which parameters are at the end of their range.
     """
@@ -98,6 +102,7 @@ class Flags(NamedTuple):
     changed: Bool[Array, ""]
     inconsistent: Bool[Array, ""]
     exchanged: Bool[Array, " m"]
+    reversed: Bool[Array, " d"]
     unexcited: Bool[Array, " p"]
     at_bound: Bool[Array, " p"]
 
@@ -112,6 +117,7 @@ def flags_of(state: OnlineState, tuning: Tuning) -> Flags:
         changed=test.quiet < 1,
         inconsistent=(state.nis >= REJECT) | (state.doubt >= ALARMS) | (state.burst >= BURST),
         exchanged=jnp.zeros((*state.nis.shape, 0), bool) if state.order is None else state.order.exchanged,
+        reversed=jnp.zeros(state.x.shape, bool) if state.signs is None else state.signs.reversed,
         unexcited=jnp.diagonal(considered, axis1=-2, axis2=-1) > TAKES_PART,
         at_bound=jnp.abs(state.trusted) >= BOUND,
     )

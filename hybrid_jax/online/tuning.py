@@ -12,6 +12,9 @@ WINDOW, TRIAL, MEMORY = 0.2, 10.0, 2.0  # time constants of the mean NIS, the co
 BURST = 2.0  # alarms in a second (weighted by e⁻ᵗ) from which an estimate is not used: it is moving
 REJECT = 6.0  # mean normalised innovation squared (NIS) from which an estimate is not used
 ALARMS = 10.0  # alarms in 10 s from which it is not, until their count has halved from twice as many
+# Random walk of a disturbance, in its prior [1/√s], which a parameter's effect must exceed: a gust of a sixth of it.
+BREEZE = 0.25
+TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a parameter explains
 FROZEN = 3  # equal samples in a row that mark a sensor as frozen
 BOUND = 4.0  # prior standard deviations that a parameter may move
 SLOWEST = 0.05  # period up to which a pace of 1 is right

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from experiments.online.agents import CHANGES, L1, NAMES, fixed_model, nominal, true_theta, with_theta
-from experiments.online.hover import EXCHANGED, RIGHT, Hovered, adaptation_of, hover
+from experiments.online.hover import FAULTS, PATH, RIGHT, Hovered, adaptation_of, hover
 from experiments.online.results import TAGS, GoalEvidence, claims, tables
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 from hybrid_jax.sim.forces import ground_effect, wind
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import BODY_RATES, IRIS
 
 STATES = np.random.default_rng(0).normal(size=(3, 13)).astype(np.float32)
 STATES[:, 3:7] /= np.linalg.norm(STATES[:, 3:7], axis=1, keepdims=True)
@@ -81,14 +81,18 @@ def test_each_claim_fails_where_it_should(change, times, fails):
     assert {each.header[0] for each in tables(rows(**change))} >= {"change"}
 
 
-def test_exchanged_rotors_are_named_and_end_the_adaptation_and_others_are_not():
-    """Each pair of the Iris' rotors in two seconds of hover; the right order in a wind, too."""
-    orders, keys = np.concatenate([RIGHT, EXCHANGED]), jax.random.split(jax.random.key(0), 7)
-    found = hover(adaptation_of("iris", 1.0), "iris", 1.0, 20, jnp.zeros(7), keys, (orders, np.ones((7, 3))))
-    np.testing.assert_array_equal(found.exchanged[1:, 19], EXCHANGED != RIGHT)
-    assert found.inconsistent[1:, 19].all()
-    assert not found.theta[1:, 19].any()  # the first model, since they were exchanged from the beginning
-    assert not found.exchanged[0].any()
+def test_wrong_sensors_and_exchanged_rotors_are_named_and_end_the_adaptation():
+    """The Iris on a path of 3 m: wrong signs of its rates, degrees, exchanged rotors from the beginning, and none."""
+    keys = jax.random.split(jax.random.key(0), len(FAULTS[0]))
+    found = hover(adaptation_of("iris", 1.0), "iris", 1.0, 30, jnp.zeros(len(keys)), keys, FAULTS, PATH)
+    np.testing.assert_array_equal(found.exchanged[4:, 29], FAULTS[0][4:] != RIGHT)
+    np.testing.assert_array_equal(found.reversed[:3, 29, BODY_RATES], np.eye(3, dtype=bool))
+    assert not found.reversed[4:].any()
+    assert found.inconsistent[:10, 29].all()
+    assert not found.theta[4:10, 29].any()  # the first model
+    assert found.ratios(25, 30)[:10].max() < 1.01
+    assert not found.exchanged[10].any()
+    assert not found.inconsistent[10].any()
 
 
 @pytest.mark.slow
