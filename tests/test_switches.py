@@ -64,6 +64,8 @@ def test_a_transformation_of_what_decides_by_numbers_is_refused_in_one_line():
     for function in (hj.fit_gauss_newton, hj.adapt):
         with pytest.raises(TypeError, match=r"cannot be called under jax.jit.*sweep"):
             jax.jit(lambda arrays, function=function: function(eqx.combine(arrays, rest), data).field)(arrays)
+    with pytest.raises(TypeError, match=r"adapt cannot be called under jax.jit.*sweep"):
+        jax.vmap(lambda x: hj.adapt(field, hj.Trajectories(data.x0, data.u, x, data.dt)).field)(np.stack(2 * [data.x]))
     keys = jax.random.split(jax.random.key(0))
     with pytest.raises(TypeError, match=r"fit cannot be called under jax.jit.*sweep"):
         jax.vmap(lambda key: hj.fit(field, data, data, key).best)(keys)
