@@ -24,6 +24,8 @@ INDEXED = re.compile(
 )
 # Without `stretchy="false"` a norm is as high as its whole line.
 NORM, FIXED = "<mo>&#x02016;", '<mo stretchy="false">&#x02016;'
+# The sign of a number, not a difference: no space behind it.
+SIGN = re.compile(r"(&#x0(?:003D|003C|2264|2265);</mo><mo)>&#x02212;")
 # Letters, which browsers set as italics, accents, punctuation, operators.
 SIGNS = (
     "20-7E,A0-FF,2B0-36F,370-3FF,2010-205F,2100-214F,2190-22FF,2308-230B,"
@@ -89,7 +91,8 @@ def on_page_content(content, page, config, files):
 
     def formula(found):
         text = html.unescape(found[2]).strip()
-        return convert(text, display=display[found[1]]).replace(NORM, FIXED)
+        math = convert(text, display=display[found[1]]).replace(NORM, FIXED)
+        return SIGN.sub(r'\1 form="prefix">&#x02212;', math)
 
     def indexed(found):
         if found[2] is None:
