@@ -1,6 +1,6 @@
 """Measured signals by name, each with its own sample times."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Self, get_args
 
@@ -125,6 +125,13 @@ class Gridded(NamedTuple):
     share: dict[str, Float[np.ndarray, " n"]]  # the position of each sample in its interval, from 0 to 1
 
 
+def completed(records: Sequence[Record], outputs: tuple[str, ...]) -> list[Record]:
+    """Return the records with an empty signal for each output that one of them lacks."""
+    known = {name: each.signals[name].values[:0] for each in records for name in outputs if each.signals.get(name)}
+    empty = {name: Signal(np.zeros(0), known.get(name, np.zeros((0, 1)))) for name in outputs}
+    return [Record(each.name, empty | {k: v for k, v in each.signals.items() if len(v)}) for each in records]
+
+
 def on_grid(
     record: Record,
     inputs: tuple[str, ...],
@@ -137,12 +144,14 @@ def on_grid(
 
     Inputs, which make up u, are "held" until the next sample, interpolated ("linear"), or "averaged" since the last.
     """
-    for name in (*inputs, *outputs):
-        if name not in record.signals or len(record.signals[name]) == 0:
-            raise ValueError(f"{record.name}: has no {name}; it has {', '.join(record.signals) or 'nothing'}")
+    seen = [name for name in outputs if record.signals.get(name)]
+    for name in (*inputs, *(() if seen else outputs)):
+        if not record.signals.get(name):
+            has = [name for name, signal in record.signals.items() if len(signal)]
+            raise ValueError(f"{record.name}: has no {name}; it has {', '.join(has) or 'nothing'}")
     if between not in get_args(Between):
         raise ValueError(f"between must be one of {', '.join(get_args(Between))}, got {checks.short_repr(between)}")
-    first, end = _span(record, inputs, outputs, between)
+    first, end = _span(record, inputs, seen, between)
     if begin is not None and begin < min((record.signals[name].t[0] for name in inputs), default=begin) - dt:
         raise ValueError(f"{record.name}: {', '.join(inputs)} must be known from {begin:.6g} s on")
     begin = first if begin is None else begin
@@ -157,7 +166,7 @@ def on_grid(
         signal = record.signals[name]
         at = (signal.t - begin) / dt
         inside = (at >= -1e-6) & (at <= steps + 1e-6)
-        if not inside.any():
+        if name in seen and not inside.any():
             raise ValueError(f"{record.name}: no sample of {name} lies between {begin:.6g} and {end:.6g} s")
         at = np.clip(at[inside], 0, steps)
         index[name] = np.minimum(np.floor(at + 1e-9).astype(int), steps - 1)

@@ -1,5 +1,6 @@
 """Partially measured systems: ẋ = f(x, u), y = h(x, u)."""
 
+import inspect
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
@@ -9,7 +10,7 @@ from jaxtyping import Array, Float
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.state_space import StateSpace
 
-Output = Callable[[Float[Array, " d"], Float[Array, " m"]], Float[Array, "*k"]]
+Output = Callable[..., Float[Array, "*k"]]
 
 
 def _numbers(values) -> tuple[float, ...]:
@@ -25,7 +26,8 @@ class StateSpaceModel(eqx.Module):
     Attributes:
         field: the vector field f.
         inputs: the names of the signals that make up u, in order.
-        outputs: the functions h by name. Each takes the state (d,) and the input (m,), and returns a scalar or (k,).
+        outputs: the functions h by name. Each takes the state (d,) and the input (m,), and returns a scalar or (k,). If
+            it has a third argument, this is the field with its present numbers: an accelerometer measures ẋ.
         start: the expected initial state (d,).
         spread: the standard deviation of the initial state about `start` (d,): 0 if you know it, infinite if you know
             nothing about it. An attitude has three numbers here, its rotation [rad].
@@ -82,7 +84,9 @@ class StateSpaceModel(eqx.Module):
             x: the state (d,).
             u: the input (m,).
         """
-        y = jnp.atleast_1d(jnp.asarray(self.outputs[name](x, u)))
+        h = self.outputs[name]
+        own = (self.field,) if len(inspect.signature(h).parameters) > 2 else ()
+        y = jnp.atleast_1d(jnp.asarray(h(x, u, *own)))
         if y.ndim != 1:
             raise ValueError(f"outputs: {name} must return a scalar or one axis, got shape {y.shape}")
         return y

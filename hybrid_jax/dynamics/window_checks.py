@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, ravel_learned, state_space
@@ -45,13 +45,17 @@ def _warn_of_turns(space: StateSpace, x0, x, name: str) -> None:
         return
     path = np.concatenate([np.asarray(x0)[:, None], x], axis=1)
     for part, one in space.parts:
-        moved = np.abs(np.diff(path[..., part], axis=1)).max(axis=1, initial=0.0) if one.is_vector else np.zeros((1, 0))
-        for i, each in enumerate(moved.T):
-            jumps = each > 1.5  # rad, of the largest change in each window
-            if jumps.any() and np.all(np.abs(each[jumps] - 2 * np.pi) < 1):
-                where = f"{name}: x[{part.start + i}] jumps by about 2π in {jumps.sum()} of {len(each)} windows"
-                remedy = "if it is an angle, unwrap it, or give the field a `state_space` with an `Angle`"
-                warnings.warn(f"{where}; {remedy}", stacklevel=3)
+        for i in np.flatnonzero(jumps := turns(path[..., part])) if one.is_vector else ():
+            where = f"{name}: x[{part.start + i}] jumps by about 2π in {jumps[i]} of {len(path)} windows"
+            remedy = "if it is an angle, unwrap it, or give the field a `state_space` with an `Angle`"
+            warnings.warn(f"{where}; {remedy}", stacklevel=3)
+
+
+def turns(path: Float[np.ndarray, "n t k"], turn: float = 2 * np.pi) -> Int[np.ndarray, " k"]:
+    """In how many windows each number changes at once by about a turn; zero if it also has other large changes."""
+    moved = np.abs(np.diff(path, axis=1)).max(axis=1, initial=0.0)
+    large = moved > turn / 4
+    return np.where((~large | (np.abs(moved - turn) < turn / 6)).all(axis=0), large.sum(axis=0), 0)
 
 
 def _warn_of_units(field: AbstractVectorField, space: StateSpace, windows: Trajectories, name: str) -> None:

@@ -29,7 +29,7 @@ from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import RK4
-from hybrid_jax.records import GAP, Between, Record, Signal, on_grid
+from hybrid_jax.records import GAP, Between, Record, Signal, completed, on_grid
 from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 
@@ -110,8 +110,8 @@ def fit_records(
             {"field.residual": 0.3}; the others are free.
         noise: expected size of each output's errors in the first round, relative to which `prior` is weighed; by
             default the standard deviation of its samples.
-        robust: from the second round on, an error counts linearly beyond this many times the usual one, for example 3
-            for data with outliers. By default all errors are squared.
+        robust: an error counts linearly beyond this many times the usual one, for example 3 for data with outliers; in
+            the first round `noise` is the usual one, or a tenth of its default. By default all errors are squared.
         rounds: number of fits, each with outputs weighted by the errors of the round before.
         max_steps: largest number of Levenberg–Marquardt steps in each round.
         starts: number of searches in the first round, of which the best continues. The first begins at the model, and
@@ -121,7 +121,8 @@ def fit_records(
         level: confidence level of the intervals, between 0 and 1.
 
     Raises:
-        ValueError: if a record lacks a signal, there are too many unknowns, or an implicit solver finds no step.
+        ValueError: if a record lacks an input or all outputs, no record has an output, there are too many unknowns, or
+            an implicit solver finds no step.
     """
     records = checks.list_of("records", records, Record)
     checks.positive("dt", dt, "a positive number of seconds")
@@ -131,15 +132,21 @@ def fit_records(
         checks.count(name, number)
     if any(model.process) and segment is None:
         raise ValueError("segment must be given with process noise: it acts between segments")
+    records = completed(records, tuple(model.outputs))
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
+    record_search.check_signals(model, records, gridded, dt)
     with jax.enable_x64(True), solver_errors(solver):
         model = in_double(model)
         record_search.check_rates(model, records)
         y = {name: np.concatenate([each.y[name] for each in gridded]) for name in gridded[0].y}
+        for name in (name for name, each in y.items() if not len(each)):
+            raise ValueError(f"records: none has a sample of {name}")
         deviation = {name: np.maximum(each.std(axis=0), TINY) for name, each in y.items()}
         known = {name: np.full_like(deviation[name], size) for name, size in (noise or {}).items()}
         scale = {name: jnp.asarray(each) for name, each in (deviation | known).items()}
-        problem = Problem(model, scale, np.inf, dt, RK4() if solver is None else solver, substeps)
+        # The least squares of the first round would follow outliers, and end in a minimum of their own.
+        cautious = robust if known.keys() == scale.keys() else robust / 10
+        problem = Problem(model, scale, cautious, dt, RK4() if solver is None else solver, substeps)
         steps = record_search.steps_of(segment, gridded, dt)
         theta, near = np.asarray(ravel_learned(model)[0]), record_search.deviations_of(model, prior or {})
         segments = shooting.cut(gridded, steps)
@@ -167,6 +174,10 @@ def fit_records(
     warn_of_steps(found.discretisation, f"a smaller dt, or substeps={2 * substeps}")
     if found.status != Status.OK:
         warnings.warn(f"records: the fit {found.status.message}; check all units and the model", stacklevel=3)
+    for name, each in found.errors.items():
+        if (each > 1.1 * deviation[name] + FINE * np.abs(y[name]).max()).any():
+            line = f"{name} varies less than the fit's errors: check all units and the model, or give a segment"
+            warnings.warn(f"records: {line}", stacklevel=3)
     if found.directions:
         warnings.warn(f"records: no sample determines {'; '.join(found.directions)}", stacklevel=3)
     return found
@@ -197,8 +208,9 @@ def simulate(
         substeps: steps of the solver in each interval.
 
     Raises:
-        ValueError: a record without a signal of the model.
+        ValueError: a record without an input, or without any output.
     """
+    model = _of_outputs(model, record)
     gridded = [on_grid(record, model.inputs, tuple(model.outputs), dt, between, begin)]
     with jax.enable_x64(True):
         model = in_double(model)
@@ -216,7 +228,8 @@ def predict(
 ) -> dict[str, Float[np.ndarray, "n k"]]:
     """Return the outputs at the times of a record's samples, starting where the previous record ends.
 
-    The past states and their disturbances are estimated by `fit_records` with fixed learned numbers.
+    The past states and their disturbances are estimated by `fit_records` with fixed learned numbers. You get a warning
+    if the past is too short for this.
 
     Args:
         model: with known numbers; its start is the expected state at the first time of the past.
@@ -228,7 +241,7 @@ def predict(
         options: others of `fit_records`, such as noise, robust, segment, solver and substeps.
 
     Raises:
-        ValueError: a record without a signal of the model, or with inputs that begin long after the past.
+        ValueError: a record without an input or any output, or with inputs that begin long after the past.
     """
     joined = dict(future.signals)
     for name in (each for each in model.inputs if past.signals.get(each) and joined.get(each)):  # with samples
@@ -240,10 +253,33 @@ def predict(
         t, values = np.append(before.t[earlier], after.t), np.concatenate([before.values[earlier], after.values])
         joined[name] = Signal(t, values, after.axes, after.source)
     still = eqx.tree_at(lambda model: model.field, model, Frozen(model.field))
+    still = _of_outputs(still, past)
+    if np.isinf(model.spread).any():  # a search from the model's start may end in a local minimum
+        lengths = (np.ptp(past.signals[name].t) for name in still.outputs if past.signals.get(name))
+        options = {"segment": max(lengths, default=0.0) / 10} | options
     known = fit_records(still, [past], dt=dt, between=between, rounds=1, **options)
     kept = {name: value for name, value in options.items() if name in ("solver", "substeps")}
     options = {"begin": known.times[0, 1], "dt": dt, "between": between} | kept
-    return simulate(model, Record(future.name, joined), known.ends[0], **options)[0]
+    y, states = simulate(model, Record(future.name, joined), known.ends[0], **options)
+    _warn_if_short(model, past, known, states)
+    return y
+
+
+def _of_outputs(model: StateSpaceModel, record: Record) -> StateSpaceModel:
+    """Return the model with the outputs that a record has."""
+    seen = {name: h for name, h in model.outputs.items() if record.signals.get(name)}
+    return dataclasses.replace(model, outputs=seen or model.outputs)
+
+
+def _warn_if_short(model: StateSpaceModel, past: Record, known: RecordFit, states: Float[np.ndarray, "t d"]) -> None:
+    """Warn of states that are less certain after the past than they change in the prediction."""
+    free, space = np.array(model.spread) > 0, model.space
+    count = sum(past.signals[name].values.size for name in known.errors)
+    spare = np.inf if any(model.process) else max(count - free.sum(), 0) / count  # with noise, the error is known
+    change = record_search.sizes_between(space, states, known.starts[0])
+    error = np.divide(known.starts_error[0], np.sqrt(spare), out=np.full(len(free), np.inf), where=spare > 0)
+    if lost := [name for name, each in zip(space.tangent_names, free & (error > change), strict=True) if each]:
+        warnings.warn(f"{past.name}: too short to determine {', '.join(lost)}: the prediction is a guess", stacklevel=4)
 
 
 def _result(search: record_search.Search, end: End, records, gridded, errors, robust, level: float) -> RecordFit:
@@ -275,7 +311,7 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
     halved = search._replace(problem=dataclasses.replace(problem, substeps=2 * problem.substeps))
     now, fine = (each.predicted(end.theta, end.own).y for each in (search, halved))
     size = {name: FINE * np.std(segments.y[name][segments.there[name]], axis=0) for name in now}
-    size = {name: jnp.asarray(each + size_of(errors[name])) for name, each in size.items()}
+    size = {name: jnp.asarray(each + size_of(errors[name], problem.robust)) for name, each in size.items()}
     # Samples that are off by as much leave the errors that half the step does, without another program.
     moved = segments._replace(y={name: each - (fine[name] - now[name]) for name, each in segments.y.items()})
     search = search._replace(problem=dataclasses.replace(problem, scale=size))

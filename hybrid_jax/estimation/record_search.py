@@ -1,7 +1,9 @@
 """The search for the parameters and the states at the nodes of records, see `record_fit`."""
 
 import dataclasses
+import inspect
 import itertools
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -12,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import ravel_learned, trainable
-from hybrid_jax.dynamics.window_checks import foreign_units
+from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
+from hybrid_jax.dynamics.window_checks import foreign_units, turns
 from hybrid_jax.estimation import shooting
 from hybrid_jax.estimation.elimination import End, descend, reduced, undetermined
 from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.estimation.shooting import Local, Model, Predicted, Problem, Segments
-from hybrid_jax.records import Gridded, Record, integral
+from hybrid_jax.records import Gridded, Record, Signal, integral
 from hybrid_jax.state_space import StateSpace
 
 APPROACH = (1.0, 0.1, 0.01)  # what a segment's end may be off, over the size of a state, in turn
@@ -26,6 +28,7 @@ MOST = 3000  # unknowns
 CLUSTERS = 20  # of a simulation's errors, each taken as one observation
 GAP = 5.0  # intervals between samples, which is a gap
 TINY, SMALL = 1e-12, 1e-3
+SLOW = 300  # dt in one interval, or records in one input: more is a mistake in a unit of time
 
 
 class Sums(NamedTuple):
@@ -182,6 +185,40 @@ def directions(search: Search, end: End, records: Sequence[Record]) -> tuple[str
     return tuple(lines)
 
 
+def check_signals(model: Model, records: Sequence[Record], gridded: list[Gridded], dt: float) -> None:
+    """Warn of times and angles in other units, and of outputs that use a field which is not learned."""
+    found = []
+    for name, h in model.outputs.items():
+        used = inspect.getclosurevars(h) if inspect.isfunction(h) else None
+        if used and any(isinstance(each, AbstractVectorField) for each in {**used.nonlocals, **used.globals}.values()):
+            found.append(f"outputs: {name} uses a field that is not learned: take it as third argument, (x, u, field)")
+    for record, each in zip(records, gridded, strict=True):
+        begin, end = each.start, each.start + len(each.u) * dt
+        signals = {name: record.signals[name] for name in (*model.inputs, *model.outputs) if record.signals[name]}
+        if SLOW * dt < (interval := min(signal.interval for signal in signals.values())) < np.inf:
+            found.append(f"{record.name}: samples are {interval:.3g} s apart, {interval / dt:.3g} times dt: check both")
+        for name, signal in signals.items():
+            if name in model.inputs:
+                most = signal.t[-1] - signal.t[0] > SLOW * (end - begin)
+            else:
+                most = len(each.index[name]) < len(signal) / 2
+                found += [f"{record.name}: {name} {line}" for line in _turns(signal)]
+            if most:
+                found.append(
+                    f"{record.name}: most of {name} is not between {begin:.6g} and {end:.6g} s: check all times"
+                )
+    for line in found:
+        warnings.warn(line, stacklevel=4)
+
+
+def _turns(signal: Signal) -> list[str]:
+    """Return what is wrong with a signal that jumps as an angle does where it is wrapped."""
+    pairs = np.stack([signal.values[:-1], signal.values[1:]], axis=1)[np.diff(signal.t) < GAP * signal.interval]
+    remedies = {2 * np.pi: "jumps by 2π: if it is an angle, unwrap it", 360.0: "jumps by 360: an angle must be in rad"}
+    narrow = {turn: np.ptp(signal.values, axis=0) < 1.1 * turn for turn in remedies}
+    return [line for turn, line in remedies.items() if (turns(pairs, turn) * narrow[turn]).any()]
+
+
 def check_rates(model: Model, records: Sequence[Record]) -> None:
     """Raise ValueError if an output that is the rate of another one in the model has another unit in a record."""
     random, m = np.random.default_rng(0), sum(records[0].signals[name].values.shape[1] for name in model.inputs)
@@ -195,6 +232,8 @@ def check_rates(model: Model, records: Sequence[Record]) -> None:
         same = found[name][1].shape == found[rate][0].shape and jnp.allclose(found[name][1], found[rate][0])
         for record in records if same else ():
             moved, measured = record.signals[name], record.signals[rate]
+            if not (moved and measured):
+                continue
             inside = (moved.t >= measured.t[0]) & (moved.t <= measured.t[-1])
             t, steps = moved.t[inside], np.diff(measured.t)
             # What changed while the rate was not measured is unknown.
@@ -239,10 +278,15 @@ def sizes_of(search: Search, theta, own) -> Float[np.ndarray, " e"]:
     model = search.problem.model
     start, spread = np.array(model.start), np.array(model.spread)
     states = search._replace(off=None).predicted(theta, own).states
-    moved = np.abs(np.asarray(_changes(model.space, states.reshape(1, -1, len(start)), start))).max(axis=(0, 1))
+    moved = sizes_between(model.space, states.reshape(-1, len(start)), start)
     far = np.maximum(np.abs(start), 1.0) if len(spread) == len(start) else np.ones(len(spread))
     guess = np.where(np.isfinite(spread) & (spread > 0), spread, far)
     return np.where(np.isfinite(moved) & (moved > 0) & (moved < 1e3 * guess), moved, guess)
+
+
+def sizes_between(space: StateSpace, states: Float[Array | np.ndarray, "t d"], x) -> Float[np.ndarray, " e"]:
+    """Return how far states are from x at most."""
+    return np.abs(np.asarray(_changes(space, jnp.asarray(states)[None], x))).max(axis=(0, 1))
 
 
 def _changes(space: StateSpace, y: Float[Array, "r s d"], x) -> Float[Array, "r s e"]:

@@ -1,5 +1,7 @@
 """Records of which not every state was measured: what made them is recovered, and what they do not tell is said."""
 
+import dataclasses
+
 import diffrax
 import equinox as eqx
 import jax
@@ -12,7 +14,7 @@ from hybrid_jax import StateSpaceModel, fit_records, predict, simulate
 from hybrid_jax.dynamics.hidden import Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
 from hybrid_jax.estimation.elimination import undetermined
 from hybrid_jax.estimation.record_search import check_rates
-from hybrid_jax.records import Record, on_grid
+from hybrid_jax.records import Record, Signal, on_grid
 
 NOISE = 0.01
 
@@ -111,10 +113,11 @@ def test_what_follows_is_predicted_from_what_was_seen(fitted):
     assert np.sqrt(np.mean((y["angle"] - seen) ** 2)) < 2 * NOISE
 
 
-def test_a_burst_of_outliers_is_set_aside(records):
+@pytest.mark.parametrize("size", [3.0, 30.0])  # the first round must not follow a large one
+def test_a_burst_of_outliers_is_set_aside(records, size):
     signal = records[0].signals["angle"]
     spoiled = signal.values.copy()
-    spoiled[20:24] += 3.0
+    spoiled[20:24] += size
     spoiled[50] = np.nan  # what is no number is left out
     torque = records[0].signals["torque"]
     bad = [Record.of("bad", torque=(torque.t, torque.values), angle=(signal.t, spoiled)), records[1]]
@@ -259,6 +262,62 @@ def test_a_rate_in_another_unit_than_its_angle_is_said(factor):
     check_rates(model, [right])
     with pytest.raises(ValueError, match=r"r: rate is (5[67]|0\.0009).* times the rate of angle: check their units"):
         fit_records(model, [wrong], dt=0.05)
+
+
+def test_records_may_have_different_sensors(records):
+    """The first has an accelerometer, whose output needs the field's numbers, and the second the angle."""
+    outputs = {"angle": angle, "acceleration": lambda x, u, field: field(x, u)[1]}
+    model = dataclasses.replace(model_of(pendulum(1.0, 0.1)), outputs=outputs)
+    true, torque = dataclasses.replace(model, field=pendulum()), records[0].signals["torque"]
+    t = np.arange(0.0, 7.9, 0.11)
+    y = simulate(
+        true, Record.of("r", torque=(torque.t, torque.values), acceleration=(t, t)), np.array([0.5, 0]), dt=0.02
+    )[0]
+    noisy = y["acceleration"] + NOISE * np.random.default_rng(0).normal(size=(len(t), 1))
+    felt = Record.of("felt", torque=(torque.t, torque.values), acceleration=(t, noisy))
+    fit = fit_records(model, [felt, records[1]], dt=0.02)
+    assert y.keys() == {"acceleration"} != fit.errors.keys()
+    assert np.abs(fit.starts - [[0.5, 0.0], [-0.4, 1.0]]).max() < 0.05
+    assert float(fit.intervals["log_length"].value) == pytest.approx(np.log(0.8), abs=0.01)
+    with pytest.raises(ValueError, match="records: none has a sample of angle"):
+        fit_records(model, [felt], dt=0.02)
+    other = pendulum(1.0, 0.1)
+    fixed = dataclasses.replace(model, outputs={"acceleration": lambda x, u: other(x, u)[1]})
+    with pytest.warns(UserWarning, match=r"acceleration uses a field that is not learned: take it as third argument"):
+        fit_records(fixed, [felt], dt=0.02)
+
+
+def spinning():
+    """A pendulum that turns over and over."""
+    return record(pendulum(), (0.5, 12.0), seed=4, samples=300)
+
+
+@pytest.mark.parametrize(
+    ("name", "times", "of", "dt", "said"),
+    [
+        ("angle", 1, lambda y: (y + np.pi) % (2 * np.pi) - np.pi, 0.02, "angle jumps by 2π: if it is an angle, unwrap"),
+        ("angle", 1, lambda y: np.rad2deg(y) % 360, 0.02, "angle jumps by 360: an angle must be in rad"),
+        ("angle", 1, lambda y: 1e3 * y, 0.02, "angle varies less than the fit's errors"),
+        ("angle", 1e2, np.array, 0.02, r"most of angle is not between 0 and 8\.?\d* s: check all times"),
+        ("torque", 1e3, np.array, 0.02, "most of torque is not between 0"),
+        ("angle", 1, np.array, 5e-5, r"samples are 0\.0\d* s apart, \d* times dt: check both"),
+    ],
+)
+def test_other_units_and_wrapped_angles_are_said(name, times, of, dt, said):
+    signals = dict(spinning().signals)
+    signals[name] = Signal(times * signals[name].t, of(signals[name].values))
+    with pytest.warns(UserWarning, match=said):
+        fit_records(model_of(pendulum()), [Record("r", signals)], dt=dt, max_steps=1, rounds=1)
+
+
+def test_a_past_far_from_the_models_start_is_found_and_a_short_one_said():
+    one, model = spinning(), model_of(pendulum())
+    past, future = one.part(2.0, 6.0), one.part(5.9, 8.0)
+    y, seen = predict(model, past, future, dt=0.02)["angle"], future.signals["angle"]
+    assert np.abs(y - seen.values[-len(y) :]).max() < 10 * NOISE
+    two = Signal(seen.t[:2], seen.values[:2])
+    with pytest.warns(UserWarning, match=r"too short to determine x\[0\], x\[1\]: the prediction is a guess"):
+        predict(model, Record("two", {**one.signals, "angle": two}), one.part(6.2, 8.0), dt=0.02)
 
 
 class Turntable(hj.AbstractVectorField):
