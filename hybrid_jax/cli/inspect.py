@@ -52,7 +52,7 @@ class Options(LogOptions):
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of logs, or one log."""
     vehicle: Path | None = None
-    """Vehicle file to check the logs against. It tells number and order of motors, spin, thrust and largest speed."""
+    """Vehicle file to check the logs against. It has the number and order of motors, spin, thrust and largest speed."""
     write_vehicle: Path | None = None
     """Write an initial vehicle file. Hover, thrust, rotor positions, spin, lag and centre of thrust are estimated from
     logs that pass all checks; the rest is marked with a comment. Existing files are not overwritten."""
