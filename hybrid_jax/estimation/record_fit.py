@@ -33,6 +33,7 @@ from hybrid_jax.records import GAP, Between, Record, Signal, completed, on_grid
 from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 
+FASTEST = 2.0  # rate of a decay times RK4's step, which is unstable above 2.8
 CONTINUOUS = 1e-6  # what a segment's end may be off, over the size of a state, where that state has no process noise
 
 
@@ -52,7 +53,7 @@ class RecordFit(eqx.Module):
         steps: number of Levenberg–Marquardt steps, summed over rounds.
         status: how the last round ended.
         discretisation: by how many standard errors half the solver's step would change a learned number at most; 0 if
-            there is none.
+            there is none, infinite if a part of the model is faster than RK4's step.
         directions: what no sample determines: states at the starts, and combinations of learned numbers.
     """
 
@@ -309,7 +310,14 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
         return 0.0
     problem, segments = search.problem, search.segments
     halved = search._replace(problem=dataclasses.replace(problem, substeps=2 * problem.substeps))
-    now, fine = (each.predicted(end.theta, end.own).y for each in (search, halved))
+    found, fine = (each.predicted(end.theta, end.own) for each in (search, halved))
+    if isinstance(problem.solver, RK4):
+        slopes = jax.vmap(jax.jacfwd(search.model(end.theta).field))
+        at = (jnp.asarray(each)[:, :, 0].reshape(-1, each.shape[-1]) for each in (found.states, segments.u))
+        rates = np.nan_to_num(np.asarray(slopes(*at)))
+        if np.abs(np.linalg.eigvals(rates)).max() * problem.dt / problem.substeps > FASTEST:
+            return np.inf  # the search stops where the solver becomes unstable, and half the step moves nothing there
+    now, fine = found.y, fine.y
     size = {name: FINE * np.std(segments.y[name][segments.there[name]], axis=0) for name in now}
     size = {name: jnp.asarray(each + size_of(errors[name], problem.robust)) for name, each in size.items()}
     # Samples that are off by as much leave the errors that half the step does, without another program.

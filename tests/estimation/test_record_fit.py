@@ -85,6 +85,16 @@ def test_steps_that_are_too_long_are_said(records, fitted):
     assert coarse.discretisation > 1
 
 
+def test_a_lag_that_is_shorter_than_a_step_is_not_taken_for_known(records):
+    """There is none: the search ends at the shortest for which RK4 is stable, where half the step changes nothing."""
+    field = with_hidden(pendulum(), Lag(jnp.log(jnp.array([0.1])), (0,)))
+    model = StateSpaceModel(field, ("torque",), {"angle": angle}, np.zeros(3), (np.inf, np.inf, 1.0))
+    with pytest.warns(UserWarning, match="half the solver's step would move a parameter by inf standard errors"):
+        fit = fit_records(model, records, dt=0.04)
+    assert np.exp(fit.intervals["parts.0.log_time_constant[0]"].value) < 0.04 / 2
+    assert fit_records(model_of(pendulum()), records[:1], dt=0.04, max_steps=2).discretisation < 1
+
+
 def test_a_fit_that_does_not_converge_is_said(records):
     with pytest.warns(UserWarning, match=r"records: the fit stopped at the limit of steps; check all units"):
         assert fit_records(model_of(pendulum()), records, dt=0.02, max_steps=1).status.name == "CAPPED"
