@@ -285,7 +285,7 @@ def _warn_if_short(model: StateSpaceModel, past: Record, known: RecordFit, state
 
 def _result(search: record_search.Search, end: End, records, gridded, errors, robust, level: float) -> RecordFit:
     model, start = search.model(end.theta), np.asarray(search.nodes(end.own)[0])[:, 0]
-    covariance, variances = _covariance(search, end)
+    covariance, variances = _covariance(search, end, errors)
     deviation = np.sqrt(variances[:, : model.space.tangent_size])
     found, physics = {}, physics_of(model.field)
     if jax.tree.leaves(eqx.filter(physics, trainable(physics))):
@@ -313,7 +313,7 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
     found, fine = (each.predicted(end.theta, end.own) for each in (search, halved))
     if isinstance(problem.solver, RK4):
         slopes = jax.vmap(jax.jacfwd(search.model(end.theta).field))
-        at = (jnp.asarray(each)[:, :, 0].reshape(-1, each.shape[-1]) for each in (found.states, segments.u))
+        at = (jnp.concatenate(jnp.asarray(each)[:, :, 0]) for each in (found.states, segments.u))
         rates = np.nan_to_num(np.asarray(slopes(*at)))
         if np.abs(np.linalg.eigvals(rates)).max() * problem.dt / problem.substeps > FASTEST:
             return np.inf  # the search stops where the solver becomes unstable, and half the step moves nothing there
@@ -331,14 +331,26 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
     return float(jnp.max(jnp.where(found.told, jnp.abs(step) / jnp.where(error > 0, error, 1), 0.0)))
 
 
-def _covariance(search: record_search.Search, end: End) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "r s"]]:
-    """Return the covariance of θ and the variances of the nodes; infinite where no output changes.
+def _covariance(search: record_search.Search, end: End, errors):
+    """Return the covariance of θ (p, p) and the variances of the nodes (r, s); infinite where no output changes.
 
-    In a simulation model errors persist, so each piece's score is one observation (a sandwich; White 1980). With
-    process noise errors are independent, and the inverse of the normal equations is the covariance.
+    In a simulation model errors persist, so each piece's score is one observation (a sandwich; White 1980). From few
+    samples this is too small, and the larger of it and that of independent errors is taken (Angrist and Pischke, Mostly
+    Harmless Econometrics, 2009, 8.2). With process noise errors are independent.
     """
-    meat = None
-    if search.off is None:
-        gram, score, _ = search.local(end.theta, end.own).equations
-        meat = np.asarray(end.equations.gram + jnp.einsum("rsp,rsq->rpq", score, score) - jnp.sum(gram, axis=1))
-    return elimination.covariance(end.equations, len(end.theta), meat)  # what was expected counts as it is
+    independent, own = elimination.covariance(end.equations, len(end.theta))
+    if search.off is not None:
+        return independent, own
+    gram, score, _ = search.local(end.theta, end.own).equations
+    meat = np.asarray(end.equations.gram + jnp.einsum("rsp,rsq->rpq", score, score) - jnp.sum(gram, axis=1))
+    found, starts = elimination.covariance(end.equations, len(end.theta), meat)  # what was expected counts as it is
+    problem = search.problem
+    r = np.concatenate(
+        [np.clip(e / problem.scale[k], -problem.robust, problem.robust).ravel() for k, e in errors.items()]
+    )
+    spare = len(r) - len(end.theta) - len(end.own) * np.count_nonzero(problem.model.spread)
+    share = float(r @ r) / max(spare, 1)
+    with np.errstate(invalid="ignore", divide="ignore"):  # infinite if not identifiable, zero if known
+        ratio = np.nan_to_num(np.diagonal(independent) * share / np.diagonal(found), posinf=1.0)
+        more = np.sqrt(np.maximum(ratio, 1.0))
+        return found * more * more[:, None], np.fmax(starts, own * share)

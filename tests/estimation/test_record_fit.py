@@ -182,6 +182,25 @@ def test_a_hidden_part_is_found(part, extra, at, truth):
     assert np.asarray(at(fit.model.field.parts[0])) == pytest.approx(truth, abs=0.05)
 
 
+class Decay(hj.AbstractVectorField):
+    rate: jax.Array
+
+    def __call__(self, x, u):
+        return -self.rate * x
+
+
+def test_an_interval_from_few_samples_is_not_narrower_than_of_independent_errors():
+    """The errors are at samples that tell little of the rate, so a sandwich is much too narrow."""
+    t = np.r_[np.linspace(0, 0.1, 9), 0.5, 1.0, 1.5]
+    y = np.exp(-t) + 0.05 * (-1.0) ** np.arange(12) * (t <= 0.1)
+    model = StateSpaceModel(Decay(jnp.array(1.1)), (), {"angle": angle}, (1.0,), (0.0,))
+    fit = fit_records(model, [Record.of("r", angle=(t, y))], dt=0.05)
+    found = fit.intervals["rate"]
+    rate, width = float(found.value), float(found.high - found.low)
+    variance = np.sum((y - np.exp(-rate * t)) ** 2) / 11 / np.sum((t * np.exp(-rate * t)) ** 2)
+    assert width == pytest.approx(2 * 1.96 * np.sqrt(variance), rel=0.01)
+
+
 class Stiff(hj.AbstractVectorField):
     """A slow state, and one that follows within a tenth of a millisecond."""
 
