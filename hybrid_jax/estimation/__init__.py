@@ -5,7 +5,8 @@ You should use `fit_least_squares` if you measure whole states, and `fit_records
 
 from hybrid_jax.estimation.disturbances import fit_disturbance, observe
 from hybrid_jax.estimation.least_squares import LeastSquaresFit, fit_least_squares
-from hybrid_jax.estimation.record_fit import RecordFit, fit_records, predict, simulate
+from hybrid_jax.estimation.record_fit import RecordFit, fit_records
+from hybrid_jax.estimation.record_prediction import predict, simulate
 from hybrid_jax.estimation.uncertainty import (
     DisturbanceSelection,
     Interval,

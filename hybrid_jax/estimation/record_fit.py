@@ -1,4 +1,4 @@
-"""Fit a model to records in which only some states were measured, and predict from the last samples.
+"""Fit a model to records in which only some states were measured.
 
 Levenberg–Marquardt sums normal equations over segments (`shooting`), so memory does not grow with the record's length.
 """
@@ -6,7 +6,6 @@ Levenberg–Marquardt sums normal equations over segments (`shooting`), so memor
 import dataclasses
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +15,6 @@ from jaxtyping import Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import in_double, ravel_learned, trainable
-from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
@@ -29,7 +27,7 @@ from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import RK4
-from hybrid_jax.records import GAP, Between, Record, Signal, completed, on_grid
+from hybrid_jax.records import Between, Record, completed, on_grid
 from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 
@@ -182,105 +180,6 @@ def fit_records(
     if found.directions:
         warnings.warn(f"records: no sample determines {'; '.join(found.directions)}", stacklevel=3)
     return found
-
-
-@entry
-def simulate(
-    model: StateSpaceModel,
-    record: Record,
-    start: Float[np.ndarray, " d"] | None = None,
-    *,
-    dt: float,
-    begin: float | None = None,
-    between: Between = "held",
-    solver: Solver = None,
-    substeps: int = 1,
-) -> tuple[dict[str, Float[np.ndarray, "n k"]], Float[np.ndarray, "t d"]]:
-    """Return the outputs at the times of a record's samples, and the states at the edges of all intervals.
-
-    Args:
-        model: the model to simulate.
-        record: the inputs, and the times of the outputs' samples; the values of outputs are not read.
-        start: the state at the first time (d,), by default the model's.
-        dt: length of the intervals in which inputs are constant [s].
-        begin: the first time [s], by default at the first sample of an output.
-        between: how inputs act between samples.
-        solver: of diffrax, by default `RK4`.
-        substeps: steps of the solver in each interval.
-
-    Raises:
-        ValueError: a record without an input, or without any output.
-    """
-    model = _of_outputs(model, record)
-    gridded = [on_grid(record, model.inputs, tuple(model.outputs), dt, between, begin)]
-    with jax.enable_x64(True):
-        model = in_double(model)
-        problem = Problem(model, {}, np.inf, dt, RK4() if solver is None else solver, substeps)
-        segments = shooting.cut(gridded, len(gridded[0].u))
-        x0 = jnp.asarray(model.start if start is None else start, float)[None]
-        y, _, states = shooting.simulated(problem, model, x0, segments)
-        found = {name: np.asarray(each)[0, 0][segments.there[name][0, 0]] for name, each in y.items()}
-        return found, np.asarray(states[0, 0])
-
-
-@entry
-def predict(
-    model: StateSpaceModel, past: Record, future: Record, *, dt: float, between: Between = "held", **options: Any
-) -> dict[str, Float[np.ndarray, "n k"]]:
-    """Return the outputs at the times of a record's samples, starting where the previous record ends.
-
-    The past states and their disturbances are estimated by `fit_records` with fixed learned numbers. You get a warning
-    if the past is too short for this.
-
-    Args:
-        model: with known numbers; its start is the expected state at the first time of the past.
-        past: the last samples; it should be longer if more states are hidden.
-        future: the inputs from the end of the past on, and the times of the outputs' samples to predict; the values of
-            outputs are not read.
-        dt: length of the intervals in which inputs are constant [s].
-        between: how inputs act between samples.
-        options: others of `fit_records`, such as noise, robust, segment, solver and substeps.
-
-    Raises:
-        ValueError: a record without an input or any output, or with inputs that begin long after the past.
-    """
-    joined = dict(future.signals)
-    for name in (each for each in model.inputs if past.signals.get(each) and joined.get(each)):  # with samples
-        before, after = past.signals[name], joined[name]
-        if after.t[0] > before.t[-1] + GAP * before.interval:
-            ends = f"begins at {after.t[0]:.6g} s, and the past ends at {before.t[-1]:.6g} s"
-            raise ValueError(f"{future.name}: {name} {ends}")
-        earlier = before.t < after.t[0]
-        t, values = np.append(before.t[earlier], after.t), np.concatenate([before.values[earlier], after.values])
-        joined[name] = Signal(t, values, after.axes, after.source)
-    still = eqx.tree_at(lambda model: model.field, model, Frozen(model.field))
-    still = _of_outputs(still, past)
-    if np.isinf(model.spread).any():  # a search from the model's start may end in a local minimum
-        lengths = (np.ptp(past.signals[name].t) for name in still.outputs if past.signals.get(name))
-        options = {"segment": max(lengths, default=0.0) / 10} | options
-    known = fit_records(still, [past], dt=dt, between=between, rounds=1, **options)
-    kept = {name: value for name, value in options.items() if name in ("solver", "substeps")}
-    options = {"begin": known.times[0, 1], "dt": dt, "between": between} | kept
-    y, states = simulate(model, Record(future.name, joined), known.ends[0], **options)
-    _warn_if_short(model, past, known, states)
-    return y
-
-
-def _of_outputs(model: StateSpaceModel, record: Record) -> StateSpaceModel:
-    """Return the model with the outputs that a record has."""
-    seen = {name: h for name, h in model.outputs.items() if record.signals.get(name)}
-    return dataclasses.replace(model, outputs=seen or model.outputs)
-
-
-def _warn_if_short(model: StateSpaceModel, past: Record, known: RecordFit, states: Float[np.ndarray, "t d"]) -> None:
-    """Warn of states that are less certain after the past than they change in the prediction."""
-    free, space = np.array(model.spread) > 0, model.space
-    count = sum(past.signals[name].values.size for name in known.errors)
-    spare = np.inf if any(model.process) else max(count - free.sum(), 0) / count  # with noise, the error is known
-    change = record_search.sizes_between(space, states, known.starts[0])
-    error = np.divide(known.starts_error[0], np.sqrt(spare), out=np.full(len(free), np.inf), where=spare > 0)
-    if lost := [name for name, each in zip(space.tangent_names, free & (error > change), strict=True) if each]:
-        warnings.warn(f"{past.name}: too short to determine {', '.join(lost)}: the prediction is a guess", stacklevel=4)
 
 
 def _result(search: record_search.Search, end: End, records, gridded, errors, robust, level: float) -> RecordFit:
