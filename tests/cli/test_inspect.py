@@ -176,4 +176,4 @@ def test_from_flights_that_hardly_move_nothing_is_learned(tmp_path, called):
     (tmp_path / "v.toml").write_text(vehicle_toml(replace(IRIS, thrust_coefficient=IRIS.mass * 9.81 / 4 / 650**2)))
     files = ["-o", tmp_path / "m.npz", "--vehicle", tmp_path / "v.toml", "--out", tmp_path / "out"]
     code, _, said = called("fit", write(tmp_path / "flights", logs), *files)
-    assert (code, "no flight excites a parameter: fly manoeuvres" in said) == (2, True)
+    assert (code, "no flight excites a parameter; fly manoeuvres" in said) == (2, True)
