@@ -32,9 +32,9 @@ class SensorSigns(eqx.Module):
     @classmethod
     def begin(cls, space: StateSpace, x: Float[Array, " d"]) -> "SensorSigns | None":
         """Initialise at the first sample; None if the state space does not say which states are disturbed."""
-        if space.disturbed is None:
+        disturbed, none = tuple(range(len(x))[space.disturbed or slice(0)]), jnp.zeros_like(x)
+        if not disturbed:
             return None
-        disturbed, none = tuple(range(len(x))[space.disturbed]), jnp.zeros_like(x)
         return cls(x, none, jnp.zeros((len(disturbed), len(x)), x.dtype), none[: len(disturbed)], disturbed)
 
     @property
