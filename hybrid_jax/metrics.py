@@ -65,7 +65,11 @@ def rollout_mse(
 
 
 def window_mse(
-    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None
+    field: AbstractVectorField,
+    windows: Trajectories,
+    every: int = 1,
+    solver: Solver | None = None,
+    scale: Float[Array, " d"] | None = None,
 ) -> Float[Array, " n"]:
     """Compute L_MSE of each window; see `rollout_mse`.
 
@@ -74,6 +78,7 @@ def window_mse(
         windows: n windows.
         every: number of intervals from one compared state to the next.
         solver: by default `RK4`.
+        scale: a divisor for the error of each state; by default 1.
     """
     windows = continuous(field, check(windows, "windows", missing=True))
     checks.count("every", every)
@@ -82,6 +87,7 @@ def window_mse(
 
     def errors(windows: Trajectories) -> Float[Array, " n"]:
         predicted = predict(field, windows.x0, windows.u, windows.dt, solver)
-        return mse(predicted[:, every - 1 :: every], jnp.asarray(windows.x)[:, every - 1 :: every])
+        pair = (x if scale is None else x / scale for x in (predicted, jnp.asarray(windows.x)))
+        return mse(*(x[:, every - 1 :: every] for x in pair))
 
     return in_chunks(errors, windows, CHUNK)

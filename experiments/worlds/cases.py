@@ -30,7 +30,7 @@ from hybrid_jax.networks.mlp import zero_output
 from hybrid_jax.sim import gone_wrong
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.training import Settings
-from hybrid_jax.training.channels import scaled_loss
+from hybrid_jax.training.objective import scaled_loss
 
 WORLDS: dict[str, World] = {world.name: world for world in (Iris(), *ROTORPY)}
 STEPS, LONG = 10, 100  # intervals of a window to learn from, and to test on

@@ -21,15 +21,9 @@ from hybrid_jax.adaptation.plausible import groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, blocks_of, correlated, overlap
+from hybrid_jax.dynamics import disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space, trainable
-from hybrid_jax.dynamics.disturbance import (
-    ConstantDisturbance,
-    disturbance_of,
-    disturbance_units,
-    physics_of,
-    without_disturbance,
-    without_zeros,
-)
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, physics_of
 from hybrid_jax.dynamics.rigid_body import uncorrected
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import NAMED, compare_steps
@@ -42,8 +36,7 @@ from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import UNOPTIMISED, entry, jit_with, keep_programs, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
-from hybrid_jax.training.channels import scaled_loss
-from hybrid_jax.training.objective import UNSCALED, Settings, TrajectoryLoss
+from hybrid_jax.training.objective import UNSCALED, Settings, TrajectoryLoss, scaled_loss
 from hybrid_jax.trajectories import Trajectories, check_like, concatenate, features_of, overflows, shares_outside
 
 FEWEST = 10  # windows, of which outliers are told apart
@@ -160,10 +153,10 @@ def adapt(
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
     adapted = solution.field
     if disturbance_of(field) is None:
-        adapted = uncorrected(without_zeros(adapted))  # what windows need
+        adapted = uncorrected(disturbance.without_zeros(adapted))  # what windows need
     status = Status(int(solution.status))
     if status != Status.DIVERGED and isinstance(settings.objective, TrajectoryLoss):
-        scale = settings.objective.scale(windows.x0.shape[-1])
+        scale = settings.objective.divisor()
         compare_steps(adapted, windows, solver, scale, named=exact or None)
     space, found = state_space(field, windows.x0.shape[-1]), disturbance_of(adapted)
     choice = {} if solution.choice is None else _chosen(solution.choice, train, space, flights)
@@ -228,7 +221,7 @@ def _split(windows: Trajectories, validation: Trajectories | None, needed: bool)
 
 
 def _size(field: AbstractVectorField) -> int:
-    physics = physics_of(without_disturbance(field))
+    physics = physics_of(disturbance.without_disturbance(field))
     return sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(physics, trainable(physics))))
 
 
@@ -243,8 +236,8 @@ def _parameters(
 ) -> dict[str, Any]:
     if not 0 < _size(field) <= NAMED:
         return {"parameters": {}, "without_intervals": NOT_LEAST_SQUARES}
-    own, d = physics_of(without_disturbance(field)), windows.x0.shape[-1]
-    known = (own.parameter_units if isinstance(own, AbstractVectorField) else {}) | disturbance_units(field)
+    own, d = physics_of(disturbance.without_disturbance(field)), windows.x0.shape[-1]
+    known = (own.parameter_units if isinstance(own, AbstractVectorField) else {}) | disturbance.disturbance_units(field)
     values = values_of(field)
     groups = groups_of([*values])
     units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
@@ -267,7 +260,7 @@ def _parameters(
     cluster = correlated(windows)
     own_degrees = len(windows) - free.sum() if cluster == 1 else -(-len(windows) // cluster) - 1
     if choice is None:
-        scale = scale_of(settings.objective, d)
+        scale = scale_of(settings.objective)
         covariance = np.asarray(covariance_of(field, windows, solver=settings.solver, scale=scale, cluster=cluster))
         inherited, of_source = np.zeros_like(covariance), np.inf
     else:

@@ -12,38 +12,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation.anchored import (
-    Subspace,
-    fit_anchored,
-    has_network,
-    network_effect,
-    subspace,
-    taken_by_network,
-    weights_of,
-    with_change,
-    without_network,
-)
+from hybrid_jax.adaptation import anchored, selection
 from hybrid_jax.adaptation.expectation import errors_at_ends
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, extended, free_parameters, groups_of, names_of
 from hybrid_jax.adaptation.results import NETWORK
-from hybrid_jax.adaptation.selection import (
-    BLOCKS,
-    STRONG,
-    Fit,
-    Posterior,
-    Unchanged,
-    alike,
-    blocks_of,
-    fit_each,
-    left_out_thetas,
-    posterior,
-    shares_outside,
-    spread,
-    surely_lower,
-    unchanged,
-    without_others,
-)
+from hybrid_jax.adaptation.selection import Fit, Posterior, Unchanged
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import disturbance_units
 from hybrid_jax.estimation.least_squares import ravel_parameters
@@ -101,7 +75,7 @@ class Auto(Method):
     """
 
     networks: bool = True
-    blocks: int = BLOCKS
+    blocks: int = selection.BLOCKS
     max_steps: int = 100
     plausible: Plausible = PLAUSIBLE
     uses_validation: ClassVar[bool] = False
@@ -128,15 +102,15 @@ class Auto(Method):
         jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))
         # Only these settings matter; as an array, another scale needs no other program.
-        scale, solver = scale_of(settings.objective, train.x0.shape[-1]), settings.solver
+        scale, solver = scale_of(settings.objective), settings.solver
         larger, physics, sizes = _begin(self, field, train)
         options, effect, step = (sizes, solver, scale, self.max_steps), None, None
-        still, network = np.zeros(sizes.shape, sizes.dtype), has_network(field)
+        still, network = np.zeros(sizes.shape, sizes.dtype), anchored.has_network(field)
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
         learned_from = motion_of(field) if learned_from is None else learned_from
         shares = None if learned_from is None else _shares(field, learned_from, train)
         if learned_from is not None:
-            distinct, learned_from = jnp.array(min(len(learned_from), len(train))), alike(learned_from, train)
+            distinct, learned_from = jnp.array(min(len(learned_from), len(train))), selection.alike(learned_from, train)
             own = _fits(larger, still, learned_from, both, *options, distinct)[0]
             rival = None if physics is None else _fits(physics, still, learned_from, both, *options, distinct)[:2]
             larger, source = _replace(self, larger, own, rival, distinct, sizes)
@@ -144,14 +118,14 @@ class Auto(Method):
         (found, every, starts), fitted = first, _ = _fits(larger, still, train, both, *options), None
         for _ in range(ROUNDS):
             if network:  # also if physics replaced the source: then it is the difference of two models
-                effect = network_effect(field, train, solver, scale, starts)
+                effect = anchored.network_effect(field, train, solver, scale, starts)
             chosen, nothing, move, rows = _judge(larger, found, every, source, learned_from, shares, effect, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
                 options = chosen.sizes, *options[1:]
                 (_, found, starts), fitted = _fits(larger, move, train, rows, *options), rows
                 if not traced and int(found.status) == Status.DIVERGED:
                     _, found, starts = _fits(larger, still, train, rows, *options)
-        units = blocks_of(len(train), self.blocks, flights)
+        units = selection.blocks_of(len(train), self.blocks, flights)
         fits = (found, starts), (first[0], first[2])
         found, starts, chosen, left_out = _confirm(self, larger, *fits, chosen, None if flights is None else units)
         if self.networks and network:
@@ -160,7 +134,7 @@ class Auto(Method):
         return _conclude(self, field, larger, train, outcome, (sizes, solver))
 
 
-_shares = jit_by_size(UNOPTIMISED)(shares_outside)
+_shares = jit_by_size(UNOPTIMISED)(selection.shares_outside)
 
 
 class OfSource(NamedTuple):
@@ -174,7 +148,7 @@ class OfSource(NamedTuple):
 @jit_by_size(UNOPTIMISED)
 def _begin(method: Auto, field, train: Trajectories):
     larger = extended(field, train.x0.shape[1])
-    physics = without_network(larger) if has_network(larger) else None
+    physics = anchored.without_network(larger) if anchored.has_network(larger) else None
     return larger, physics, method.plausible.sizes(larger, train)
 
 
@@ -182,7 +156,7 @@ def _begin(method: Auto, field, train: Trajectories):
 def _fits(field, move, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
     """Fit nothing and some parameters, from where the parameters moved by `move`, which smooths the starts as well."""
     start, unravel = ravel_parameters(field)
-    found, starts = fit_each(unravel((start + move).astype(start.dtype)), windows, free, *options, moved=move)
+    found, starts = selection.fit_each(unravel((start + move).astype(start.dtype)), windows, free, *options, moved=move)
     return (*(jax.tree.map(itemgetter(row), found) for row in (0, 1)), starts)
 
 
@@ -191,12 +165,12 @@ def _replace(method: Auto, larger, own: Fit, rival: tuple[Fit, Fit] | None, dist
     """Replace the source by its physics if they predict its own motion better, fitted again if that is better still."""
     if rival is None:
         return larger, OfSource(own, jnp.array(False), distinct)
-    start, unravel = ravel_parameters(without_network(larger))
-    blocks = blocks_of(len(own.equations.score), method.blocks)
-    left_out = left_out_thetas(rival[1], jnp.ones(len(start), bool), sizes, start, blocks)
-    again = surely_lower(rival[1], rival[0], left_out, blocks)
+    start, unravel = ravel_parameters(anchored.without_network(larger))
+    blocks = selection.blocks_of(len(own.equations.score), method.blocks)
+    left_out = selection.left_out_thetas(rival[1], jnp.ones(len(start), bool), sizes, start, blocks)
+    again = selection.surely_lower(rival[1], rival[0], left_out, blocks)
     physics, left_out = _where(again, rival[1], rival[0]), jnp.where(again, left_out, start)
-    alone = surely_lower(physics, own, left_out, blocks) & method.networks
+    alone = selection.surely_lower(physics, own, left_out, blocks) & method.networks
     larger, own = (_where(alone, *pair) for pair in ((unravel(physics.theta), larger), (physics, own)))
     return larger, OfSource(own, alone, distinct)
 
@@ -208,10 +182,10 @@ def _judge(
     start = ravel_parameters(larger)[0]
     free, nothing = np.stack([*free_parameters(larger).values()]), Unchanged(jnp.zeros_like(start), jnp.zeros(()))
     if source is not None:
-        nothing = unchanged(source.own, around, effect.total if effect else 0.0, learned_from, shares)
-    found = posterior(around, every, start, free, sizes, nothing.apparent)
+        nothing = selection.unchanged(source.own, around, effect.total if effect else 0.0, learned_from, shares)
+    found = selection.posterior(around, every, start, free, sizes, nothing.apparent)
     rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
-    return found, nothing, without_others(every, rows[1], start).astype(sizes.dtype), rows
+    return found, nothing, selection.without_others(every, rows[1], start).astype(sizes.dtype), rows
 
 
 @jit_by_size(UNOPTIMISED)
@@ -221,20 +195,20 @@ def _confirm(method: Auto, larger, changed, still, chosen: Posterior, units) -> 
     The last are the parameters fitted without each block, or each of `units`.
     """
     free, start = jnp.stack([*free_parameters(larger).values()])[chosen.taken], ravel_parameters(larger)[0]
-    blocks = blocks_of(len(still[0].equations.score), method.blocks)
-    thetas = left_out_thetas(changed[0], free, chosen.sizes, start, blocks)
-    sure = (chosen.taken == 0) | surely_lower(changed[0], still[0], thetas, blocks)
+    blocks = selection.blocks_of(len(still[0].equations.score), method.blocks)
+    thetas = selection.left_out_thetas(changed[0], free, chosen.sizes, start, blocks)
+    sure = (chosen.taken == 0) | selection.surely_lower(changed[0], still[0], thetas, blocks)
     if units is not None:
-        thetas = left_out_thetas(changed[0], free, chosen.sizes, start, units)
+        thetas = selection.left_out_thetas(changed[0], free, chosen.sizes, start, units)
     found, starts = jax.tree.map(partial(jnp.where, sure), changed, still)
     chosen = chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
     return found, starts, chosen, jnp.where(sure, thetas, found.theta)
 
 
 @jit_by_size(FASTEST_COMPILE)
-def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale) -> Subspace:
+def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale) -> anchored.Subspace:
     """Linearise by the network's weights at the chosen candidate."""
-    return subspace(ravel_parameters(larger)[1](found.theta), train, starts, solver, scale)
+    return anchored.subspace(ravel_parameters(larger)[1](found.theta), train, starts, solver, scale)
 
 
 @jit_by_size(UNOPTIMISED)
@@ -244,7 +218,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     start, unravel = ravel_parameters(larger)
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
-    theta, blocks = chosen.theta.at[taken].set(found.theta), blocks_of(len(train), method.blocks)
+    theta, blocks = chosen.theta.at[taken].set(found.theta), selection.blocks_of(len(train), method.blocks)
     probability, refused = chosen.probability, chosen.naive > chosen.naive[taken]
     equations = masked(found.equations, free[taken] & found.seen)
     alone, of_source, degrees = jnp.array(False), jnp.diag(nothing.apparent), jnp.inf
@@ -252,24 +226,24 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
         own, alone, distinct = source
         of_source = jnp.where(alone, sandwich_of_repeated(own.equations, len(start), distinct), of_source)
         degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
-    inherited = spread(found.equations, free[taken] & found.seen, of_source)
+    inherited = selection.spread(found.equations, free[taken] & found.seen, of_source)
     changes = jnp.zeros((len(left_out), 0))
     if step is not None:
-        step = fit_anchored(step, found.noise, nothing.error, blocks, units)
-        removed = weights_of(larger)[0] - weights_of(field)[0]  # all of them, if physics replaced it
+        step = anchored.fit_anchored(step, found.noise, nothing.error, blocks, units)
+        removed = anchored.weights_of(larger)[0] - anchored.weights_of(field)[0]  # all of them, if physics replaced it
         odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
-        better = odds > STRONG
+        better = odds > selection.STRONG
         changes, change = jnp.where(better, step.left_out, 0.0), jnp.tile(removed, (len(names) + 1, 1))
         change = change.at[-1].add(step.change)
         probability = jnp.append(probability, odds / (1 + odds))
-        refused = jnp.append(refused, (naive > STRONG) & ~better)
+        refused = jnp.append(refused, (naive > selection.STRONG) & ~better)
         free, theta = (jnp.concatenate([each, each[taken][None]]) for each in (free, theta))
         names, taken = (*names, NETWORK), jnp.where(better, len(names), taken)
 
     def at_ends(block):
         theta, change, windows, counted = block
         field = unravel(theta)
-        return errors_at_ends(with_change(field, change) if change.size else field, windows, counted, solver)
+        return errors_at_ends(anchored.with_change(field, change) if change.size else field, windows, counted, solver)
 
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[units[0]], train)
     ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(units[1])))
@@ -277,7 +251,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     if effect is not None:
         # For example the velocity, the body rates and the rotor speeds, on which aerodynamic forces depend.
         quantities = len(disturbance_units(larger)) + train.u.shape[-1]
-        most = taken_by_network(effect.of_states, equations, found.of_states, quantities)
+        most = anchored.taken_by_network(effect.of_states, equations, found.of_states, quantities)
         absorbed = jnp.where(alone, absorbed, most)
     # Other systems' sizes are relative to the source's value, and change with the parametrisation.
     vague = jnp.sqrt(absorbed) > VAGUE * (sizes if "drag" in groups_of(names_of(larger)) else jnp.inf)
@@ -296,4 +270,4 @@ def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
 
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:
     adapted = ravel_parameters(larger)[1](choice.theta[index])
-    return adapted if choice.change is None else with_change(adapted, choice.change[index])  # type: ignore
+    return adapted if choice.change is None else anchored.with_change(adapted, choice.change[index])  # type: ignore

@@ -18,7 +18,6 @@ from hybrid_jax.estimation.least_squares import Scale, fit_free, ravel_parameter
 from hybrid_jax.estimation.uncertainty import check_determined, select_disturbance
 from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.status import Status
-from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import ADAM, make_run_config, run, start
 from hybrid_jax.training.objective import Objective, Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories, check
@@ -96,7 +95,7 @@ class LeastSquares(Method):
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         n, d = train.x0.shape
-        options = {"solver": settings.solver, "max_steps": self.max_steps, "scale": scale_of(settings.objective, d)}
+        options = {"solver": settings.solver, "max_steps": self.max_steps, "scale": scale_of(settings.objective)}
         indices = None if self.indices is None else checks.places("indices", self.indices, d)
         larger = sized(with_disturbance(field, indices), d)
         start = larger if self.disturbance is True else field
@@ -197,12 +196,10 @@ class Source(Method):
         return Solution(field)
 
 
-def scale_of(objective: Objective, d: int) -> Scale:
-    """The error of each of d states that counts as 1 in the objective; None if each counts in its own unit."""
+def scale_of(objective: Objective) -> Scale:
+    """The error of each state that counts as 1 in the objective; None if each counts in its own unit."""
     if not isinstance(objective, TrajectoryLoss):
         remedy = "or take method='fine_tune', which minimises any"
         given = type(objective).__name__
         raise ValueError(f"settings.objective must be a TrajectoryLoss for least squares, got {given}; {remedy}")
-    if isinstance(objective, ChannelLoss) and objective.huber is not None:
-        raise ValueError("settings.objective must have no huber threshold for least squares")
-    return objective.scale(d)
+    return objective.divisor()

@@ -12,15 +12,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.estimation import normal_equations
 from hybrid_jax.estimation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters, rounding
-from hybrid_jax.estimation.normal_equations import (
-    NormalEquations,
-    equations_of,
-    has_effect,
-    inverse,
-    masked,
-    steps_without,
-)
+from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, masked
 from hybrid_jax.estimation.starts import Starts, from_starts, smoothed
 from hybrid_jax.trajectories import RANGE, Trajectories
 
@@ -74,10 +68,10 @@ def fit_each(
     def one(known, free: Bool[Array, " p"]):
         held, given = jnp.sqrt(noise) / sizes, (field, smooth, solver, max_steps, scale)
         found, jacobian, r = fit_and_linearise(*given, free, weigh, held, distinct, known, moved)
-        equations = jax.vmap(equations_of)(jacobian, r)
+        equations = jax.vmap(normal_equations.equations_of)(jacobian, r)
         # What windows tell less of than its prior could be anything, at hardly another error.
         more = jnp.diagonal(jnp.sum(equations.gram, axis=0)) > noise / jnp.square(sizes)
-        seen = more & has_effect(equations, windows, scale)
+        seen = more & normal_equations.has_effect(equations, windows, scale)
         theta = ravel_parameters(found.field)[0]
         of_states = jnp.einsum("nsdp,nsdq->dpq", jacobian, jacobian)
         fit = Fit(theta, masked(equations, seen), of_states, noise, seen, found.steps, found.status)
@@ -224,7 +218,7 @@ def left_out_steps(
     places, counted = blocks
     gram = jnp.sum(equations.gram[places] * counted[..., None, None], axis=1)
     score = jnp.sum(equations.score[places] * counted[..., None], axis=1)
-    return steps_without(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0) + pull, gram, score)
+    return normal_equations.steps_without(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0) + pull, gram, score)
 
 
 def left_out_thetas(found: Fit, free: Bool[Array, " p"], sizes, start, blocks) -> Float[Array, "b p"]:

@@ -10,15 +10,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.batching import (
-    AbstractInferenceOnly,
-    Batch,
-    RunningStats,
-    batch_norms,
-    over_samples,
-    training_mode,
-    with_moved_stats,
-)
+from hybrid_jax.dynamics import batching
+from hybrid_jax.dynamics.batching import AbstractInferenceOnly, Batch, RunningStats, batch_norms
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.trajectories import Trajectories
 
@@ -45,15 +38,15 @@ class AbstractVectorField(eqx.Module):
     def train_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
         """Evaluate ẋ on a minibatch in training mode: batch normalisation uses the moments of this minibatch."""
         direct = self.features_first and not batch_norms(self)
-        return self(x, u) if direct else over_samples(training_mode(self))(x, u)
+        return self(x, u) if direct else batching.over_samples(batching.training_mode(self))(x, u)
 
     def infer_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
         """Evaluate ẋ on a batch in inference mode, with one column for each sample."""
-        return self(x, u) if self.features_first else over_samples(self)(x, u)
+        return self(x, u) if self.features_first else batching.over_samples(self)(x, u)
 
     def update_running_stats(self, x: Batch, u: Float[Array, "m b"]) -> Self:
         """Return the field with running statistics updated by a minibatch; learned parameters do not change."""
-        return with_moved_stats(self, x, u)
+        return batching.with_moved_stats(self, x, u)
 
     def apply_residual(self, x: Float[Array, " d *b"], residual: Float[Array, " d *b"]) -> Float[Array, " d *b"]:
         """Return what a residual adds to ẋ of this physics; by default the residual itself.
@@ -188,7 +181,7 @@ class _Function(AbstractVectorField):
         return getattr(self.function, "accepts_batch", False)
 
     def update_running_stats(self, x, u):
-        return with_moved_stats(self.function, x, u)
+        return batching.with_moved_stats(self.function, x, u)
 
     def fuse_for_inference(self):
         return self.function

@@ -23,7 +23,7 @@ from hybrid_jax.flights.windows import cut_each, cut_windows, flight_errors, seq
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.training import Settings, fit, rates_by_group
-from hybrid_jax.training.channels import scaled_loss
+from hybrid_jax.training.objective import scaled_loss
 from hybrid_jax.trajectories import Trajectories, concatenate, split, windows_of
 
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}  # of prediction errors

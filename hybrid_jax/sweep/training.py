@@ -110,7 +110,7 @@ def sweep(
         more = hosts.agreed(int(np.clip(more * block_seconds / (time.perf_counter() - start), 1, 4 * more)))
     if trains and isinstance(settings.objective, TrajectoryLoss):
         field, plan, mse = lane((states.best, plans, states.best_mse), int(np.argmin(states.best_mse)))
-        own, scale = train[plan.subset[: plan.n_train]], settings.objective.scale(train.x0.shape[-1])
+        own, scale = train[plan.subset[: plan.n_train]], settings.objective.divisor()
         if np.isfinite(mse):
             compare_steps(field, own, settings.solver, scale)
     return states

@@ -211,7 +211,7 @@ def compared(result: FitResult, data: PyTree, settings: Settings) -> FitResult:
     loss = settings.objective
     if result.status == Status.DIVERGED or not (isinstance(loss, TrajectoryLoss) and isinstance(data, Trajectories)):
         return result
-    scale = loss.scale(data.x0.shape[-1])
+    scale = loss.divisor()
     moved = compare_steps(result.best, data, settings.solver, scale, stacklevel=5)
     return replace(result, discretisation=moved)
 

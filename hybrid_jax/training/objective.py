@@ -6,17 +6,20 @@ from typing import Any, Protocol
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax import checks, kernels
-from hybrid_jax.dynamics.base import AbstractVectorField, as_field
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, state_space
 from hybrid_jax.dynamics.batching import batch_norms
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.integrate import RK4, check_solver
-from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.metrics import window_mse
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training.loss import Minibatch, Regulariser, along, rollout_minibatch
-from hybrid_jax.trajectories import Trajectories, check, errors_of
+from hybrid_jax.trajectories import Trajectories, check, errors_of, last_measured
+
+FLOOR = 1e-3  # least scale of a state over its size: one that hardly changes must not outweigh the others
 
 Learner = Any  # an Equinox module: a vector field, or anything that the objective can evaluate
 
@@ -80,10 +83,29 @@ class Objective(Protocol):
 
 @dataclass(frozen=True)
 class TrajectoryLoss(Objective):
-    """The default loss (paper, Eq. 6): L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², averaged over windows; λ L_reg in training."""
+    """The default loss (paper, Eq. 6): L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², averaged over windows; λ L_reg in training.
+
+    Attributes:
+        scale: the error of each state (d) that counts as 1, in its unit, infinite for a state that does not count; by
+            default each counts in its own unit. You should set it if units differ: without it, an error of 1 rad/s
+            counts ten thousand times as much as 1 cm. See `scaled_loss`.
+
+    Raises:
+        ValueError: if a scale is not positive.
+    """
+
+    scale: tuple[float, ...] | None = None
+
+    def __post_init__(self):
+        given = self.scale
+        if given is not None and not (isinstance(given, tuple) and all((checks.real(one) or 0) > 0 for one in given)):
+            raise ValueError(f"scale must be a tuple of positive numbers, got {checks.short_repr(given)}")
 
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
-        return check(windows, name, missing=True)
+        size = check(windows, name, missing=True).x.shape[-1]
+        if self.scale is not None and size != len(self.scale):
+            raise ValueError(f"{name}: states of {len(self.scale)} numbers expected, as scale has, got {size}")
+        return windows
 
     def batch(self, picked: Trajectories, settings: "Settings") -> Minibatch:
         last = (jnp.moveaxis(a, 0, -1) for a in (picked.x0, picked.u, picked.x))
@@ -91,32 +113,38 @@ class TrajectoryLoss(Objective):
 
     def loss(self, field: AbstractVectorField, batch: Minibatch, settings: "Settings", weight: Float[Array, ""]):
         predicted = rollout_minibatch(field, batch.x0, batch.u, batch.dt, batch.solver)
-        value = self.mean_error(errors_of(predicted, batch.x))
+        errors = errors_of(predicted, batch.x)
+        if (divisor := self.divisor()) is not None:
+            errors = errors / divisor[:, None]
+        value = jnp.mean(jnp.mean(jnp.sum(jnp.square(errors), axis=1), axis=0))
         if settings.regulariser is not None and isinstance(field, Hybrid):
             value = value + weight * settings.regulariser(field, batch, predicted)
         return value, predicted
 
-    def scale(self, d: int) -> Float[Array, " d"] | None:
-        """Return the error of each state that counts as 1; None if each counts in its own unit.
-
-        Args:
-            d: size of the state.
-        """
-        return None
-
-    def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
-        """Return the error of a minibatch.
-
-        Args:
-            difference: predicted minus measured states (t, d, b), zero where x is not measured.
-        """
-        return jnp.mean(jnp.mean(jnp.sum(jnp.square(difference), axis=1), axis=0))
+    def divisor(self) -> Float[Array, " d"] | None:
+        """Return `scale` as an array, in the current precision."""
+        # By NumPy first: JAX would compile a program that converts it.
+        return None if self.scale is None else jnp.asarray(np.asarray(self.scale, jnp.result_type(float)))
 
     def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
         return as_field(field).update_running_stats(*along(batch.x0, seen, batch.u))
 
     def validate(self, field: AbstractVectorField, data: Trajectories, settings: "Settings") -> Float[Array, ""]:
-        return rollout_mse(field, data, solver=settings.solver)
+        return jnp.mean(window_mse(field, data, solver=settings.solver, scale=self.divisor()))
+
+
+def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> TrajectoryLoss:
+    """A loss relative to the RMS change over a window of each quantity in the field's state space."""
+    x0, end = np.asarray(windows.x0, float), last_measured(windows)[:, -1].astype(float)
+
+    def rms(vectors: Float[np.ndarray, "n k"]) -> float:
+        return float(np.sqrt(np.mean(np.sum(np.square(vectors), axis=-1))))
+
+    scale: list[float] = []
+    for part, one in state_space(field, x0.shape[-1]).parts:
+        changed, size = rms(end[:, part] - x0[:, part]), rms(end[:, part])
+        scale += [max(changed, FLOOR * size) or 1.0] * one.size
+    return TrajectoryLoss(tuple(scale))
 
 
 UNSCALED = TrajectoryLoss()  # the default, which `adapt` replaces

@@ -125,7 +125,7 @@ def test_a_method_of_a_user_is_the_example_of_the_docstring():
 
 class Recorded(hj.adaptation.Auto):
     def solve(self, field, train, validation, settings, learned_from=None):
-        return Solution(field, status=jnp.array(Status.OK), steps=settings.objective.channels[1].scale)
+        return Solution(field, status=jnp.array(Status.OK), steps=settings.objective.scale[1])
 
 
 def test_errors_count_by_the_source_s_motion_also_in_a_hover():

@@ -10,7 +10,7 @@ import pytest
 import hybrid_jax as hj
 from hybrid_jax.dynamics.base import as_field
 from hybrid_jax.export import casadi_function
-from hybrid_jax.training.channels import scaled_loss
+from hybrid_jax.training.objective import scaled_loss
 
 KEY = jax.random.key(0)
 GRID = hj.Grid((6, 8), 0.25, 2)
@@ -82,7 +82,8 @@ def hybrid(kernel=1):
 def test_scaling_is_by_component_and_fields_need_no_input():
     scaling = hj.with_scaling(hybrid(), decays()).residual.network.scaling
     assert [len(part) for part in (scaling.offset, scaling.scale, scaling.output)] == [2, 2, 2]
-    assert len(scaled_loss(hybrid(), decays()).channels) == 2
+    scale = scaled_loss(hybrid(), decays()).scale
+    assert (len(scale), len(set(scale))) == (GRID.size, 2)
     assert hj.dynamics.disturbance.disturbance_of(hj.with_disturbance(hybrid())).value.shape == (2,)
 
 

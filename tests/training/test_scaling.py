@@ -8,17 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pendulum import DAMPING, LENGTH, pendulum, swings
+from pendulum import pendulum, swings
 from systems import SYSTEMS, Gain
 
 import hybrid_jax as hj
-from hybrid_jax import Settings, fit
-from hybrid_jax.metrics import rollout_mse
+from hybrid_jax import Settings
 from hybrid_jax.networks.mlp import LinearSkip
 from hybrid_jax.networks.normalisation import ChannelScaling, InputScaling
 from hybrid_jax.networks.standardise import with_scaling
-from hybrid_jax.training.channels import Channel, ChannelLoss, scaled_loss
-from hybrid_jax.training.objective import TrajectoryLoss
+from hybrid_jax.training.objective import TrajectoryLoss, scaled_loss
 
 KEY = jax.random.key(0)
 car = SYSTEMS["car"]  # cached
@@ -80,8 +78,6 @@ def test_training_leaves_the_scaling_and_a_file_keeps_it(tmp_path):
 
 
 TRAIN, VALIDATION = swings(60), swings(40, seed=1)
-CHANNELS = Channel(0, 1, 0.5), Channel(1, 2, 2.0)
-PLAIN = ChannelLoss((Channel(0, 2, 1.0),))
 FIELD = pendulum(0.8)
 
 
@@ -89,50 +85,31 @@ def loss(objective, windows, field=FIELD):
     return objective.loss(field, objective.batch(windows, Settings()), Settings(), 0.0)[0]
 
 
-def test_with_a_scale_of_one_it_is_the_plain_loss():
-    np.testing.assert_allclose(loss(PLAIN, TRAIN), loss(TrajectoryLoss(), TRAIN), rtol=1e-6)
+def test_a_scale_counts_errors_in_its_units():
+    """States without a scale of their own do not count; windows are predicted whole, and in chunks."""
     many = jax.tree.map(lambda leaf: np.tile(leaf, (26, *(1,) * (leaf.ndim - 1))), VALIDATION)
-    for data in (VALIDATION, many):  # whole, and in chunks
-        np.testing.assert_allclose(PLAIN.validate(FIELD, data, Settings()), rollout_mse(FIELD, VALIDATION), rtol=1e-5)
+    for scale in ((1.0, 1.0), (0.5, 2.0), (0.5, np.inf)):
+        objective, unit = TrajectoryLoss(scale), np.array(scale)
+        errors = hj.rollout_batch(FIELD, VALIDATION.x0, VALIDATION.u, VALIDATION.dt) - VALIDATION.x
+        expected = np.mean(np.sum(np.square(errors / unit), axis=-1))
+        np.testing.assert_allclose(loss(objective, VALIDATION), expected, rtol=1e-5)
+        for data in (VALIDATION, many):
+            np.testing.assert_allclose(objective.validate(FIELD, data, Settings()), expected, rtol=1e-5)
 
 
 def test_the_scales_of_a_field_are_the_changes_over_a_window_and_free_of_units():
     last = (TRAIN.x - TRAIN.x0[:, None])[:, -1]
-    counted = scaled_loss(FIELD, TRAIN).error(last)
-    np.testing.assert_allclose(counted.mean(), 2.0, rtol=1e-5)  # two quantities
+    counted = last / np.array(scaled_loss(FIELD, TRAIN).scale)
+    np.testing.assert_allclose(np.square(counted).sum(axis=-1).mean(), 2.0, rtol=1e-5)  # two quantities
     half = jax.tree.map(lambda leaf: leaf / 2, eqx.tree_at(lambda w: w.u, TRAIN, TRAIN.x))
-    np.testing.assert_allclose(scaled_loss(FIELD, half).error(last / 2), counted, rtol=1e-5)
-
-
-def test_beyond_its_threshold_a_robust_loss_grows_with_the_error_and_not_its_square():
-    robust = ChannelLoss((Channel(0, 2, 2.0),), huber=1.5)
-
-    def count(x):
-        return robust.error(jnp.array([0.6, 0.8]) * 2.0 * x)  # a length of x scales
-
-    np.testing.assert_allclose([count(0.5), count(1.5), count(4.0)], [0.25, 2.25, 9.75], rtol=1e-6)
-    slopes = [jax.grad(count)(x) for x in (1.499, 1.501, 40.0)]
-    np.testing.assert_allclose(slopes, [2.998, 3.0, 3.0], rtol=1e-5)
-    assert (jax.grad(robust.error)(jnp.zeros(2)) == 0).all()
-
-
-def test_a_robust_loss_does_not_follow_outliers():
-    wild = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[::10].add(20.0))
-    found = {}
-    for name, huber in (("square", None), ("robust", 0.05)):
-        objective = ChannelLoss(CHANNELS, huber)
-        settings = Settings(batch_size=60, objective=objective)
-        state = fit(pendulum(0.8, DAMPING), wild, VALIDATION, KEY, rates=0.03, max_epochs=60, settings=settings)
-        found[name] = abs(float(jnp.exp(state.field.log_length)) - LENGTH)
-    assert found["robust"] < 0.02
-    assert found["robust"] < 0.2 * found["square"]
+    np.testing.assert_allclose(last / 2 / np.array(scaled_loss(FIELD, half).scale), counted, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [lambda: Channel(0, 1, 0.0), lambda: ChannelLoss(()), lambda: ChannelLoss((Channel(0, 1, 1.0),), huber=-1.0),
-     lambda: ChannelLoss((Channel(0, 3, 1.0),)).prepare(TRAIN, "train")],
+    [lambda: TrajectoryLoss((1.0, 0.0)), lambda: TrajectoryLoss((np.nan,)), lambda: TrajectoryLoss([1.0]),
+     lambda: TrajectoryLoss((1.0,) * 3).prepare(TRAIN, "train")],
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"scale|channels|huber|train: states"):
+    with pytest.raises(ValueError, match=r"scale must|train: states of 3"):
         wrong()
