@@ -2,7 +2,9 @@
 
 import errno
 import math
+import sys
 import tempfile
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,6 +25,14 @@ SMALLEST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32)
 
 def is_traced(value: Any) -> bool:
     return isinstance(value, jax.core.Tracer)
+
+
+def warn(line: str) -> None:
+    """Warn at the caller's line, the last one outside of this library."""
+    frame, level = sys._getframe(1), 2
+    while (above := frame.f_back) and frame.f_globals.get("__name__", "").startswith("hybrid_jax."):
+        frame, level = above, level + 1
+    warnings.warn(line, stacklevel=level)
 
 
 def not_traced(name: str, *arguments: Any) -> None:

@@ -1,6 +1,5 @@
 """`adapt`: adapt any field to windows of a changed system, with any method and one type of result."""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -120,9 +119,9 @@ def adapt(
         physics = type(physics_of(field)).__name__
         raise ValueError(f"field: {physics} has {size} unnamed parameters, too many to fit; use method='fine_tune'")
     if (reason := check_savable(field)) is not None:
-        warnings.warn(reason, stacklevel=3)
+        checks.warn(reason)
     if overlap(windows):
-        warnings.warn(OVERLAP, stacklevel=3)
+        checks.warn(OVERLAP)
     keep_programs("adapt", windows.x.shape)
     with solver_errors(solver):
         given, errors = len(windows), np.asarray(errors_in(windows, field, compact(solver)))
@@ -140,9 +139,9 @@ def adapt(
     if settings.objective is UNSCALED:
         settings = replace(settings, objective=scaled_loss(field, motion.get("learned_from") or train))
     if motion and learned_from is None and has_network(field):
-        warnings.warn(NO_MOTION, stacklevel=3)
+        checks.warn(NO_MOTION)
     if motion and len(windows) <= size:
-        warnings.warn(FEW.format(len(windows), size), stacklevel=3)
+        checks.warn(FEW.format(len(windows), size))
     load_lapack()
     keep_programs("adapt", windows.x.shape)
     diverged = Solution(field, status=Status.DIVERGED) if overflows(windows) or overflows(held_out) else None

@@ -27,7 +27,8 @@ class StateSpaceModel(eqx.Module):
         field: the vector field f.
         inputs: the names of the signals that make up u, in order.
         outputs: the functions h by name. Each takes the state (d,) and the input (m,), and returns a scalar or (k,). If
-            it has a third argument, this is the field with its present numbers: an accelerometer measures ẋ.
+            it has a third argument, this is the field with its present numbers: an accelerometer measures ẋ. A field
+            that it takes from elsewhere keeps the numbers that it has.
         start: the expected initial state (d,).
         spread: the standard deviation of the initial state about `start` (d,): 0 if you know it, infinite if you know
             nothing about it. An attitude has three numbers here, its rotation [rad].

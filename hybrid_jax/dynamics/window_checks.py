@@ -1,6 +1,5 @@
 """Checks of windows against the field that they are for."""
 
-import warnings
 from dataclasses import replace
 
 import equinox as eqx
@@ -48,7 +47,7 @@ def _warn_of_turns(space: StateSpace, x0, x, name: str) -> None:
         for i in np.flatnonzero(jumps := turns(path[..., part])) if one.is_vector else ():
             where = f"{name}: x[{part.start + i}] jumps by about 2π in {jumps[i]} of {len(path)} windows"
             remedy = "if it is an angle, unwrap it, or give the field a `state_space` with an `Angle`"
-            warnings.warn(f"{where}; {remedy}", stacklevel=3)
+            checks.warn(f"{where}; {remedy}")
 
 
 def turns(path: Float[np.ndarray, "n t k"], turn: float = 2 * np.pi) -> Int[np.ndarray, " k"]:
@@ -79,7 +78,7 @@ def _warn_of_units(field: AbstractVectorField, space: StateSpace, windows: Traje
         rates = _steps(space, np.stack([x[fast] + 0 * slopes, x[fast] + slopes], axis=-2).astype(float))[..., 0, i]
         if np.abs(rates - x[fast, j]).max() < 0.05 * np.abs(x[fast, j]).max():
             rate = f"{name}: x[{j}] is {gains[i, j]:.3g} times the rate of {space.tangent_names[i]}"
-            warnings.warn(f"{rate}: check their units, and dt", stacklevel=3)
+            checks.warn(f"{rate}: check their units, and dt")
 
 
 @jit_by_size(UNOPTIMISED)

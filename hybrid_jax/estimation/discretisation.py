@@ -1,6 +1,5 @@
 """What half the solver's step would change in a fit: intervals do not include it, and a network learns it."""
 
-import warnings
 from dataclasses import replace
 
 import diffrax
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.by_product import fixed_residual
 from hybrid_jax.dynamics.disturbance import physics_of, with_physics
@@ -68,19 +68,18 @@ def compare_steps(
     solver: Solver,
     scale: Scale,
     named: bool | None = None,
-    stacklevel: int = 4,
 ) -> float:
     """Return the `discretisation` of a field, by default of all that it learns, and warn if the step is too long."""
     named = is_named(field) if named is None else named
     moved = discretisation(field, windows, solver, scale, named)
-    warn_of_steps(moved, REMEDY, named, stacklevel + 1)
+    warn_of_steps(moved, REMEDY, named)
     return moved
 
 
-def warn_of_steps(moved: float, remedy: str, named: bool = True, stacklevel: int = 4) -> None:
+def warn_of_steps(moved: float, remedy: str, named: bool = True) -> None:
     if moved > COARSE:
         what = f"move a parameter by {moved:.2g} standard" if named else f"change predictions by {moved:.2g} of their"
-        warnings.warn(f"half the solver's step would {what} errors: give {remedy}", stacklevel=stacklevel)
+        checks.warn(f"half the solver's step would {what} errors: give {remedy}")
 
 
 @jit_by_size(UNOPTIMISED)

@@ -1,6 +1,5 @@
 """Learn to predict a disturbance from its own past, and estimate its hidden state from measured states."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -89,7 +88,7 @@ def observe(model: DisturbanceModel, past: Trajectories, solver: Solver = None) 
     """
     seconds, needed = past.horizon * past.dt, max(model.time_constants, default=0.0)
     if seconds < needed:
-        warnings.warn(f"past: {seconds:.3g} s are too short for filters of up to {needed:.3g} s", stacklevel=2)
+        checks.warn(f"past: {seconds:.3g} s are too short for filters of up to {needed:.3g} s")
     return _observed(model, past, solver)
 
 

@@ -4,7 +4,6 @@ Levenberg–Marquardt sums normal equations over segments (`shooting`), so memor
 """
 
 import dataclasses
-import warnings
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -172,13 +171,13 @@ def fit_records(
         found = _result(search, end._replace(steps=total), records, gridded, errors, robust, level)
     warn_of_steps(found.discretisation, f"a smaller dt, or substeps={2 * substeps}")
     if found.status != Status.OK:
-        warnings.warn(f"records: the fit {found.status.message}; check all units and the model", stacklevel=3)
+        checks.warn(f"records: the fit {found.status.message}; check all units and the model")
     for name, each in found.errors.items():
         if (each > 1.1 * deviation[name] + FINE * np.abs(y[name]).max()).any():
             line = f"{name} varies less than the fit's errors: check all units and the model, or give a segment"
-            warnings.warn(f"records: {line}", stacklevel=3)
+            checks.warn(f"records: {line}")
     if found.directions:
-        warnings.warn(f"records: no sample determines {'; '.join(found.directions)}", stacklevel=3)
+        checks.warn(f"records: no sample determines {'; '.join(found.directions)}")
     return found
 
 

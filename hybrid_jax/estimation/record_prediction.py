@@ -1,7 +1,6 @@
 """Simulate a model with the inputs of a record, and predict from its last samples."""
 
 import dataclasses
-import warnings
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import in_double
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.outputs import StateSpaceModel
@@ -118,4 +118,4 @@ def _warn_if_short(model: StateSpaceModel, past: Record, known: RecordFit, state
     change = record_search.sizes_between(space, states, known.starts[0])
     error = np.divide(known.starts_error[0], np.sqrt(spare), out=np.full(len(free), np.inf), where=spare > 0)
     if lost := [name for name, each in zip(space.tangent_names, free & (error > change), strict=True) if each]:
-        warnings.warn(f"{past.name}: too short to determine {', '.join(lost)}: the prediction is a guess", stacklevel=4)
+        checks.warn(f"{past.name}: too short to determine {', '.join(lost)}: the prediction is a guess")

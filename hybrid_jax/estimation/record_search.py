@@ -1,9 +1,7 @@
 """The search for the parameters and the states at the nodes of records, see `record_fit`."""
 
 import dataclasses
-import inspect
 import itertools
-import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -14,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import ravel_learned, trainable
 from hybrid_jax.dynamics.window_checks import foreign_units, turns
 from hybrid_jax.estimation import shooting
 from hybrid_jax.estimation.elimination import End, descend, reduced, undetermined
@@ -186,12 +185,8 @@ def directions(search: Search, end: End, records: Sequence[Record]) -> tuple[str
 
 
 def check_signals(model: Model, records: Sequence[Record], gridded: list[Gridded], dt: float) -> None:
-    """Warn of times and angles in other units, and of outputs that use a field which is not learned."""
+    """Warn of times and angles in other units."""
     found = []
-    for name, h in model.outputs.items():
-        used = inspect.getclosurevars(h) if inspect.isfunction(h) else None
-        if used and any(isinstance(each, AbstractVectorField) for each in {**used.nonlocals, **used.globals}.values()):
-            found.append(f"outputs: {name} uses a field that is not learned: take it as third argument, (x, u, field)")
     for record, each in zip(records, gridded, strict=True):
         begin, end = each.start, each.start + len(each.u) * dt
         signals = {name: record.signals[name] for name in (*model.inputs, *model.outputs) if record.signals[name]}
@@ -208,7 +203,7 @@ def check_signals(model: Model, records: Sequence[Record], gridded: list[Gridded
                     f"{record.name}: most of {name} is not between {begin:.6g} and {end:.6g} s: check all times"
                 )
     for line in found:
-        warnings.warn(line, stacklevel=4)
+        checks.warn(line)
 
 
 def _turns(signal: Signal) -> list[str]:

@@ -1,7 +1,6 @@
 """Load logs of any format (detected from the first bytes and the suffix), check them and clean them."""
 
 import contextlib
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from hybrid_jax import checks
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.checks.consistency import FAILS, WARNS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
@@ -126,7 +126,7 @@ def report(found: Sequence[tuple[str, Check]], failed: Failed) -> None:
         more = f" ({len(lines[FAILS]) - 1} more checks failed)" if len(lines[FAILS]) > 1 else ""
         raise ValueError(f'{lines[FAILS][0]}{more}; failed="warn" continues nevertheless')
     for line in (*lines[FAILS], *lines[WARNS]):
-        warnings.warn(line, stacklevel=3)
+        checks.warn(line)
 
 
 def format_of(path: str | Path) -> tuple[str, str]:

@@ -1,7 +1,6 @@
 """Save and load trained models. A file contains only data; loading it runs no code of the file."""
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,9 +87,9 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
     arrays = named_leaves({"field": field}) | {key: to_numpy(leaf) for key, leaf in structure.static_arrays.items()}
     save_archive(path, FORMAT, {"field": structure.tree, "about": dict(about)}, arrays)
     if structure.problem is not None:
-        warnings.warn(f"{path}: this model can only be loaded with like=: {structure.problem}", stacklevel=2)
+        checks.warn(f"{path}: this model can only be loaded with like=: {structure.problem}")
     if spoiled := _not_finite(field):
-        warnings.warn(f"{path}: this model cannot be loaded: {spoiled}", stacklevel=2)
+        checks.warn(f"{path}: this model cannot be loaded: {spoiled}")
 
 
 def load(path: str | Path, like: eqx.Module | None = None) -> Model:

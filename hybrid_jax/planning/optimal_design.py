@@ -3,7 +3,6 @@ Optimal Experiments, 1972; Mehra, IEEE TAC 1974; as Fourier series Swevers et al
 """
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -255,7 +254,7 @@ def _excited(search: _Search, begun, wanted: tuple[str, ...]) -> tuple[Bool[Arra
     windows = windows_of(x[:, : len(search.noise)], u, search.design.dt, steps=search.window)
     seen = jnp.asarray(gram > float(rounding(windows, search.noise)) ** 2)
     for name in (name for name, known in zip(names, seen, strict=True) if not known):
-        warnings.warn(f"excitation: no input excites {name}; it is left out", stacklevel=4)
+        checks.warn(f"excitation: no input excites {name}; it is left out")
     asked = jnp.asarray([name in wanted for name in names]) & seen
     if not asked.any():
         raise ValueError(f"parameters: no input excites any of {', '.join(wanted)}")

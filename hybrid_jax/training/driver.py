@@ -1,7 +1,6 @@
 """`fit`: train one field on windows, by the compiled loop of `fitting` in blocks of epochs."""
 
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -202,7 +201,7 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
 def ready(field: Learner, train: Trajectories) -> Learner:
     """The field with its scaling and motion set; warns if you will need `like` to load it from a file."""
     if (reason := check_savable(field)) is not None:
-        warnings.warn(reason, stacklevel=4)
+        checks.warn(reason)
     return with_motion(with_scaling(field, train), train) if isinstance(field, AbstractVectorField) else field
 
 
@@ -211,8 +210,7 @@ def compared(result: FitResult, data: PyTree, settings: Settings) -> FitResult:
     loss = settings.objective
     if result.status == Status.DIVERGED or not (isinstance(loss, TrajectoryLoss) and isinstance(data, Trajectories)):
         return result
-    scale = loss.divisor()
-    moved = compare_steps(result.best, data, settings.solver, scale, stacklevel=5)
+    moved = compare_steps(result.best, data, settings.solver, loss.divisor())
     return replace(result, discretisation=moved)
 
 

@@ -288,10 +288,6 @@ def test_records_may_have_different_sensors(records):
     assert float(fit.intervals["log_length"].value) == pytest.approx(np.log(0.8), abs=0.01)
     with pytest.raises(ValueError, match="records: none has a sample of angle"):
         fit_records(model, [felt], dt=0.02)
-    other = pendulum(1.0, 0.1)
-    fixed = dataclasses.replace(model, outputs={"acceleration": lambda x, u: other(x, u)[1]})
-    with pytest.warns(UserWarning, match=r"acceleration uses a field that is not learned: take it as third argument"):
-        fit_records(fixed, [felt], dt=0.02)
 
 
 class Turntable(hj.AbstractVectorField):

@@ -49,8 +49,9 @@ def spinning():
 def test_other_units_and_wrapped_angles_are_said(name, times, of, dt, said):
     signals = dict(spinning().signals)
     signals[name] = Signal(times * signals[name].t, of(signals[name].values))
-    with pytest.warns(UserWarning, match=said):
+    with pytest.warns(UserWarning, match=said) as warned:
         fit_records(model_of(pendulum()), [Record("r", signals)], dt=dt, max_steps=1, rounds=1)
+    assert {w.filename for w in warned} == {__file__}
 
 
 def test_a_past_far_from_the_models_start_is_found_and_a_short_one_said():
@@ -59,5 +60,6 @@ def test_a_past_far_from_the_models_start_is_found_and_a_short_one_said():
     y, seen = predict(model, past, future, dt=0.02)["angle"], future.signals["angle"]
     assert np.abs(y - seen.values[-len(y) :]).max() < 10 * NOISE
     two = Signal(seen.t[:2], seen.values[:2])
-    with pytest.warns(UserWarning, match=r"too short to determine x\[0\], x\[1\]: the prediction is a guess"):
+    with pytest.warns(UserWarning, match=r"too short to determine x\[0\], x\[1\]: the prediction is a guess") as warned:
         predict(model, Record("two", {**one.signals, "angle": two}), one.part(6.2, 8.0), dt=0.02)
+    assert {w.filename for w in warned} == {__file__}  # also of the fit within
