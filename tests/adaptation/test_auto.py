@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pendulum import LENGTH, Push, flown, hybrid, pendulum, pushes
+from pendulum import LENGTH, flown, hybrid, pendulum
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation import FineTune, adapt, auto, selection
+from hybrid_jax.adaptation import FineTune, Solution, adapt, auto
 from hybrid_jax.adaptation.anchored import fit_anchored, subspace, taken_by_network, with_change
 from hybrid_jax.adaptation.plausible import CANDIDATES, extended, free_parameters
-from hybrid_jax.adaptation.selection import STRONG, Fit, alike, blocks_of, correlated, fit_each, posterior
+from hybrid_jax.adaptation.selection import STRONG, blocks_of
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations
@@ -22,7 +22,6 @@ from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.normalisation import ChannelScaling
 from hybrid_jax.status import Status
-from hybrid_jax.trajectories import windows_of
 
 
 class Half(hj.AbstractVectorField):
@@ -40,78 +39,6 @@ def test_a_candidate_whose_parameters_no_window_tells_apart_is_fitted_all_the_sa
     assert result.chosen == "theta"
     assert result.field.first + result.field.second == pytest.approx(LENGTH, rel=0.01)
     assert "do not determine first, second: other values fit them as well" in result.report()
-
-
-def flight(steps, stride, seed=0):
-    inputs = np.random.default_rng(seed).normal(size=(400, 1)).astype(np.float32)
-    start = np.array([1.0, 0.0], np.float32)
-    states = np.concatenate([start[None], np.asarray(hj.rollout(pendulum(), start, inputs, 0.05))])
-    noise = 0.01 * np.random.default_rng(seed).normal(size=states.shape)
-    return windows_of((states + noise).astype(np.float32), inputs, 0.05, steps=steps, stride=stride)
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("stride", [1, 5, 6, 8])
-def test_windows_of_one_flight_are_correlated_whether_they_touch_overlap_or_not(stride):
-    windows = flight(5, stride)
-    assert correlated(windows) == -(-len(windows) // 5)
-    assert len(alike(flown(pendulum()), jax.tree.map(np.float64, windows))) == len(windows)
-
-
-def test_windows_that_overlap_are_adapted_to_with_a_warning():
-    with pytest.warns(UserWarning, match="windows overlap: left-out blocks share samples"):
-        adapt(pendulum(0.7), flight(5, 2)[:40], method="source")
-
-
-FREE = np.array([[False, False], [True, False], [True, True]])
-
-
-@eqx.filter_jit
-def chosen(start, apparent, size=1.0):
-    """Which of `FREE` is taken, and how probable each is, where the source has other gains than the truth."""
-    windows, _ = pushes(40, noise=0.3)
-    fits = fit_each(Push(start), windows, FREE[[0, 2]], jnp.full(2, 1e6), None, None, 50)[0]  # hardly any prior
-    source, every = (jax.tree.map(lambda leaf, i=i: leaf[i], fits) for i in (0, 1))
-    return posterior(source, every, start, FREE, jnp.full(2, size), jnp.full(2, apparent))
-
-
-def test_a_change_is_believed_if_the_evidence_is_strong_and_the_source_does_not_err_as_much():
-    truth = jnp.array([3.0, -2.0])
-    for away, taken in (([0.0, 0.0], 0), ([0.5, 0.0], 1), ([0.5, 0.5], 2)):
-        found = chosen(truth + jnp.array(away), jnp.zeros(()))
-        assert found.taken == taken
-        np.testing.assert_allclose(found.probability.sum(), 1, rtol=1e-5)
-        assert taken == 0 or found.probability[taken] > STRONG * found.probability[0]
-        np.testing.assert_allclose(found.theta[taken], truth, atol=0.25 if taken else 1e-6)
-    erring = chosen(truth + jnp.array([0.5, 0.0]), jnp.array(0.25))
-    assert erring.taken == 0
-    assert erring.naive[1] > STRONG * erring.naive[0]  # it would be believed of an exact source
-
-
-def test_left_out_blocks_confirm_a_change_of_all_and_not_of_two():
-    @jax.jit
-    def confirmed(errors):
-        def fit(offset):
-            r = errors - offset
-            equations = NormalEquations(jnp.ones((10, 1, 1)), -r[:, None], r**2)
-            return Fit(jnp.array([offset]), equations, jnp.ones((1, 1, 1)), 0.01, jnp.array([True]), 1, 0)
-
-        found, blocks = fit(errors.mean()), blocks_of(10, 10)
-        thetas = selection.left_out_thetas(found, jnp.array([True]), 1.0, 0.0, blocks)
-        return selection.surely_lower(found, fit(0.0), thetas, blocks)
-
-    assert [confirmed(each) for each in (np.linspace(0.5, 1.5, 10), np.repeat([3.0, 0.0], [2, 8]))] == [True, False]
-
-
-@pytest.mark.parametrize(("least", "sure"), [(0.1, True), (-0.5, False)])
-def test_large_gains_of_some_blocks_do_not_hide_the_small_ones_of_others(least, sure):
-    gains, blocks = np.repeat([4.0, 1.0, least], [2, 3, 5]), blocks_of(10, 10)
-    still = NormalEquations(jnp.ones((10, 1, 1)), jnp.zeros((10, 1)), jnp.ones(10))
-    before, after = (
-        Fit(jnp.zeros(1), still._replace(square=jnp.exp(-own)), jnp.ones((1, 1, 1)), 0.01, jnp.array([True]), 1, 0)
-        for own in (0 * gains, gains)
-    )
-    assert selection.surely_lower(after, before, jnp.zeros((10, 1)), blocks) == sure
 
 
 @pytest.mark.parametrize("chosen", ["source", "theta", "disturbance"])
@@ -240,13 +167,15 @@ def test_results_of_auto_are_pooled_with_what_the_networks_express():
     assert pooled.low < np.log(LENGTH) < pooled.high
 
 
-def test_one_window_warns_and_a_source_without_its_motion_says_how_to_add_it():
-    few, unknown = (
-        "windows: 1 are too few to determine 1 parameters",
-        "its training windows are unknown.*; pass learned_",
-    )
-    with pytest.warns(UserWarning, match=few), pytest.warns(UserWarning, match=unknown):
-        assert adapt(hybrid(), flown(hybrid(), count=1)).chosen == "source"
+def test_one_window_warns():
+    with pytest.warns(UserWarning, match="windows: 1 are too few to determine 1 parameters"):
+        assert adapt(pendulum(), flown(pendulum(), count=1)).chosen == "source"
+
+
+def test_a_source_without_its_motion_says_how_to_add_it(monkeypatch):
+    monkeypatch.setattr(auto.Auto, "solve", lambda self, field, *_, **__: Solution(field))
+    with pytest.warns(UserWarning, match=r"its training windows are unknown.*; pass learned_"):
+        adapt(hybrid(), flown(hybrid()))
 
 
 class Stiff(hj.AbstractVectorField):
@@ -303,7 +232,7 @@ def example(key, scaling):
     return adapt(source, windows(0.8, 20, draws[2]))
 
 
-@pytest.mark.parametrize("keys", [10, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("keys", [4, pytest.param(100, marks=pytest.mark.slow)])
 def test_the_interval_of_readme_s_example_contains_the_length(keys):
     """The source's own length is 1 to 5 % too large, as a longer pendulum resembles one with damping."""
     scaling = ChannelScaling(output=(0.1, 1.0))  # one for all, so that one program serves

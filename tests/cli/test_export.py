@@ -3,6 +3,7 @@
 import json
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,7 @@ import hybrid_jax as hj
 from hybrid_jax.cli.export import TORQUE, Options, _filter
 from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.dynamics.rigid_body import Kinematics
-from hybrid_jax.export import export_adaptation_c, load_program
+from hybrid_jax.export import load_program
 from hybrid_jax.networks.standardise import with_motion
 
 ca = pytest.importorskip("casadi")
@@ -22,6 +23,16 @@ X, U = np.array([0, 0, 1, 1.0, 0, 0, 0, 0.3, 0, 0, 0, 0, 0.1]), np.full(4, 650.0
 @pytest.fixture(scope="module")
 def field():
     return hj.Hybrid(hj.rigid_body(hj.IRIS), hj.residual_network(13, 4, jax.random.key(0), hidden=4))
+
+
+@pytest.fixture
+def filters(monkeypatch):
+    """The filters that the command would write as C, with their options; to translate one takes seconds."""
+    given = []
+    monkeypatch.setattr(
+        "hybrid_jax.cli.export.export_adaptation_c", lambda *each, **own: given.append((*each, own)) or []
+    )
+    return given
 
 
 def test_all_that_is_written_is_the_model(field, tmp_path, called):
@@ -39,7 +50,7 @@ def test_all_that_is_written_is_the_model(field, tmp_path, called):
     np.testing.assert_allclose(field(X, U), derivative, rtol=1e-5, atol=1e-4)
 
 
-def test_of_a_model_with_a_past_the_update_is_written_and_said(tmp_path, called):
+def test_of_a_model_with_a_past_the_update_is_written_and_said(tmp_path, called, filters):
     model = DisturbanceModel(hj.rigid_body(hj.IRIS), jnp.eye(12, 13), jnp.ones(13), (0.1,), ())
     hj.save(tmp_path / "model.npz", model, {"dt": 0.02})
     _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--to", "c,stablehlo", "--out", tmp_path)
@@ -49,6 +60,7 @@ def test_of_a_model_with_a_past_the_update_is_written_and_said(tmp_path, called)
     seen = load_program(tmp_path / "observe.npz")(x0, U, X)
     np.testing.assert_allclose(seen, model.after(x0, hj.rollout(model.field, X, U[None], 0.02)[0], X, 0.02), atol=1e-3)
     assert "void model_observe(" in (tmp_path / "model.h").read_text()
+    assert len(filters) == 1
 
 
 def test_the_filter_keeps_which_states_an_adapted_model_disturbs(tmp_path):
@@ -60,30 +72,30 @@ def test_the_filter_keeps_which_states_an_adapted_model_disturbs(tmp_path):
     assert [size for name, size in scales.items() if name.startswith("disturbance")] == [TORQUE] * 3
 
 
-def test_c_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, called, monkeypatch):
+def test_c_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, called, monkeypatch, filters):
     monkeypatch.chdir(tmp_path)
     x0, u = np.tile(X, (20, 1)), np.full((20, 10, 4), 650.0)
     motion = hj.Trajectories(x0, u, np.tile(x0[:, None], (1, 10, 1)), 0.02)
     hj.save("model.npz", with_motion(field, motion), {"dt": 0.02})
     _, said, _ = called("export", "model.npz", "-o", "board", "--name", "iris", "--double", "--smooth", "30")
-    files = {"iris.h", "iris.c", "iris_adaptation.h", "iris_adaptation.c"}
-    assert {path.name for path in (tmp_path / "board").iterdir()} == files
+    assert {path.name for path in (tmp_path / "board").iterdir()} == {"iris.h", "iris.c"}
+    assert (filters[0][0].name, filters[0][-1]["name"], filters[0][-1]["double"]) == ("board", "iris_adaptation", True)
     assert "IRIS_DT 0.02" in (tmp_path / "board" / "iris.h").read_text()
     assert "typedef double real" in (tmp_path / "board" / "iris.c").read_text()
     (found,) = map(float, re.findall(r"smooth 30: ẋ differs by at most ([\d.e-]+),", said))
     assert 0 < found <= np.abs(field.residual.weight_out).sum(axis=1).max() / 60
 
 
-def test_the_filter_that_is_written_is_that_of_the_options(tmp_path, called):
+def test_the_filter_that_is_written_is_that_of_the_options(tmp_path, called, filters):
     hj.save(tmp_path / "model.npz", hj.rigid_body(hj.IRIS), {"dt": 0.02})
-    options = "--double --noise 0.1,0.2,0.3,0.4"
+    options = "--noise 0.1,0.2,0.3,0.4"
     _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--out", tmp_path, *options.split())
     assert "model_adaptation adapts Ix, Iy, k, disturbance, with a sample every 0.02 s" in said
     noise, process = (np.repeat(each, [3, 4, 3, 3]) for each in ([0.1, 0.2, 0.3, 0.4], [0, 0, 0.003, 0.005]))
     pushed = (3, 3, 3, 5, 5, 5)
     wanted = hj.OnlineAdaptation(hj.rigid_body(hj.IRIS), 0.02, noise, disturbance=pushed, process=process)
-    for path in export_adaptation_c(tmp_path / "wanted", wanted, name="model_adaptation", double=True):
-        assert (tmp_path / path.name).read_text() == path.read_text()
+    assert eqx.tree_equal(filters[0][1], wanted)
+    assert filters[0][-1] == {"name": "model_adaptation", "double": False, "state_size": 13, "input_size": 4}
 
 
 def test_a_model_without_parameters_has_no_filter(tmp_path, called):

@@ -53,7 +53,7 @@ def files(tmp_path):
 
 def test_a_folder_of_commands_becomes_a_page_and_a_model(files, called):
     folder, arguments = files
-    short = ["--dt", "0.01", "--steps", "40", "--windows", "20"]
+    short = ["--dt", "0.01", "--steps", "40"]  # all windows are fitted, so that all commands share their programs
     (folder / "logs" / "two.csv").rename(folder / "two.csv")
     assert "2 of 2 parameters are identified" in called("fit", *arguments, *short)[1]
     model: Any = hj.load(folder / "model.npz").field

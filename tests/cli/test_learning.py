@@ -14,8 +14,9 @@ from hybrid_jax.dynamics.vehicle_file import LEARN, VehicleModel
 from hybrid_jax.identification import learning
 from hybrid_jax.vehicle import IRIS
 
-BODY = hj.rigid_body(IRIS)
-LACKING = hj.Hybrid(BODY, ConstantDisturbance(jnp.array([0, 0, -1.0, 0, 0, 0])))  # the flights have no such force
+LACKING = hj.Hybrid(
+    hj.rigid_body(IRIS), ConstantDisturbance(jnp.array([0, 0, -1.0, 0, 0, 0]))
+)  # the flights have no such force
 errors = partial(learning.errors_of, steps=learning.STEPS)
 
 
@@ -33,15 +34,19 @@ def test_what_is_learned_by_default_follows_from_the_logs(given, learned, told):
     assert (model.learn, left.startswith(told), bool(left)) == (learned, True, bool(told))
 
 
-def test_a_push_that_the_model_lacks_is_predicted_from_the_errors_before():
-    model = learning.with_past(LACKING, LOGS[:6])
+@pytest.fixture(scope="module")
+def model():
+    return learning.with_past(LACKING, LOGS[:6])
+
+
+def test_a_push_that_the_model_lacks_is_predicted_from_the_errors_before(model):
     assert eqx.tree_equal(learning.without_past(model), LACKING)
     before, after = (errors(field, LOGS[7])[2:, -1, 1].mean() for field in (LACKING, model))
     assert after < 0.3 * before
 
 
-def test_errors_to_expect_of_a_past_are_of_flights_that_it_was_not_learned_from():
-    model, flown = learning.with_past(LACKING, LOGS[:6]), LOGS[6:]
+def test_errors_to_expect_of_a_past_are_of_flights_that_it_was_not_learned_from(model):
+    flown = LOGS[6:]
     found = learning.expected_with_past(model, flown, ["0.1 s", "2 s"])
     pasts = [learning.with_past(model, flown[:i] + flown[i + 1 :]) for i in range(3)]
     ends = [learning.rmse(errors(past, log))[-1] for past, log in zip(pasts, flown, strict=True)]
@@ -51,10 +56,9 @@ def test_errors_to_expect_of_a_past_are_of_flights_that_it_was_not_learned_from(
     assert one[1:] == (0.0, np.inf)  # one stretch bounds nothing; half of it is shorter than what a past remembers
 
 
-def test_weights_of_zero_have_the_errors_of_the_field_in_the_same_windows():
-    model = learning.with_past(BODY, LOGS[:3], most=3 * 60)
-    model = eqx.tree_at(lambda each: each.weights, model, 0 * model.weights)
-    np.testing.assert_allclose(errors(model, LOGS[4]), errors(BODY, LOGS[4]), atol=2e-5)
+def test_weights_of_zero_have_the_errors_of_the_field_in_the_same_windows(model):
+    still = eqx.tree_at(lambda each: each.weights, model, 0 * model.weights)
+    np.testing.assert_allclose(errors(still, LOGS[7]), errors(LACKING, LOGS[7]), atol=2e-5)
 
 
 GOOD = [-0.5, -0.4, -0.6, -0.5]

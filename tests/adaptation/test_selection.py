@@ -1,0 +1,86 @@
+"""Laws of the choice between changes, and of windows that are correlated."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import Push, flown, pendulum, pushes
+
+import hybrid_jax as hj
+from hybrid_jax.adaptation import adapt, selection
+from hybrid_jax.adaptation.selection import STRONG, Fit, alike, blocks_of, correlated, fit_each, posterior
+from hybrid_jax.estimation.normal_equations import NormalEquations
+from hybrid_jax.trajectories import windows_of
+
+
+def flight(steps, stride, seed=0):
+    inputs = np.random.default_rng(seed).normal(size=(400, 1)).astype(np.float32)
+    start = np.array([1.0, 0.0], np.float32)
+    states = np.concatenate([start[None], np.asarray(hj.rollout(pendulum(), start, inputs, 0.05))])
+    noise = 0.01 * np.random.default_rng(seed).normal(size=states.shape)
+    return windows_of((states + noise).astype(np.float32), inputs, 0.05, steps=steps, stride=stride)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("stride", [1, 5, 6, 8])
+def test_windows_of_one_flight_are_correlated_whether_they_touch_overlap_or_not(stride):
+    windows = flight(5, stride)
+    assert correlated(windows) == -(-len(windows) // 5)
+    assert len(alike(flown(pendulum()), jax.tree.map(np.float64, windows))) == len(windows)
+
+
+def test_windows_that_overlap_are_adapted_to_with_a_warning():
+    with pytest.warns(UserWarning, match="windows overlap: left-out blocks share samples"):
+        adapt(pendulum(0.7), flight(5, 2)[:40], method="source")
+
+
+FREE = np.array([[False, False], [True, False], [True, True]])
+
+
+@eqx.filter_jit
+def chosen(start, apparent, size=1.0):
+    """Which of `FREE` is taken, and how probable each is, where the source has other gains than the truth."""
+    windows, _ = pushes(40, noise=0.3)
+    fits = fit_each(Push(start), windows, FREE[[0, 2]], jnp.full(2, 1e6), None, None, 50)[0]  # hardly any prior
+    source, every = (jax.tree.map(lambda leaf, i=i: leaf[i], fits) for i in (0, 1))
+    return posterior(source, every, start, FREE, jnp.full(2, size), jnp.full(2, apparent))
+
+
+def test_a_change_is_believed_if_the_evidence_is_strong_and_the_source_does_not_err_as_much():
+    truth = jnp.array([3.0, -2.0])
+    for away, taken in (([0.0, 0.0], 0), ([0.5, 0.0], 1), ([0.5, 0.5], 2)):
+        found = chosen(truth + jnp.array(away), jnp.zeros(()))
+        assert found.taken == taken
+        np.testing.assert_allclose(found.probability.sum(), 1, rtol=1e-5)
+        assert taken == 0 or found.probability[taken] > STRONG * found.probability[0]
+        np.testing.assert_allclose(found.theta[taken], truth, atol=0.25 if taken else 1e-6)
+    erring = chosen(truth + jnp.array([0.5, 0.0]), jnp.array(0.25))
+    assert erring.taken == 0
+    assert erring.naive[1] > STRONG * erring.naive[0]  # it would be believed of an exact source
+
+
+def test_left_out_blocks_confirm_a_change_of_all_and_not_of_two():
+    @jax.jit
+    def confirmed(errors):
+        def fit(offset):
+            r = errors - offset
+            equations = NormalEquations(jnp.ones((10, 1, 1)), -r[:, None], r**2)
+            return Fit(jnp.array([offset]), equations, jnp.ones((1, 1, 1)), 0.01, jnp.array([True]), 1, 0)
+
+        found, blocks = fit(errors.mean()), blocks_of(10, 10)
+        thetas = selection.left_out_thetas(found, jnp.array([True]), 1.0, 0.0, blocks)
+        return selection.surely_lower(found, fit(0.0), thetas, blocks)
+
+    assert [confirmed(each) for each in (np.linspace(0.5, 1.5, 10), np.repeat([3.0, 0.0], [2, 8]))] == [True, False]
+
+
+@pytest.mark.parametrize(("least", "sure"), [(0.1, True), (-0.5, False)])
+def test_large_gains_of_some_blocks_do_not_hide_the_small_ones_of_others(least, sure):
+    gains, blocks = np.repeat([4.0, 1.0, least], [2, 3, 5]), blocks_of(10, 10)
+    still = NormalEquations(jnp.ones((10, 1, 1)), jnp.zeros((10, 1)), jnp.ones(10))
+    before, after = (
+        Fit(jnp.zeros(1), still._replace(square=jnp.exp(-own)), jnp.ones((1, 1, 1)), 0.01, jnp.array([True]), 1, 0)
+        for own in (0 * gains, gains)
+    )
+    assert selection.surely_lower(after, before, jnp.zeros((10, 1)), blocks) == sure
