@@ -1,7 +1,7 @@
 """Vector fields ẋ = f(x, u) of one state x (d,) and one input u (m,): physics, a network, or any function."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Self, TypeVar
 
 import equinox as eqx
@@ -152,6 +152,14 @@ class AbstractEstimator(eqx.Module):
             state: of the estimator, as returned by `begin` and `update`.
         """
         return u
+
+
+def parts_of(tree: Any) -> Iterator[Any]:
+    """The tree, and all modules, containers and leaves inside it."""
+    yield tree
+    for child in jax.tree.leaves(tree, is_leaf=lambda node: node is not tree):
+        if child is not tree:
+            yield from parts_of(child)
 
 
 def _fields_inside(tree) -> list[AbstractVectorField]:

@@ -1,6 +1,6 @@
 """f_p: the Newton–Euler equations of a multirotor, by default with unknown Ix, Iy and k (paper, Eq. 10); baselines."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks, rotation
 from hybrid_jax.dynamics import equations
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.base import AbstractVectorField, parts_of
 from hybrid_jax.dynamics.batching import expand_trailing
 from hybrid_jax.dynamics.composition import AbstractWrapper
 from hybrid_jax.dynamics.terms import CORRECTIONS, LOGARITHMIC, Terms, check_names, nominal_values, shape_of, units_of
@@ -257,10 +257,3 @@ class FrozenRates(AbstractWrapper):
 def vehicle_in(field: Any) -> Vehicle | None:
     vehicles = (getattr(part, "vehicle", None) for part in parts_of(field))
     return next((one for one in vehicles if isinstance(one, Vehicle)), None)
-
-
-def parts_of(tree: Any) -> Iterator[Any]:
-    yield tree
-    for child in jax.tree.leaves(tree, is_leaf=lambda node: node is not tree):
-        if child is not tree:
-            yield from parts_of(child)

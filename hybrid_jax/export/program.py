@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, as_field
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, parts_of
 from hybrid_jax.dynamics.hidden import DisturbanceModel, WithHidden
-from hybrid_jax.dynamics.rigid_body import parts_of
 from hybrid_jax.integrate import check_field, rk4_step
 from hybrid_jax.networks import smoothed
 from hybrid_jax.vehicle import STATE_SIZE, Vehicle

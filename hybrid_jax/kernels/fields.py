@@ -6,6 +6,7 @@ takes its result n and returns z and the weights W, γ and β besides ẋ; see c
 """
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from hybrid_jax.dynamics.base import parts_of
 from hybrid_jax.dynamics.batching import batch_norms
 from hybrid_jax.kernels import library
 from hybrid_jax.kernels.source import Source
@@ -141,15 +143,12 @@ class _Given(AbstractNorm):
         return self.normal
 
 
-def _check_methods(node: Any) -> None:
+def _check_methods(field: Any) -> None:
     """Reject a field with a user-defined batched method, which may differ from the method for one sample."""
-    for method in ("train_batch", "infer_batch"):
-        own = getattr(type(node), method, None)
+    for part, method in product(parts_of(field), ("train_batch", "infer_batch")):
+        own = getattr(type(part), method, None)
         if own is not None and not own.__module__.startswith("hybrid_jax."):
-            raise ValueError(f"{type(node).__name__} has a {method} of its own")
-    for part in jax.tree.leaves(node, is_leaf=lambda one: one is not node):
-        if part is not node:
-            _check_methods(part)
+            raise ValueError(f"{type(part).__name__} has a {method} of its own")
 
 
 def _is_array(leaf: Any) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics import AbstractVectorField, batching, unfreeze
+from hybrid_jax.dynamics.base import parts_of
 from hybrid_jax.dynamics.batching import AbstractBatchNorm, RunningStats
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.grids import GridNetwork
@@ -86,7 +87,7 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
 
     predicted = np.asarray(rollout_batch(probed, x, u[:, None], windows.dt))[:, 0]
     lacking, rate = (np.sqrt(np.mean(np.square(after - start), axis=0)) / windows.dt for start in (predicted, x))
-    grids = [node for node in jax.tree.leaves(field, is_leaf=_is_grid) if _is_grid(node)]
+    grids = [part for part in parts_of(field) if isinstance(part, GridNetwork)]
     seen, scalings = iter(_seen(probed, x.T, u.T)), []
     for network, new in zip(networks, unset, strict=True):
         if not new:
@@ -125,13 +126,8 @@ def _positive(scale: Float[np.ndarray, " d"], floor: Float[np.ndarray, " d"]) ->
     return tuple(np.where(np.isfinite(scale) & (scale > 0), scale, 1.0).tolist())
 
 
-def _is_grid(node) -> bool:
-    return isinstance(node, GridNetwork)
-
-
 def _networks(field: AbstractVectorField) -> list[ResidualNetwork]:
-    nodes = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, ResidualNetwork))
-    return [node for node in nodes if isinstance(node, ResidualNetwork)]
+    return [part for part in parts_of(field) if isinstance(part, ResidualNetwork)]
 
 
 def _scalings(field: AbstractVectorField) -> list[AbstractScaling]:

@@ -15,7 +15,7 @@ import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, as_field, state_space
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, parts_of, state_space
 from hybrid_jax.dynamics.disturbance import sized
 from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
@@ -211,8 +211,7 @@ def _design(model, bounds, seconds: float, window: float, dt: float, bandwidth: 
         return InputSeries(bounds, *numbers)
     if not isinstance(bounds, FlightBounds):
         raise ValueError(f"bounds must be FlightBounds or InputBounds, got {checks.short_repr(bounds)}")
-    parts = jax.tree.leaves(model, is_leaf=lambda node: isinstance(node, RigidBody))
-    bodies = [part for part in parts if isinstance(part, RigidBody)]
+    bodies = [part for part in parts_of(model) if isinstance(part, RigidBody)]
     if not bodies or state_space(model) != RIGID_BODY_SPACE:
         raise ValueError("bounds must be InputBounds, as the model is not a multirotor with rotor speeds as inputs")
     vehicle = bodies[0].vehicle

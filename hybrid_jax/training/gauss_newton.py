@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, as_field, ravel_learned
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, parts_of, ravel_learned
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import compare_steps
@@ -68,12 +68,8 @@ def trajectory_correlation(field: Hybrid, predicted, window: Trajectories, solve
 
 def neighbour_weights(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
     """The weights of a `GridNetwork` for all points except the centre: zero for a reaction, and not for diffusion."""
-    networks = [n for n in jax.tree.leaves(field, is_leaf=_is_grid) if _is_grid(n)]
+    networks = (part for part in parts_of(field) if isinstance(part, GridNetwork))
     return jnp.concatenate([jnp.zeros(0), *(network.neighbour_weights().ravel() for network in networks)])
-
-
-def _is_grid(node) -> bool:
-    return isinstance(node, GridNetwork)
 
 
 PENALTIES: dict[str, Rows] = {
