@@ -58,15 +58,6 @@ def test_order_of_motors_is_found(flight, order):
     assert check.suggestion == NOTHING if order == [0, 1, 2, 3] else back in check.suggestion
 
 
-def test_reversed_spin_is_found(flight):
-    arms, squares = np.array(IRIS.rotor_positions), flight.u**2
-    mix = np.stack([np.ones(4), arms[:, 1], -arms[:, 0], np.array(IRIS.spin)])
-    squares = np.linalg.solve(mix, mix @ squares.T * [[1], [1], [1], [-1]]).T
-    check = table(with_parts(flight, u=np.sqrt(squares)))
-    assert check[ORDER].verdict == OK
-    assert (check[YAW].verdict, "flip" in check[YAW].suggestion) == (FAILS, True)
-
-
 def test_a_spin_is_not_refused_for_an_inertia_that_may_be_an_estimate(flight):
     """While it rolls steadily, an Iy twice too large makes of pitch a torque about yaw that is against the motors."""
     (ix, _, iz), t = IRIS.inertia, flight.t
@@ -87,10 +78,12 @@ def test_a_spin_is_not_refused_for_an_inertia_that_may_be_an_estimate(flight):
         assert (found.verdict, words in found.suggestion) == (verdict, True), found
 
 
-@pytest.mark.parametrize("spin", [(1, 1, -1, 1), (1, 1, 1, 1)], ids=str)
-def test_unbalanced_spins_are_found(flight, spin):
+@pytest.mark.parametrize("spin", [(1, 1, -1, 1), (1, 1, 1, 1), tuple(-sign for sign in IRIS.spin)], ids=str)
+def test_unbalanced_and_reversed_spins_are_found(flight, spin):
     checks = {check.name: check for check in check_log(flight, replace(IRIS, spin=spin))}
-    assert (checks[YAW].verdict, "half of its rotors" in checks[YAW].suggestion) == (FAILS, True)
+    words = "half of its rotors" if sum(spin) else "flip"
+    assert checks[ORDER].verdict == OK
+    assert (checks[YAW].verdict, words in checks[YAW].suggestion) == (FAILS, True)
 
 
 def test_steady_wind_fails_no_check(flight):

@@ -56,9 +56,12 @@ REFUSED = {
     "one output": (NARROW, {}, r"train: field: ResidualNetwork must return .* \(2,\) for .* returned float32\[1\]$"),
 }
 STAGES = {
-    "none": ([], "stages"), "no list": (Stage({"": 0.1}), "stages must be a list of Stage, got Stage"),
-    "too long": ([Stage({"": 0.1}, steps=9)], "steps"), "no such part": ([Stage({"wing": 0.1})], "'wing'"),
-}  # fmt: skip
+    "none": (FIELD, [], "stages"),
+    "no list": (FIELD, Stage({"": 0.1}), "stages must be a list of Stage, got Stage"),
+    "too long": (FIELD, [Stage({"": 0.1}, steps=9)], "steps"),
+    "no such part": (FIELD, [Stage({"wing": 0.1})], "'wing'"),
+    "as a fit": (Frozen(FIELD), [Stage({"": 0.1})], "^field: Frozen has nothing to learn"),
+}
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -70,14 +73,9 @@ def test_what_cannot_be_trained_is_refused_by_name(name):
 
 @pytest.mark.parametrize("name", STAGES)
 def test_stages_that_make_no_sense_are_refused(name):
-    stages, said = STAGES[name]
+    field, stages, said = STAGES[name]
     with pytest.raises(ValueError, match=said):
-        fit_in_stages(FIELD, TRAIN, VALIDATION, KEY, stages, settings=Settings(20))
-
-
-def test_what_a_fit_refuses_stages_refuse():
-    with pytest.raises(ValueError, match=r"^field: Frozen has nothing to learn"):
-        fit_in_stages(Frozen(FIELD), TRAIN, VALIDATION, KEY, [Stage({"": 0.1})])
+        fit_in_stages(field, TRAIN, VALIDATION, KEY, stages, settings=Settings(20))
 
 
 def test_fewer_windows_than_a_minibatch_make_one():
