@@ -27,6 +27,8 @@ ENVIRONMENT = {
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
 }
+for name, value in ENVIRONMENT.items():  # at once, as conftest.py of a folder that is given to pytest imports JAX
+    os.environ.setdefault(name, value)
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []  # other systems bind no process
 
 
@@ -34,8 +36,6 @@ def pytest_configure(config):
     worker = os.environ.get("PYTEST_XDIST_WORKER", "")  # gw0, gw1, …
     if worker and CORES:
         os.sched_setaffinity(0, {CORES[int(worker.removeprefix("gw")) % len(CORES)]})
-    for name, value in ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
 
 
 def pytest_collection_modifyitems(items):
