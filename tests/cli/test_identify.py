@@ -31,8 +31,8 @@ motors = { columns = ["c0", "c1", "c2", "c3"], unit = "share" }
 def files(tmp_path):
     """A rig that shakes its thrust: k is a tenth more than nominal, the lag 0.08 s."""
     rng, dt = np.random.default_rng(0), 0.01
-    t = dt * np.arange(1600)
-    c = np.repeat(rng.uniform(0.45, 0.75, 100), 16)
+    t = dt * np.arange(800)
+    c = np.repeat(rng.uniform(0.45, 0.75, 50), 16)
     w = np.empty_like(c)
     speed = 100 + 900 * c[0]
     for i, told in enumerate(c):
