@@ -1,5 +1,6 @@
 """The normal equations of θ_p for each window, and the effect of leaving windows out."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -83,14 +84,14 @@ class Inverse(NamedTuple):
     rank: Int[Array, "*n"]  # number of directions of θ_p that change a prediction by more
 
 
-def inverse(gram: Float[Array, "p p"]) -> Inverse:
-    """Invert a matrix after scaling it to a unit diagonal."""
+def inverse(gram: Float[Array, "p p"], rank: float = RANK) -> Inverse:
+    """Invert a matrix after scaling it to a unit diagonal; for `rank` see `RANK`."""
     scale = jnp.sqrt(jnp.diagonal(gram))
     scale = jnp.where(scale > 0, scale, 1)
     scales = scale[:, None] * scale
     scaled, epsilon = gram / scales, jnp.finfo(gram.dtype).eps
     values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(scaled))
-    seen = values > RANK * len(gram) * epsilon
+    seen = values > rank * len(gram) * epsilon
     found = (vectors * jnp.where(seen, 1 / values, 0.0)) @ vectors.T
     # A step of Newton's method has the derivative of the inverse; eigenvectors' is not always finite.
     found = found @ (2 * jnp.eye(len(gram)) - scaled @ found)
@@ -98,9 +99,9 @@ def inverse(gram: Float[Array, "p p"]) -> Inverse:
     return Inverse(found / scales, unseen < jnp.sqrt(epsilon), jnp.sum(seen))
 
 
-def inverses(grams: Float[Array, "n p p"]) -> Inverse:
+def inverses(grams: Float[Array, "n p p"], rank: float = RANK) -> Inverse:
     """Invert one after the other: two batches at once can wait for each other, see `batches.solve`."""
-    return jax.lax.map(inverse, grams)
+    return jax.lax.map(partial(inverse, rank=rank), grams)
 
 
 def steps_without(

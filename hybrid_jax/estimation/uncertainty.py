@@ -28,6 +28,8 @@ from hybrid_jax.estimation.normal_equations import (
 from hybrid_jax.runtime import UNOPTIMISED, entry, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
+TOLD = 2  # see `RANK`: an interval needs less of a margin than a step, and the yaw of a small quadrotor is close to it
+
 
 class Interval(NamedTuple):
     """An estimate and its confidence interval, in one unit.
@@ -95,12 +97,12 @@ def covariance_of(
 @jit_by_size(UNOPTIMISED)
 def _covariance(equations: NormalEquations, p: Int[Array, ""] | int, cluster: int, n: Int[Array, ""] | int):
     gram, score, _ = equations
-    bread = inverse(jnp.sum(gram, axis=0))
+    bread = inverse(jnp.sum(gram, axis=0), TOLD)
     told = bread.told
     if cluster > 1:
         clusters, of = -(-len(score) // cluster), np.arange(len(score)) // cluster
         gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
-        without = inverses(jnp.sum(gram, axis=0) - gram)
+        without = inverses(jnp.sum(gram, axis=0) - gram, TOLD)
         told = told & without.told.all(axis=0)
         # What leaving a cluster out does to θ_p.
         moves = jnp.einsum("gpq,gq->gp", without.matrix, score - jnp.mean(score, axis=0))

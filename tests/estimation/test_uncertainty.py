@@ -34,6 +34,22 @@ def test_a_linear_problem_meets_its_closed_form():
     np.testing.assert_allclose(covariance_of(field, windows, chunk=7), expected, rtol=1e-4)
 
 
+class Pair(AbstractVectorField):
+    """`Push` by the sum of two parameters and by a thousandth of their difference."""
+
+    parts: Float[Array, " 2"]
+
+    def __call__(self, x, u):
+        return Push(jnp.array([[1.0, 1.0], [1e-3, -1e-3]]) @ self.parts)(x, u)
+
+
+def test_parameters_that_are_told_apart_by_little_have_their_intervals():
+    windows, design = pushes(30, 1e-3)
+    field = fit_least_squares(Pair(jnp.ones(2)), windows).field
+    expected = closed_form(windows, design @ np.array([[1.0, 1.0], [1e-3, -1e-3]]), field.parts)
+    np.testing.assert_allclose(covariance_of(field, windows), expected, rtol=0.3)  # float32 sums
+
+
 def test_a_parameter_that_the_windows_do_not_depend_on_stays_and_may_be_anything():
     windows, _ = pushes(30, 0.1)
     still = eqx.tree_at(lambda w: w.u, windows, windows.u * np.float32([1, 0]))
