@@ -83,7 +83,8 @@ def _page(
     effective: dict[Any, dict[str, None]] = {}  # why → names without their indices
     for name, _, one in changes:
         effective.setdefault(one.effective, {})[name.partition("[")[0]] = None
-    own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
+    # What was zero, such as an added drag, is new to the model; a rotor's efficiency was one.
+    own, lacked = ([each for each in changed if (each[0] in learned or each[1] != 0) == of] for of in (True, False))
     fields = {"before": known.field} | ({"adapted": field} if different else {})
     curves = {name: rmse_by_flight(each, flights.logs, known.steps) for name, each in fields.items()}
     old, *new = (errors.texts(each.mean(axis=0)[-1])[1] for each in curves.values())
