@@ -16,6 +16,7 @@ from hybrid_jax.dynamics.hidden import DisturbanceModel
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.least_squares import Solver
 from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.runtime import FASTEST_COMPILE, UNOPTIMISED, jit_with
 from hybrid_jax.trajectories import Trajectories, windows_of
 
 FILTERS = 5, 20, 60  # time constants, in intervals
@@ -115,7 +116,7 @@ def errors_after_one(
     return np.concatenate(parts)[: n * t].reshape(n, t, -1)
 
 
-@eqx.filter_jit
+@jit_with(FASTEST_COMPILE)
 def _one_step(field, rows: Any, dt: float, solver: Solver) -> Float[Array, "n e"]:
     x, u, after = rows
     space = state_space(field, x.shape[-1])
@@ -152,7 +153,7 @@ def _states(field: AbstractVectorField, windows: Trajectories) -> tuple[int, ...
     return tuple(np.flatnonzero(np.abs(np.asarray(slope)).max(axis=(0, 1)) > 0).tolist())
 
 
-@eqx.filter_jit
+@jit_with(UNOPTIMISED)
 def _slopes(field, x, u) -> Float[Array, "n d d"]:
     return jax.vmap(jax.jacfwd(field))(x, u)
 
@@ -208,7 +209,7 @@ def _scores(start: DisturbanceModel, weights, flights: Sequence, steps: int, sol
     return np.nan_to_num(np.log(of_quantity).mean(axis=0), nan=np.inf)
 
 
-@eqx.filter_jit
+@jit_with(FASTEST_COMPILE)
 def _squares(model, weights, windows: Any, dt: float, solver: Solver) -> Float[Array, " e"]:
     """Mean squared error at the end of windows, number by number."""
     x0, u, end = windows

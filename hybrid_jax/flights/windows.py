@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +18,7 @@ from hybrid_jax.flights.checks.consistency import check_log
 from hybrid_jax.flights.load import Failed, load_logs, report
 from hybrid_jax.flights.log import FlightLog, even_segments, segments
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.runtime import entry
+from hybrid_jax.runtime import FASTEST_COMPILE, entry, jit_with
 from hybrid_jax.trajectories import Trajectories, check, concatenate, windows_of
 from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, Vehicle
 
@@ -247,7 +246,7 @@ def flight_errors(field: AbstractVectorField, windows: Trajectories) -> FlightEr
     return FlightErrors(*(np.concatenate(arrays)[: len(windows)] for arrays in zip(*found, strict=True)))
 
 
-@eqx.filter_jit
+@jit_with(FASTEST_COMPILE)
 def _errors(field, windows: Trajectories) -> FlightErrors:
     predicted = rollout_batch(field, windows.x0, windows.u, windows.dt)
     return errors_between(*(each[..., :STATE_SIZE] for each in (predicted, jnp.asarray(windows.x))))
