@@ -291,11 +291,10 @@ class OnlineAdaptation(AbstractEstimator):
         return kalman.triangular(belief, d), told, slope, correction
 
     def _haste(self, state: OnlineState, sample: Sample, opens: Bool[Array, ""]) -> Float[Array, " p"]:
-        """Update the log-scale of the random walk: of disturbances, or of all parameters without one."""
+        """Update the log-scale of the random walk: of disturbances or, without one, of all unless reset now."""
         varies, tuning = self._varies(), self.tuning
         pulled = state.test.pulled / EAGER - 1
         rise = jnp.where(pulled > 0, RISE * jnp.minimum(pulled, 4.0), -FALL)
         rise = self.dt / tuning.pace * jnp.where(sample.measured, rise, 0.0)
         haste = jnp.clip(state.haste + rise + jnp.where(opens & (pulled > 0), 1.0, 0.0), 0.0, math.log(tuning.gusts))
-        # What opens need not walk.
         return jnp.asarray(varies, haste.dtype) * haste if varies.any() else jnp.where(opens, 0.0, haste)
