@@ -3,14 +3,24 @@
 import gzip
 import tempfile
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from surface import refusal
 from writers import blackbox
 
+import hybrid_jax as hj
 from hybrid_jax.flights import read_recording, to_flight
 
 pytest.importorskip("orangebox")
+
+
+class Torque(hj.AbstractVectorField):
+    gains: jax.Array
+
+    def __call__(self, x, u):
+        return self.gains @ u**2
 
 
 def test_a_blackbox_log_is_the_flight_it_holds(flight, written, monkeypatch):
@@ -23,6 +33,9 @@ def test_a_blackbox_log_is_the_flight_it_holds(flight, written, monkeypatch):
     np.testing.assert_allclose(signals["voltage"].values, 16.5)
     np.testing.assert_allclose(signals["command"].values, flight.u[:last] / 1999, atol=3e-4)
     np.testing.assert_allclose(signals["rotor_speed"].values, flight.u[:last], atol=1)
+    model = hj.StateSpaceModel(Torque(jnp.zeros((3, 4))), ("command",), {"rates": lambda x, u: x}, (0,) * 3, (9,) * 3)
+    fit = hj.fit_records(model, [recording], dt=0.01)
+    assert (fit.errors["rates"] < 0.1 * signals["rates"].values.std(axis=0)).all()
     assert "damage" not in recording.facts
     assert "damage" in read_recording(written(blackbox(flight[:200], ended=False), "cut.bbl")).facts
     refusal(lambda: to_flight(recording), "no position", "identify")
