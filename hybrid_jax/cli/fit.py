@@ -27,8 +27,8 @@ from hybrid_jax.io.models import save
 __all__ = ["Options", "run"]
 OF_MODEL = ("windows", "motion")  # of the model, and not of the report
 REMEMBERS = (
-    "Errors of the model last, for example because a load swings that no sensor shows. So it predicts them from its "
-    "errors in the seconds before; see docs/howto/records.md on how you give them to it."
+    "The model also uses its errors in the seconds before: they show forces that last, for example of a load that "
+    "swings, and noise in the first sample. docs/howto/records.md says how you give them to it."
 )
 QUANTILES = np.linspace(0.01, 0.99, 99)
 
