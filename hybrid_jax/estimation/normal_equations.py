@@ -84,14 +84,14 @@ class Inverse(NamedTuple):
     rank: Int[Array, "*n"]  # number of directions of θ_p that change a prediction by more
 
 
-def inverse(gram: Float[Array, "p p"], rank: float = RANK) -> Inverse:
-    """Invert a matrix after scaling it to a unit diagonal; for `rank` see `RANK`."""
+def inverse(gram: Float[Array, "p p"], least: float | None = None) -> Inverse:
+    """Invert a matrix after scaling it to a unit diagonal; `least` replaces `RANK` times p."""
     scale = jnp.sqrt(jnp.diagonal(gram))
     scale = jnp.where(scale > 0, scale, 1)
     scales = scale[:, None] * scale
     scaled, epsilon = gram / scales, jnp.finfo(gram.dtype).eps
     values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(scaled))
-    seen = values > rank * len(gram) * epsilon
+    seen = values > (RANK * len(gram) if least is None else least) * epsilon
     found = (vectors * jnp.where(seen, 1 / values, 0.0)) @ vectors.T
     # A step of Newton's method has the derivative of the inverse; eigenvectors' is not always finite.
     found = found @ (2 * jnp.eye(len(gram)) - scaled @ found)
@@ -99,9 +99,9 @@ def inverse(gram: Float[Array, "p p"], rank: float = RANK) -> Inverse:
     return Inverse(found / scales, unseen < jnp.sqrt(epsilon), jnp.sum(seen))
 
 
-def inverses(grams: Float[Array, "n p p"], rank: float = RANK) -> Inverse:
+def inverses(grams: Float[Array, "n p p"], least: float | None = None) -> Inverse:
     """Invert one after the other: two batches at once can wait for each other, see `batches.solve`."""
-    return jax.lax.map(partial(inverse, rank=rank), grams)
+    return jax.lax.map(partial(inverse, least=least), grams)
 
 
 def steps_without(

@@ -28,7 +28,9 @@ from hybrid_jax.estimation.normal_equations import (
 from hybrid_jax.runtime import UNOPTIMISED, entry, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
-TOLD = 2  # see `RANK`: an interval needs less of a margin than a step, and the yaw of a small quadrotor is close to it
+# Times the rounding of one number. The errors of many windows cancel, so that an interval needs less of a margin than a
+# step does: the yaw of a small quadrotor tells its rotors apart by 100 times the rounding.
+TOLD = 8
 
 
 class Interval(NamedTuple):
