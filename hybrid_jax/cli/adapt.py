@@ -97,14 +97,14 @@ def _page(
     title = "What changed" if changed else "Parameters, none of which clearly changed"
     moved = [each for each in changes if each[1] != each[2].value] or changes
     main = ([*own, *lacked] or moved)[:SHOWN]
-    rows = [(name, f"{value:.4g} {one.unit or ''}".rstrip(), str(one)) for name, value, one in main]
+    rows = [(name, str(one), f"{value:.4g} {one.unit or ''}".rstrip()) for name, value, one in main]
     was = known.about.get("expected", {}).get("velocity")  # of a model that `fit` wrote
     expected = f", where {was[0]:.3g} m/s was expected on a new flight" if was else ""
     unseen = [each["velocity"] for each in [*found.expected.values()][:1] if different]
     return page.Page(
         f"What changed in {page.counted(flights.logs, 'flight')} of {options.after} ({flights.seconds:.0f} s)?",
         answer,
-        page.Table(f"{title} (95 % intervals)", ("parameter", "before", "after"), rows) if rows else None,
+        page.Table(f"{title} (95 % intervals)", ("parameter", "after", "before"), rows) if rows else None,
         [(f"RMSE on these flights{TAUGHT * different}", errors.figure(curves, known.dt))],
         [
             f"{error} was {old}; it is now {new[0]}." if new else f"{error} is {old}{expected}.",
