@@ -183,7 +183,7 @@ def _candidates(
         choice = METHOD.solve(field, windows, windows, shared, known).choice
         larger = extended(field, STATE_SIZE)
         # Of candidates that were not taken `choice` knows the parameters to first order alone.
-        options = METHOD.plausible.sizes(larger, windows), shared.solver, scale_of(shared.objective, STATE_SIZE)
+        options = METHOD.plausible.sizes(larger, windows), shared.solver, scale_of(shared.objective)
         fits, _ = fit_each(candidate(larger, choice, 0), windows, choice.free, *options, METHOD.max_steps)
         choice = choice._replace(theta=fits.theta)
 
