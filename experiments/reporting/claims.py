@@ -8,7 +8,7 @@ from experiments.reporting.tables import Table
 
 Evidence = TypeVar("Evidence")
 Part = tuple[bool | None, str]  # whether a hypothesis holds in one case, None if undecided, and the numbers behind that
-SUMMED = {False: "fail", None: "undecided"}
+SUMMED = {False: ("fail", "fails"), None: ("undecided", "undecided")}  # of several hypotheses, and of one
 OUTCOMES = {True: "✓ holds", False: "✗ fails", None: "– undecided"}
 
 
@@ -81,7 +81,7 @@ def summary(verdicts: Sequence[Verdict]) -> list[str]:
     if not judged:
         return []
     counts = {words: sum(each.holds is holds for each in judged) for holds, words in SUMMED.items()}
-    others = [f"{count} {words}" for words, count in counts.items() if count]
+    others = [f"{count} {words[count == 1]}" for words, count in counts.items() if count]
     return [f"{sum(each.holds is True for each in judged)} of {len(judged)} hypotheses hold{', '.join(['', *others])}."]
 
 
