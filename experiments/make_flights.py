@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from rich.console import Console
@@ -12,7 +12,7 @@ from rich.console import Console
 from experiments.flying.images import picture
 from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
-from experiments.runner.options import CountFromZero, check_numbers
+from experiments.runner.options import CountFromZero, Named, check_numbers
 from experiments.runner.progress import Line
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.files import digest
@@ -34,13 +34,13 @@ class Options:
     excites roll and pitch so that the inertia is identifiable. Every split has its own flights. The same arguments give
     the same file, byte for byte; an existing file with other content is never overwritten.
 
-    Example: python -m experiments.make_flights --domain source --out source.npz --train 10000 --validation 1000
+    Example: python -m experiments.make_flights --domain source -o source.npz --train 10000 --validation 1000
     """
 
     domain: Literal["source", "parameter_shift", "external_force"]
     """Which system. source: drag and ground effect. parameter_shift: the same with Ix 0.040, Iy 0.020 kg m².
     external_force: the same with side wind."""
-    out: Path
+    output: Annotated[Path, Named(aliases=["-o"])]
     """File to write (.npz)."""
     seed: CountFromZero = 0
     """Random seed."""
@@ -117,7 +117,7 @@ def survey(windows: Trajectories) -> dict[str, float]:
 
 def make_flights(options: Options) -> None:
     """Fly and save the dataset unless it exists; print statistics of its splits."""
-    dataset = read_or_fly(options.out, DOMAINS[options.domain], options.splits(), options.seed)
+    dataset = read_or_fly(options.output, DOMAINS[options.domain], options.splits(), options.seed)
     if options.picture is not None:
         picture(options.picture)
     splits = dataset.splits.items()

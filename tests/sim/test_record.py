@@ -155,14 +155,14 @@ def call(monkeypatch, *arguments):
 
 def test_the_command_writes_a_dataset_prints_a_table_and_keeps_what_exists(tmp_path, monkeypatch, capsys):
     file = tmp_path / "source.npz"
-    call(monkeypatch, "--domain", "source", "--out", file, "--train", 20, "--validation", 10)
+    call(monkeypatch, "--domain", "source", "--output", file, "--train", 20, "--validation", 10)
     assert "windows below 0.5 m" in capsys.readouterr().out
     before = file.read_bytes()
     assert len(load_dataset(file).splits["train"]) == 20
-    call(monkeypatch, "--domain", "source", "--out", file, "--train", 20, "--validation", 10)
+    call(monkeypatch, "--domain", "source", "--output", file, "--train", 20, "--validation", 10)
     for train, said in ((30, "splits.train.windows is 20, expected 30"), (-3, "--train must be")):
         with pytest.raises(SystemExit) as stop:
-            call(monkeypatch, "--domain", "source", "--out", file, "--train", train, "--validation", 10)
+            call(monkeypatch, "--domain", "source", "--output", file, "--train", train, "--validation", 10)
         assert stop.value.code == 2
         (message,) = capsys.readouterr().err.strip().splitlines()
         assert said in message
