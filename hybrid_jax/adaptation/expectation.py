@@ -18,6 +18,8 @@ from hybrid_jax.trajectories import Trajectories, errors_of
 
 LEVEL = 0.8
 JOINED = 10  # windows that touch, at most so many, are predicted as one
+FAR = 1e3  # times the error: an interval that ends there says nothing, for example where all errors are rounding
+NO_INTERVAL = "no interval: blocks are too few or differ too much"
 Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
 
 
@@ -72,7 +74,8 @@ def expected_errors(
 
 def lines_of(expected: Expected, units: Mapping[str, str]) -> list[str]:
     def text(name: str, value: float, low: float, high: float) -> str:
-        return f"{name} {value:.3g} ({low:.2g} to {high:.2g}) {units[name]}".rstrip()
+        around = f"{low:.2g} to {high:.2g}" if high < FAR * value else NO_INTERVAL
+        return f"{name} {value:.3g} ({around}) {units[name]}".rstrip()
 
     return [
         f"  after {horizon}: {', '.join(text(name, *errors) for name, errors in found.items())}"

@@ -20,6 +20,10 @@ NETWORK = "network"  # the candidate that changes the network
 SHOWN = 0.01  # less probable candidates are not reported
 NOT_CONFIRMED = "errors in windows that were left out of the fit do not confirm it"
 AS_LARGE = "the source's own errors may be as large without any change"
+WITHIN = (
+    "Some intervals contain the value before. They are of the values themselves, which the network makes uncertain; "
+    "the changes are more certain, since the network is the same before and after."
+)
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,11 @@ class Parameter:
     def has_interval(self) -> bool:
         """Whether the parameter has a valid interval, which may be infinite."""
         return not math.isnan(self.low)
+
+    @property
+    def contains_before(self) -> bool:
+        """Whether it has an interval, which contains the source's value."""
+        return self.low <= self.before <= self.high
 
     def __str__(self) -> str:
         around = " (effective)" if self.effective else ""
@@ -160,6 +169,7 @@ class Adaptation:
                 yield f"  {name:<{width}}  {one}{before}"
             if self.changed:
                 yield f"Significantly different from the source: {', '.join(self.changed)}."
+                yield from [WITHIN] * any(self.parameters[name].contains_before for name in self.changed)
             told = [name for name, one in self.parameters.items() if one.has_interval and one.high < np.inf]
             effective = [name for name, one in self.parameters.items() if one.effective]
             if len(told + effective) < len(self.parameters) and self.chosen is not None:

@@ -8,6 +8,7 @@ import numpy as np
 import tyro
 
 from hybrid_jax.adaptation import Adaptation
+from hybrid_jax.adaptation.results import WITHIN
 from hybrid_jax.cli import errors, identify, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
 from hybrid_jax.cli.identify import KEEP
@@ -26,10 +27,6 @@ DIFFER = "These flights differ from the model, but do not determine which of its
 ALONE = "physics alone predicts the flights before better than with the network, and is the adapted model."
 STILL = "These flights hardly move, so they determine hardly anything."
 TAUGHT = ", to which the model was adapted"
-WITHIN = (
-    "Some intervals contain the value before. They are of the values themselves, which the network makes uncertain; "
-    "the changes are more certain, since the network is the same before and after."
-)
 LACKED = (
     "Effects that the model lacked explain these flights as well: {}. Flights before may have had them: name those "
     "that the vehicle always has, such as drag, in `learn` of the vehicle file, and fit again."
@@ -110,7 +107,7 @@ def _page(
             f"{error} was {old}; it is now {new[0]}." if new else f"{error} is {old}{expected}.",
             *[f"On flights not seen expect {v:.3g} m/s ({low:.3g} to {high:.3g})." for v, low, high in unseen],
             *([f"Of the model before, {ALONE}"] if found.alone else []),
-            *[WITHIN] * any(one.has_interval and one.low <= value <= one.high for _, value, one in own),
+            *[WITHIN] * any(one.contains_before for *_, one in own),
             *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
             *errors.unknown(found),
             *(f"The values of {', '.join(names)} are effective: {why}." for why, names in effective.items() if why),
