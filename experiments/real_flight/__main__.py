@@ -19,7 +19,7 @@ from hybrid_jax.identification.learning import STEPS, learnable
 
 ABOUT = "How well do models that `hybrid-jax fit` and `adapt` learn predict other flights?"
 GUIDE = """\
-real_flight needs flights: --vehicle FILE --before FOLDER [--after FOLDER] [--test-logs FOLDER], or --simulated.
+real_flight needs flights: --vehicle FILE --before FOLDER [--after FOLDER] [--test FOLDER], or --simulated.
 
   No logs at hand?  python -m experiments.real_flight --simulated --preset smoke
   writes logs of a simulated vehicle before and after a change to runs/real_flight/logs and trains on them. The files

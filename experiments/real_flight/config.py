@@ -9,7 +9,7 @@ from hybrid_jax.cli.logs import FlightOptions
 from hybrid_jax.dynamics.vehicle_file import check_learned
 
 PATHS = ("source", "target", "test", "vehicle", "columns")
-OPTIONS = {name: f"--{name}" for name in PATHS} | {"source": "--before", "target": "--after", "test": "--test-logs"}
+OPTIONS = {name: f"--{name}" for name in PATHS} | {"source": "--before", "target": "--after"}
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class RealFlightConfig(FlightOptions, Run):
     """Learn from the flights in --before, adapt to N windows of --after, test on held-out flights.
 
     Learning, adaptation and log readers are those of `hybrid-jax fit` and `adapt`, so you get the scores of the tool.
-    Without --test-logs, the target's flights are held out in turn (--folds). Without --after, nothing is adapted and
-    the source's models are tested. No data? Try --simulated.
+    Without --test, the target's flights are held out in turn (--folds). Without --after, nothing is adapted and the
+    source's models are tested. No data? Try --simulated.
 
     Example: python -m experiments.real_flight --vehicle v.toml --before before/ --after after/ --n-target 100,600
     """
@@ -29,7 +29,7 @@ class RealFlightConfig(FlightOptions, Run):
     """Folder of the flights before the change, preferably many."""
     target: Annotated[Path | None, Named(name="after")] = None
     """Folder of the few flights after the change."""
-    test: Annotated[Path | None, Named(name="test-logs")] = None
+    test: Path | None = None
     """Folder of test flights; by default the target's flights are held out in turn."""
     simulated: bool = False
     """Simulate flights, write their logs to --out and use them."""
@@ -42,10 +42,10 @@ class RealFlightConfig(FlightOptions, Run):
     n: Annotated[tuple[Count, ...], Target] = (100, 600)
     """Numbers of target windows of ten intervals to adapt to, spread evenly over the training flights."""
     folds: Count = 3
-    """Without --test-logs: number of folds, or as many as there are names."""
+    """Without --test: number of folds, or as many as there are names."""
     folds_by: Literal["flight", "manoeuvre"] = "flight"
     """Test and training share no flight, or no manoeuvre (file name without number).
-    With manoeuvre and without --after, flights in --test-logs are held out by manoeuvre as well."""
+    With manoeuvre and without --after, flights in --test are held out by manoeuvre as well."""
     data_seed: int = 0
     """Seed of the folds and of simulated flights."""
 

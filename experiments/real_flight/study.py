@@ -44,7 +44,7 @@ def make_folds(train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, c
     of = GROUP_BY[config.folds_by]
     known = {of(log) for log in train} & {of(log) for log in tested or train}
     if len(known) < 2:
-        none_left = "all flights are of one name, so none is left to train on; give flights to --test-logs"
+        none_left = "all flights are of one name, so none is left to train on; give flights to --test"
         raise ValueError(f"--folds-by {config.folds_by}: {none_left}")
     found = []
     for _, held_out in folds(

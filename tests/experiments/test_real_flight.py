@@ -73,8 +73,7 @@ def test_guide_is_printed_without_flights_but_a_wrong_option_is_named_first(give
 
 
 def test_lists_may_be_comma_separated():
-    given = ["--before", "1,2", "--horizon=10,50", "--test-logs=3,4", "--learn", "Ix,Iy", "k"]
-    given += ["--polynomial", "-150.5,9e2"]
+    given = ["--horizon=10,50", "--before", "1,2", "--test=3,4", "--learn", "Ix,Iy", "k", "--polynomial", "-150.5,9e2"]
     config: Any = read("real_flight", "", [*given, "--topics", "imu=/imu,motors=/m:data:rpm"], PRESETS)
     assert (config.horizon, config.polynomial, config.learn) == ((10, 50), (-150.5, 900.0), ("Ix", "Iy", "k"))
     assert (config.source, config.test, config.topics) == (Path("1,2"), Path("3,4"), ("imu=/imu", "motors=/m:data:rpm"))
@@ -85,8 +84,7 @@ def test_a_flight_that_is_there_twice_is_refused(tmp_path):
     same = replace(LOGS[0], name="/logs/chirp_run9.csv")
     folders = {"source": write(tmp_path / "source", LOGS[:2]), "test": write(tmp_path / "test", [same])}
     config = replace(CONFIG, vehicle=vehicle, **folders)
-    said = r"--test-logs chirp_run9.csv.gz: the same flight as --before chirp_run1.csv.gz"
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=r"--test chirp_run9.csv.gz: the same flight as --before chirp_run1.csv.gz"):
         prepare(config)
     prepare(replace(config, folds_by="manoeuvre"))  # each is tested by models of other manoeuvres
     write(folders["source"], [same])
