@@ -19,7 +19,7 @@ from hybrid_jax.trajectories import Trajectories, errors_of
 LEVEL = 0.8
 JOINED = 10  # windows that touch, at most so many, are predicted as one
 FAR = 1e3  # times the error: an interval that ends there says nothing, for example where all errors are rounding
-NO_INTERVAL = "no interval: blocks are too few or differ too much"
+NO_INTERVAL = "no interval: the parts left out are too few or differ too much"
 Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
 
 

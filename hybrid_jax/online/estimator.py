@@ -291,7 +291,7 @@ class OnlineAdaptation(AbstractEstimator):
         return kalman.triangular(belief, d), told, slope, correction
 
     def _haste(self, state: OnlineState, sample: Sample, opens: Bool[Array, ""]) -> Float[Array, " p"]:
-        """Update the log-scale of the random walk: of disturbances or, without one, of all unless reset now."""
+        """Update the log-scale of the random walk: of disturbances or, without one, of all that do not open now."""
         varies, tuning = self._varies(), self.tuning
         pulled = state.test.pulled / EAGER - 1
         rise = jnp.where(pulled > 0, RISE * jnp.minimum(pulled, 4.0), -FALL)
