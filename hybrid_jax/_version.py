@@ -1,4 +1,4 @@
-"""The installed version; found when it is first asked for, as `importlib.metadata` loads longer than the package."""
+"""The installed version. Imported when first used, because `importlib.metadata` takes longer than the package."""
 
 from importlib.metadata import PackageNotFoundError, version
 

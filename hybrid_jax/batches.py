@@ -1,4 +1,4 @@
-"""Evaluate a function on many windows, a few at a time, and solve systems with small matrices one after the other."""
+"""Evaluate a function on many windows, a few at a time, and solve small linear systems."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,11 +10,9 @@ from jaxtyping import Array, Float
 
 
 def in_chunks(function: Callable[[Any], Any], values: Any, size: int, distinct: Any = None) -> Any:
-    """Evaluate `function` on n stacked values, `size` at a time: memory does not grow with n, and caches suffice.
+    """Evaluate `function` on n stacked values, `size` at a time, so that memory does not grow with n.
 
-    Args:
-        distinct: how many of the values are distinct, if the others repeat them in order; only these are evaluated. It
-            may be traced, so that one program serves any number.
+    If the values repeat the first `distinct` of them in order, only these are evaluated. This number may be traced.
     """
     n = len(jax.tree.leaves(values)[0])
     size = -(-n // -(-n // size))  # at most `size`, with few left over
@@ -36,9 +34,9 @@ def in_chunks(function: Callable[[Any], Any], values: Any, size: int, distinct: 
 
 @jax.custom_batching.sequential_vmap
 def solve(matrix: Float[Array, "n n"], right: Float[Array, " n *k"]) -> Float[Array, " n *k"]:
-    """matrix⁻¹ right for a positive definite matrix, by Cholesky, one after the other under `vmap`.
+    """Solve matrix x = right for a positive definite matrix by Cholesky; under `vmap`, one system after the other.
 
-    On a CPU, jaxlib distributes a batch of factorisations over the threads that run programs and waits for them in one
-    of these threads, so two batches at once, in one program or on two devices, can deadlock.
+    On a CPU, jaxlib distributes a batch of factorisations over the threads that run programs, and waits for them in one
+    of these threads. Two batches at once could therefore deadlock.
     """
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right)

@@ -17,9 +17,9 @@ import numpy as np
 Numbers = jax.Array | np.ndarray
 T = TypeVar("T")
 
-LONGEST = 300  # characters of what an error says of a file
-UNIT = 1e-2  # |q| may be off 1 by this: rounding and noise are far below, and it is 2 % of the thrust
-MOST = np.iinfo(np.int32).max  # what a count may be in a compiled program
+LONGEST = 300  # characters of another error's message that ours quotes
+UNIT = 1e-2  # tolerance of |q| = 1: far above rounding and noise, and 2 % of the thrust
+MOST = np.iinfo(np.int32).max  # largest count in a compiled program
 SMALLEST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)  # of positive numbers
 
 
@@ -36,7 +36,7 @@ def warn(line: str) -> None:
 
 
 def not_traced(name: str, *arguments: Any) -> None:
-    """Raise TypeError inside `jax.jit`, `jax.vmap` or `jax.grad`, for functions that branch on values."""
+    """Raise TypeError inside `jax.jit`, `jax.vmap` or `jax.grad`. Functions that branch on values should call this."""
     if any(map(is_traced, jax.tree.leaves(arguments))):
         raise TypeError(
             f"{name} cannot be called under jax.jit, jax.vmap or jax.grad, as it branches on values; "
@@ -45,7 +45,7 @@ def not_traced(name: str, *arguments: Any) -> None:
 
 
 def real_array(name: str, value: Any) -> Numbers:
-    """The value as an array of real numbers; an array is returned unchanged."""
+    """Convert a value to an array of real numbers; an array is returned unchanged."""
     try:
         array = value if isinstance(value, Numbers) else np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -57,13 +57,13 @@ def real_array(name: str, value: Any) -> Numbers:
 
 
 def floating(name: str, value: Any) -> jax.Array:
-    """The value as a JAX array of finite floating-point numbers."""
+    """Convert a value to a JAX array of finite floating-point numbers."""
     array = finite(name, real_array(name, value))
     return jnp.asarray(array, None if jnp.issubdtype(array.dtype, jnp.floating) else float)
 
 
 def finite(name: str, array: Numbers, remedy: str = "", missing: bool = False) -> Numbers:
-    """The array unchanged; ValueError, with the position, for a number that is not finite in JAX's precision.
+    """Return the array unchanged; ValueError, with the position, for a number that is not finite in JAX's precision.
 
     If `missing`, NaN is allowed.
     """
@@ -93,7 +93,7 @@ def unit_quaternions(name: str, states: Numbers, part: slice) -> None:
 
 
 def real(value: Any) -> float | None:
-    """The value as a float if it is a real number or an array without axes, else None."""
+    """Convert a real number, or an array without axes, to a float; None for anything else."""
     if isinstance(value, Numbers) and value.ndim == 0 and not is_traced(value):
         value = value.item()
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
@@ -134,7 +134,7 @@ def instance(name: str, value: Any, kind: type) -> None:
 
 
 def list_of(name: str, values: Any, kind: type[T], least: int = 1) -> list[T]:
-    """The values as a list of instances of `kind`; a single instance outside a list is an error."""
+    """Return the values as a list of instances of `kind`; a single instance outside a list is an error."""
     found = list(values) if isinstance(values, Iterable) else [values]
     if not isinstance(values, Iterable) or not all(isinstance(value, kind) for value in found):
         raise ValueError(f"{name} must be a list of {kind.__name__}, got {short_repr(values)}")
@@ -144,7 +144,7 @@ def list_of(name: str, values: Any, kind: type[T], least: int = 1) -> list[T]:
 
 
 def places(name: str, values: Any, size: int = MOST) -> tuple[int, ...]:
-    """The values as a tuple of at least one index of an axis of length `size`, all different."""
+    """Return the values as a tuple of at least one index of an axis of length `size`, all different."""
     found = tuple(values) if isinstance(values, Iterable) else ()
     whole = all(isinstance(value, int | np.integer) for value in found)
     if not whole or len({*found}) < max(1, len(found)) or not 0 <= min(found) <= max(found) < size:
@@ -176,13 +176,13 @@ def short_repr(value: Any) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of an error's message, shortened in the middle, or the error's class name."""
+    """Return the first line of an error's message, shortened in the middle, or the error's class name."""
     line = (str(getattr(error, "strerror", None) or error).strip() or type(error).__name__).splitlines()[0]
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} … {line[-LONGEST // 2 :]}"
 
 
 def content_of(path: str | Path) -> bytes:
-    """The bytes of a regular file; OSError for others, since a pipe or a device may never end."""
+    """Read a regular file; OSError for others, since a pipe or a device may never end."""
     if Path(path).exists() and not Path(path).is_file():
         raise OSError(errno.EINVAL, "is not a regular file")
     return Path(path).read_bytes()

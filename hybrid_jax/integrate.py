@@ -1,4 +1,4 @@
-"""Trajectories of a vector field with piecewise constant inputs, by any one-step ODE solver of diffrax."""
+"""Integrate a vector field with piecewise constant inputs, by any one-step ODE solver of diffrax."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,9 +19,9 @@ from hybrid_jax.runtime import entry, jit_by_size
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
-LONG = 1000  # intervals in which solvers change the norm of a quaternion by more than rounding
+LONG = 1000  # intervals after which the norm of a quaternion has drifted by more than rounding
 
-# Traced once for all stages of a step, not once for each; the compiler inlines it again.
+# Traced once for all stages of a step; the compiler inlines it again.
 _infer = jit_by_size()(lambda field, x, u: as_field(field).infer_batch(x, u))
 
 
@@ -30,7 +30,7 @@ class RK4(diffrax.AbstractSolver):
 
     Attributes:
         scanned: whether its stages are a loop, which compiles faster (see `compact`). The result is the same.
-        substeps: number of steps in each interval. Take more if one is not accurate, for example if stiff.
+        substeps: number of steps in each interval. You should use more if one is inaccurate, for example if stiff.
     """
 
     scanned: bool = False
@@ -72,7 +72,7 @@ class RK4(diffrax.AbstractSolver):
 
 
 def compact(solver: Solver | None) -> Solver:
-    """The solver, by default RK4, with its stages in a loop: it compiles faster, for programs that run rarely."""
+    """Return the solver, by default RK4, with its stages in a loop. It compiles faster, but runs slower."""
     if solver is None or isinstance(solver, RK4):
         return RK4(scanned=True, substeps=1 if solver is None else solver.substeps)
     return solver
@@ -87,19 +87,19 @@ def integrate(
     substeps=1,
     project: Callable[[Array], Array] = lambda x: x,
 ) -> Float[Array, "t d *b"]:
-    """The states at the end of each of t intervals of length dt [s], after each of which `project` is applied.
+    """Return the states at the end of each of t intervals of length dt [s], each passed through `project`.
 
-    Each interval is a separate solve with its input as `args`: a single one would read the next input at its end.
+    Each interval is a separate solve with its input as `args`. A single solve would use the next input at its end.
     """
     solver = prepared(solver, jnp.result_type(x0))
     term = diffrax.ODETerm(lambda t, x, args: derivative(x, args[0]))
     substeps *= solver.substeps if isinstance(solver, RK4) else 1
     begin, end = 0.0, dt / substeps
     if implicit := isinstance(solver, diffrax.AbstractImplicitSolver):
-        begin, end = jnp.asarray(begin, x0.dtype), jnp.asarray(end, x0.dtype)  # its root finder takes no plain numbers
+        begin, end = jnp.asarray(begin, x0.dtype), jnp.asarray(end, x0.dtype)  # its root finder needs arrays
 
     def interval(x, held):
-        # The solver starts afresh in each interval: the input jumped, so nothing may be reused from the last one.
+        # The input has jumped, so the solver may not reuse anything from the last interval.
         started = x, solver.init(term, begin, end, x, (held, x))
 
         def step(carry, _):
@@ -110,7 +110,7 @@ def integrate(
             solved = known & (result == diffrax.RESULTS.successful)
             return (jnp.where(solved, x, jnp.nan) if implicit else x, state), None
 
-        # Training takes one step: that program has no loop in it. Many, written out, would take minutes to compile.
+        # One step, as in training, needs no loop. Many steps, written out, would take minutes to compile.
         (x, _), _ = step(started, None) if substeps == 1 else jax.lax.scan(step, started, length=substeps)
         return (x := project(x)), x
 
@@ -120,17 +120,17 @@ def integrate(
 def rk4_step(
     derivative: Derivative, x: Float[Array, " d *b"], u: Float[Array, " m *b"], dt: float
 ) -> Float[Array, " d *b"]:
-    """The state after one RK4 step of dt [s] with constant input, as in an interval of `rollout`."""
+    """Return the state after one RK4 step of dt [s] with constant input, as in an interval of `rollout`."""
     evaluate = traced_once(derivative, x)
     term = diffrax.ODETerm(lambda t, x, held: evaluate(x, held))
     return RK4().step(term, 0.0, dt, x, u, None, made_jump=False)[0]
 
 
 def traced_once(derivative: Derivative, x: Float[Array, " d *b"]) -> Derivative:
-    """The derivative, traced once for all stages of a step from x; the compiler inlines it again."""
+    """Return the derivative, traced once for all stages of a step from x."""
     if isinstance(derivative, AbstractVectorField):
         return partial(_evaluate, derivative)
-    # Outside of compiled code a function that is made for one step would be compiled at every call.
+    # Outside of compiled code, this new function would be compiled at every call.
     return jax.jit(lambda x, held: derivative(x, held)) if checks.is_traced(x) else derivative
 
 
@@ -171,7 +171,7 @@ def _integrate(field, x0, u, solver, dt):
 
 
 def projection(field, d: int, intervals: int) -> Callable[[Array], Array]:
-    """The map applied to a state after each interval: onto its manifold beyond `LONG` intervals, else the identity."""
+    """Return the map for states after each interval: onto their manifold beyond `LONG` intervals, else the identity."""
     return state_space(field, d).projected if intervals > LONG else lambda x: x
 
 
@@ -207,7 +207,7 @@ def _integrate_batch(field, x0, u, solver, dt):
 def checked(
     field, x0, u, dt, solver, *, windows: bool = False
 ) -> tuple[Float[Array, "*n d"], Float[Array, "*n t m"], Solver]:
-    """x0 in the precision of ẋ, u, and the solver or its default, after the checks of `rollout`."""
+    """Check the arguments of `rollout`; return x0 in the precision of ẋ, u, and the solver or its default."""
     x0, u = checks.floating("x0", x0), checks.floating("u", u)
     expected = "x0 (n, d) and u (n, t, m)" if windows else "x0 (d,) and u (t, m)"
     if x0.ndim != 1 + windows or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
@@ -223,7 +223,7 @@ def check_solver(solver) -> None:
     """Require a one-step diffrax solver for ODEs of one term."""
     if not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver must be one of diffrax or of hybrid_jax.SOLVERS, got {checks.short_repr(solver)}")
-    # A step starts at time zero, of which a multistep method would remember the wrong ones.
+    # Each step starts at time zero, so a multistep method would remember wrong times.
     if solver.term_structure is not diffrax.AbstractTerm or isinstance(solver, diffrax.LeapfrogMidpoint):
         raise ValueError(f"solver must be a one-step method for ODEs of one term, got {type(solver).__name__}")
 
@@ -236,7 +236,7 @@ def check_callable(field) -> None:
 
 
 def check_field(field, x: Array | jax.ShapeDtypeStruct, u: Array | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-    """Shape and type of ẋ = field(x, u); ValueError if it does not have the shape of x."""
+    """Return shape and type of ẋ = field(x, u); ValueError if it does not have the shape of x."""
     check_callable(field)
     name = getattr(field, "__name__", type(field).__name__)
     given = f"a state {x.shape} and an input {u.shape}"
@@ -244,7 +244,7 @@ def check_field(field, x: Array | jax.ShapeDtypeStruct, u: Array | jax.ShapeDtyp
         slope = eqx.filter_eval_shape(field, x, u)
     except Exception as error:  # a user's code may raise anything
         for part in (field.physics, field.residual) if isinstance(field, Hybrid) else ():
-            check_field(part, x, u)  # it says which part does not take them
+            check_field(part, x, u)  # names the part that does not accept them
         reason = f"{type(error).__name__}: {checks.first_line(error)}"
         raise ValueError(f"field: {name} does not take {given}: {reason}") from error
     if getattr(slope, "shape", None) != x.shape or not jnp.issubdtype(slope.dtype, jnp.floating):

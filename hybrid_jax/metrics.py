@@ -16,8 +16,8 @@ CHUNK = 1000  # windows predicted at once
 
 
 def predict(field: AbstractVectorField, x0, u, dt: float, solver: Solver | None = None) -> Float[Array, "n t d"]:
-    """`rollout_batch` by the kernels where available; equal to rounding, with the same errors."""
-    by_kernels = np.ndim(u) == 3 and np.shape(u)[1] <= LONG  # they do not project, see `integrate.projection`
+    """Call `rollout_batch`, or a kernel if there is one, with the same result to rounding and the same errors."""
+    by_kernels = np.ndim(u) == 3 and np.shape(u)[1] <= LONG  # kernels do not project, see `integrate.projection`
     states = kernels.predicted(field, x0, u, dt, RK4() if solver is None else solver) if by_kernels else None
     return rollout_batch(field, x0, u, dt, solver) if states is None else states
 

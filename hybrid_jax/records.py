@@ -140,7 +140,7 @@ def on_grid(
     between: Between = "held",
     begin: float | None = None,
 ) -> Gridded:
-    """A record on intervals of length dt [s] from `begin` [s], over the outputs' samples with known inputs.
+    """Divide a record into intervals of length dt [s] from `begin` [s], over the outputs' samples with known inputs.
 
     Inputs, which make up u, are "held" until the next sample, interpolated ("linear"), or "averaged" since the last.
     """
@@ -175,7 +175,7 @@ def on_grid(
 
 
 def _span(record: Record, inputs, outputs, between: Between) -> tuple[float, float]:
-    """The first and last time for which all inputs are known."""
+    """Return the first and last time with a measured output and known inputs."""
     acting = [record.signals[name] for name in inputs]
     lasting = [signal.interval if between == "held" and len(signal) > 1 else 0.0 for signal in acting]
     begin = max((signal.t[0] - (signal.interval if between == "averaged" else 0) for signal in acting), default=-np.inf)
@@ -186,7 +186,7 @@ def _span(record: Record, inputs, outputs, between: Between) -> tuple[float, flo
 
 
 def integral(signal: Signal, t: Float[np.ndarray, " n"], between: Between) -> Float[np.ndarray, "n k"]:
-    """The integral of a signal up to each time [s]; its first and last values continue beyond its ends."""
+    """Integrate a signal up to each time [s]; its first and last values continue beyond its ends."""
     edges, values = signal.t, signal.values
     step = np.diff(edges)[:, None]
     parts = {"held": values[:-1], "averaged": values[1:], "linear": (values[1:] + values[:-1]) / 2}[between] * step

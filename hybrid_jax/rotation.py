@@ -27,18 +27,18 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """q̄, the inverse rotation of a unit quaternion."""
+    """Return q̄, the inverse rotation of a unit quaternion."""
     w, x, y, z = q
     return jnp.stack([w, -x, -y, -z])
 
 
 def rotate(q: Quaternion, v: Vector) -> Vector:
-    """A body vector in the world frame, the vector part of q ⊗ [0, v] ⊗ q̄ (scaled by |q|² for other than unit q)."""
+    """Rotate a body vector into the world frame: the vector part of q ⊗ [0, v] ⊗ q̄, scaled by |q|² if q is not unit."""
     return multiply(multiply(q, jnp.stack([jnp.zeros_like(v[0]), *v])), conjugate(q))[1:]
 
 
 def matrix(q: Quaternion | Rows) -> tuple[Rows, Rows, Rows]:
-    """The rows of R, with R v = rotate(q, v)."""
+    """Return the rows of R, with R v = rotate(q, v)."""
     w, x, y, z = q
     ww, xx, yy, zz = w * w, x * x, y * y, z * z
     wx, wy, wz, xy, xz, yz = w * x, w * y, w * z, x * y, x * z, y * z
@@ -50,12 +50,12 @@ def matrix(q: Quaternion | Rows) -> tuple[Rows, Rows, Rows]:
 
 
 def body_z(q: Quaternion | Rows) -> Vector:
-    """rotate(q, [0, 0, 1]) written out: the direction of thrust in the world frame."""
+    """Return rotate(q, [0, 0, 1]), the direction of thrust in the world frame."""
     return jnp.stack([row[2] for row in matrix(q)])
 
 
 def derivative(q: Quaternion | Rows, body_rates: Vector | Rows) -> Quaternion:
-    """q̇ = ½ q ⊗ [0, ω]  [1/s] for body rates ω [rad/s]."""
+    """Return q̇ = ½ q ⊗ [0, ω]  [1/s] for body rates ω [rad/s]."""
     (w, x, y, z), (a, b, c) = q, body_rates
     return 0.5 * jnp.stack(
         [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
@@ -67,13 +67,13 @@ def normalise(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
 
 
 def from_axis_angle(axis: Vector, angle: Float[Array, ""]) -> Quaternion:
-    """The rotation by angle [rad] about a unit axis."""
+    """Return the rotation by an angle [rad] about a unit axis."""
     half = jnp.asarray(angle) / 2
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * jnp.asarray(axis)])
 
 
 def from_rotation_vector(v: Vector) -> Quaternion:
-    """The rotation by |v| [rad] about v; the inverse of `rotation_vector`."""
+    """Return the rotation by |v| [rad] about v, the inverse of `rotation_vector`."""
     square = v @ v
     small = square < 1e-8  # there the next term of the series is below single precision
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
@@ -82,7 +82,7 @@ def from_rotation_vector(v: Vector) -> Quaternion:
 
 
 def rotation_vector(q: Quaternion) -> Vector:
-    """Rotation vector [rad], at most π long, equal for q and −q, of a q of any length; unlike its sine nonzero at π."""
+    """Return the rotation vector [rad] of q or −q, of any norm. Unlike its sine, its length is not 0 but π at π."""
     w, v = jnp.where(q[0] < 0, -q[0], q[0]), jnp.where(q[0] < 0, -q[1:], q[1:])
     square = v @ v
     small = square < 1e-8 * w * w  # there the next term of the series is below single precision
@@ -92,17 +92,17 @@ def rotation_vector(q: Quaternion) -> Vector:
 
 
 def attitude_error(reference: Quaternion, q: Quaternion) -> Vector:
-    """Rotation vector [rad, body frame] from the reference attitude to q."""
+    """Return the rotation vector [rad, body frame] from the reference attitude to q."""
     return rotation_vector(multiply(conjugate(reference), q))
 
 
 def tilt(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
-    """The angle [rad] between the body's z axis and the vertical, for unit quaternions."""
+    """Return the angle [rad] between the body's z axis and the vertical, for unit quaternions."""
     of = jnp if isinstance(q, jax.Array) else np
     return of.arccos(of.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1))  # pyright: ignore[reportReturnType]
 
 
 def heading(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch"]:
-    """Yaw [rad], the first of the Euler angles z, y, x."""
+    """Return the yaw [rad], the first of the Euler angles z, y, x."""
     w, x, y, z = jnp.moveaxis(q, -1, 0)
     return jnp.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)

@@ -29,26 +29,26 @@ EXTRA = "--xla_backend_extra_options"
 # XLA compiles a loop without matrix products into one kernel if it touches at most this many bytes, by default 1024.
 # Kernels over 13 numbers of a minibatch cost less than their launches, so the limit is raised.
 WHOLE_LOOPS = f"{EXTRA}=xla_cpu_small_while_loop_byte_threshold=10000000"
-# Compiler options for programs that run seldom or are large. Fusion emitters make a gradient step faster, but least
-# squares and predictions compile in half the time without them; and a program in one part takes a fifth less processor
-# time than in parts for several threads. Later versions may not have the options.
+# Compiler options for large programs, or programs that run seldom. Fusion emitters make a gradient step faster, but
+# least squares and predictions compile in half the time without them. Compiling a program as a whole takes a fifth less
+# processor time than in parts for several threads. Later versions may not have these options.
 FAST_COMPILE: dict[str, bool | int] = {}
 if version("jaxlib").split(".")[:2] == ["0", "10"]:
     FAST_COMPILE |= {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 # At optimisation level 1 the simulator compiles in two thirds of the time of level 3, and flights are 3 % slower. At
 # level 0, which XLA_FLAGS can set, they are five times slower.
 FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
-UNOPTIMISED = FAST_COMPILE | {"xla_backend_optimization_level": 0}  # for programs in which nothing is repeated
-UNUSED = 30 * 24 * 3600  # s after which a program that nobody used is deleted: its source has changed
+UNOPTIMISED = FAST_COMPILE | {"xla_backend_optimization_level": 0}  # for programs that compute little
+UNUSED = 30 * 24 * 3600  # s after which unused programs are deleted: their source has changed
 MOST = 2**30  # bytes of programs; beyond, those used longest ago are deleted
 THREADS = "OPENBLAS_NUM_THREADS"
-SIZES = 2  # of data, of which a function keeps its programs
+SIZES = 2  # sizes of data for which a function keeps its programs
 
 P = ParamSpec("P")
 R = TypeVar("R")
 _owner: dict[str, int] = {}  # the process that first computed
 _sized: list[Any] = []  # programs of `jit_by_size`
-_sizes: dict[str, set[Hashable]] = {}  # of the data of each function, since these were last cleared
+_sizes: dict[str, set[Hashable]] = {}  # sizes of data of each function, since programs were last deleted
 
 
 def configure(folder: Path | None = None) -> None:
@@ -101,22 +101,22 @@ def private_folder(name: str) -> Path:
         each.mkdir(0o700, parents=True, exist_ok=True)
         about = each.stat()
         if hasattr(os, "getuid") and (about.st_uid != os.getuid() or about.st_mode & 0o022):
-            raise PermissionError(errno.EPERM, f"others can write {each}, which holds code; delete it")
+            raise PermissionError(errno.EPERM, f"others can write to {each}, which contains code; delete it")
     return folder
 
 
 @cache
 def load_lapack() -> None:
     """Load SciPy's LAPACK, which JAX uses, with one thread by default: two can slow a small QR down 100 times."""
-    alone = THREADS not in os.environ
+    unset = THREADS not in os.environ
     os.environ.setdefault(THREADS, "1")
     lapack.prepare_lapack_call("potrf_ffi", np.dtype("f4"))
-    if alone:
-        del os.environ[THREADS]  # it is for no other library and no child process
+    if unset:
+        del os.environ[THREADS]  # other libraries and child processes should not see it
 
 
 def entry(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator of public functions: NumPy promotion, and an error in a process forked after JAX started."""
+    """Decorate a public function: use NumPy's promotion, and raise an error in a process forked after JAX started."""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -132,14 +132,14 @@ def entry(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def jit_with(options: dict[str, bool | int] | None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """`equinox.filter_jit` with compiler options, which its type annotation lacks."""
+    """Return `equinox.filter_jit` with compiler options, which its type annotation lacks."""
     return partial(eqx.filter_jit, compiler_options=options)  # pyright: ignore[reportCallIssue, reportReturnType]
 
 
 def jit_by_size(options: dict[str, bool | int] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """`jit_with`, whose programs `keep_programs` deletes: each size of data has its own, of some 20 MiB.
+    """Compile like `jit_with`. Each size of data has its own program of some 20 MiB, which `keep_programs` deletes.
 
-    Inside of another program, which has its own options, it is only traced.
+    Inside another compiled function, which has its own options, the function is only traced.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -156,7 +156,7 @@ def jit_by_size(options: dict[str, bool | int] | None = None) -> Callable[[Calla
 
 
 def keep_programs(function: str, size: Hashable) -> None:
-    """Delete the programs of `jit_by_size` if a function begins with data of its third size since they were deleted."""
+    """Delete all programs of `jit_by_size` when a function meets its third size of data since the last time."""
     sizes = _sizes.setdefault(function, set())
     if size not in sizes and len(sizes) == SIZES:
         for program in _sized:
@@ -166,7 +166,7 @@ def keep_programs(function: str, size: Hashable) -> None:
 
 
 def machine() -> tuple[str, ...]:
-    """What a compiled program depends on: XLA options, devices and the processor's instructions."""
+    """Return what a compiled program depends on: XLA options, devices and the processor's instructions."""
     lines = CPUS.read_text().splitlines() if CPUS.exists() else []
     flags = next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
     return os.environ.get(FLAGS, ""), str(jax.devices()), platform.machine(), flags
@@ -177,8 +177,8 @@ def cores() -> int:
 
 
 def hardware() -> dict[str, Any]:
-    """Processor, cores, memory [GiB] and JAX devices, as JSON values."""
-    lines = CPUS.read_text().splitlines() if CPUS.exists() else []  # Linux alone has them
+    """Return processor, cores, memory [GiB] and JAX devices, as JSON values."""
+    lines = CPUS.read_text().splitlines() if CPUS.exists() else []  # only on Linux
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     try:
         memory = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
@@ -194,7 +194,7 @@ def hardware() -> dict[str, Any]:
 
 
 def _delete_stale(programs: Path) -> None:
-    """Delete programs unused for `UNUSED`, beyond `MOST`, or half written (JAX would warn of these in every run)."""
+    """Delete programs that are unused for `UNUSED`, beyond `MOST`, or half written. JAX would warn about the latter."""
     looked = programs / ".verified"
     since = looked.stat().st_mtime if looked.exists() else 0.0
     looked.touch()  # first, so that programs written meanwhile are verified next time

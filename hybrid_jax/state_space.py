@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import accumulate
+from itertools import accumulate, chain
 
 import jax.numpy as jnp
 import numpy as np
@@ -160,7 +160,7 @@ class StateSpace:
     Attributes:
         quantities: in the order of the state; empty if nothing is known about it.
         disturbed: indices of the states on which a constant disturbance acts by default; None for all. The rates of
-            the others should follow from the state alone, as that of a position from the velocity.
+            the others should follow from the state, for example of a position from the velocity.
     """
 
     quantities: tuple[Quantity, ...] = ()
@@ -180,11 +180,8 @@ class StateSpace:
     @property
     def names(self) -> tuple[str, ...]:
         """The name of each number of the state: its label or its index."""
-        return tuple(
-            one.labels[i - part.start] if one.labels else str(i)
-            for part, one in self.parts
-            for i in range(part.start, part.stop)
-        )
+        labels = (one.labels or map(str, range(part.start, part.stop)) for part, one in self.parts)
+        return tuple(chain.from_iterable(labels))
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -252,7 +249,7 @@ class StateSpace:
         return x
 
     def canonical(self, x: Float[Array, " d *b"], own: Float[Array, " d *b"]) -> Float[Array, " d *b"]:
-        """Return x, or a derivative there, in the representation that networks read: of q and −q, that with w ≥ 0.
+        """Return x, or a derivative there, as networks read it: with the one of q and −q that has w ≥ 0.
 
         Args:
             own: x itself or a derivative (d), which changes as x does.
@@ -277,7 +274,7 @@ class StateSpace:
             one.check(name, x, part)
 
     def features(self, x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
-        """Return, by name, what determines whether samples are alike; by default each number of x and of u."""
+        """Return, by name, the quantities that decide how alike samples are; by default each number of x and of u."""
         return {f"{name}[{i}]": column for name, part in (("x", x), ("u", u)) for i, column in enumerate(part.T)}
 
     def _curved(self) -> Iterator[tuple[slice, Quantity]]:

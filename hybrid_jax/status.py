@@ -4,7 +4,7 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """How a fit ended, as an integer in compiled programs (`Status(int(number))`); as text it is its name.
+    """How a fit ended. Compiled programs return it as an integer, which `Status(int(number))` converts.
 
     Attributes:
         message: a description in words.

@@ -12,15 +12,15 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.state_space import StateSpace
 
-SAME = 1e-3  # two dt that differ by less, relatively, are of clocks and not of windows
+SAME = 1e-3  # relative difference of two dt that clocks may cause
 RANGE = 0.01, 0.99  # quantiles of the training samples
-WARN = 0.1  # share of samples outside of it that is worth a warning
+WARN = 0.1  # share of samples outside this range that is worth a warning
 
 Features = Mapping[str, np.ndarray]
 
 
 def _plain(dt):
-    """A NumPy scalar as a Python number, since Equinox would treat it as an array."""
+    """Convert a NumPy scalar to a Python number, since Equinox would treat it as an array."""
     return dt.item() if isinstance(dt, np.floating) else dt
 
 
@@ -28,7 +28,7 @@ class Trajectories(eqx.Module):
     """Windows: n pieces of recordings, each of t equal intervals.
 
     Attributes:
-        x0: the initial state of each window (n, d), in SI units. You should not scale it.
+        x0: the initial state of each window (n, d). You should use SI units, and not scale it.
         u: the input (n, t, m), constant during each interval.
         x: state at the end of each interval (n, t, d): x[:, i] is (i + 1) dt after x0. For `fit`, `adapt` and least
             squares, NaN means not measured.
@@ -49,7 +49,7 @@ class Trajectories(eqx.Module):
         return self.x.shape[-2]
 
     def __getitem__(self, index) -> "Trajectories":
-        """The windows at an index, a slice or an array of indices, which may be traced; IndexError out of range."""
+        """Return the windows at an index, a slice or an array of indices, which may be traced."""
         # JAX would clamp the index, and a loop over the windows would not end.
         if isinstance(index, int | np.integer) and not -len(self) <= index < len(self):
             raise IndexError(f"index {index} is out of range, as there are {len(self)} windows")
@@ -57,7 +57,7 @@ class Trajectories(eqx.Module):
 
 
 def check(trajectories: Trajectories, name: str = "trajectories", missing: bool = False) -> Trajectories:
-    """The trajectories unchanged; ValueError for wrong shapes or dt or, unless traced, numbers that are not finite.
+    """Return the trajectories unchanged; ValueError for wrong shapes or dt or, unless traced, numbers not finite.
 
     If `missing`, x may contain NaN, but not everywhere.
     """
@@ -88,12 +88,12 @@ def check(trajectories: Trajectories, name: str = "trajectories", missing: bool 
 
 
 def errors_of(predicted: Float[Array, "*s"], x: Float[Array | np.ndarray, "*s"]) -> Float[Array, "*s"]:
-    """Predicted minus measured states; zero, also in its derivatives, where x is NaN: not measured."""
+    """Return predicted minus measured states; zero, also in derivatives, where x is NaN because it was not measured."""
     return jnp.where(jnp.isnan(x), 0, predicted - x)
 
 
 def last_measured(windows: Trajectories) -> Float[np.ndarray, "*n t d"]:
-    """The states with each number that is NaN, not measured, replaced by its last measured value."""
+    """Return the states x with each NaN, where nothing was measured, replaced by the last measured value."""
     x = np.asarray(windows.x)
     if not (missing := np.isnan(x)).any():
         return x
@@ -104,7 +104,7 @@ def last_measured(windows: Trajectories) -> Float[np.ndarray, "*n t d"]:
 
 
 def overflows(trajectories: Trajectories) -> bool:
-    """Whether squares of its states overflow their type, for example 1e30 in float32: then no loss is finite."""
+    """Whether squares of the states overflow their type, for example of 1e30 in float32, so that no loss is finite."""
     states = np.asarray(trajectories.x0), np.asarray(trajectories.x)
     most = np.finfo(jax.dtypes.canonicalize_dtype(states[0].dtype)).max / states[0].shape[-1]
     return max(max(part.max(), -part.min()) for part in states) > most**0.5
@@ -192,6 +192,6 @@ def features_of(windows: Trajectories, space: StateSpace) -> Features:
 
 
 def shares_outside(known: Features, asked: Features) -> dict[str, float]:
-    """By quantity, the fraction of samples outside the 1 to 99 % range of the known ones."""
+    """Return the fraction of samples outside the 1 to 99 % range of the known ones, by quantity."""
     ends = {name: np.nanquantile(values, RANGE) for name, values in known.items()}
     return {name: float(np.mean((asked[name] < low) | (asked[name] > high))) for name, (low, high) in ends.items()}

@@ -32,7 +32,7 @@ TABLES = ("vehicle", "learn", "terms", "actuator")  # of a vehicle file: see `dy
 # Of vehicles that fly, the radius of gyration √(I / m) is 0.2 to 1 times the longest arm.
 LONGEST_ARM = 10.0  # m
 LEAST_GYRATION, MOST_GYRATION = 0.01, 10.0  # times the longest arm
-ROUNDING = 0.05  # share by which a moment may exceed the sum of the other two: of a flat body with two digits
+ROUNDING = 0.05  # share by which a moment may exceed the sum of the other two: a flat body, rounded to two digits
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
 
 
 def read_tables(path: str | Path) -> dict[str, Any]:
-    """The tables of a TOML file, with or without a byte order mark; ValueError if it is not readable."""
+    """Read a TOML file, with or without a byte order mark; ValueError if it is not readable."""
     try:
         return tomllib.loads(checks.content_of(path).decode("utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
@@ -152,7 +152,7 @@ def read_tables(path: str | Path) -> dict[str, Any]:
 
 
 def vehicle_of(tables: Mapping[str, Any], path: str | Path, variant: str | None = None) -> Vehicle:
-    """`load_vehicle` on the tables of a file that has already been read."""
+    """Make the vehicle of a file from its tables; see `load_vehicle`."""
     table = tables.get("vehicle")
     if not isinstance(table, dict):
         raise ValueError(f"{path}: has no table [vehicle]")
@@ -169,7 +169,7 @@ def vehicle_of(tables: Mapping[str, Any], path: str | Path, variant: str | None 
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
-    """A dataclass from a TOML table; ValueError, after `where`, for a wrong or missing key or an invalid value."""
+    """Make a dataclass from a TOML table; ValueError, after `where`, for a wrong or missing key or an invalid value."""
     required = [each.name for each in fields(cls) if each.default is MISSING and each.default_factory is MISSING]  # type: ignore
     require_known(where, table, [each.name for each in fields(cls)])  # type: ignore
     if missing := [name for name in required if name not in table]:
@@ -191,7 +191,7 @@ def require_numbers(name: str, value: Any, shape: tuple[int, ...], what: str) ->
     def fits(value: Any, shape: tuple[int, ...]) -> bool:
         if shape:
             return isinstance(value, tuple) and len(value) == shape[0] and all(fits(part, shape[1:]) for part in value)
-        # NumPy's scalars are refused: a vehicle is hashed and written to files.
+        # Not NumPy's scalars, because a vehicle is hashed and written to files.
         number = checks.real(value) if isinstance(value, int | float) else None
         return number is not None and abs(number) <= checks.LARGEST
 

@@ -126,7 +126,7 @@ def test_what_others_can_write_is_neither_made_nor_used(tmp_path, monkeypatch):
     assert {each.stat().st_mode & 0o777 for each in (*folders, tmp_path / "cache" / "hybrid_jax")} == {0o700}
     for wrong, use in zip((*folders, folders[0].parent), (checked, runtime.configure, checked), strict=True):
         wrong.chmod(0o770)
-        with pytest.raises((OSError, ValueError), match=f"others can write {wrong}, which holds code; delete it"):
+        with pytest.raises((OSError, ValueError), match=f"others can write to {wrong}, which contains code; delete it"):
             use()
         wrong.chmod(0o700)
     monkeypatch.setattr(os, "getuid", lambda: 1 + folders[0].stat().st_uid)
