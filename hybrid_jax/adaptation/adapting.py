@@ -38,13 +38,13 @@ from hybrid_jax.status import Status
 from hybrid_jax.training.objective import UNSCALED, Settings, TrajectoryLoss, scaled_loss
 from hybrid_jax.trajectories import Trajectories, check_like, concatenate, features_of, overflows, shares_outside
 
-FEWEST = 10  # windows, of which outliers are told apart
-HELD_OUT = 5  # one in so many windows validates
+FEWEST = 10  # windows without outliers that are enough; with fewer, all windows are used
+HELD_OUT = 5  # the last of so many equal parts of the windows is held out for validation
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; check dt and all units"
 NOT_FITTED = "no parameter was fitted"
 NO_MOTION = "field: its training windows are unknown, so all its errors count as changes; pass learned_from="
-FEW = "windows: {} are too few to determine {} parameters; those that they do not determine keep the source's values"
+FEW = "windows: {} are too few to determine {} parameters; undetermined parameters keep the source's values"
 BY_NETWORK = "the network's effect is comparable to that of a plausible change; hj.pool of several sources helps"
 BY_ROTORS = "the rotors' efficiencies, which were fitted too, can have the same effect"
 OVERLAP = "windows overlap: left-out blocks share samples with the others, so the expected errors are too small"
@@ -80,17 +80,17 @@ def adapt(
 
     Args:
         field: a trained `Hybrid`, or any other field.
-        windows: windows of the changed system, more than parameters, in the order of time and without overlap. If
-            they follow each other, for example in one flight, intervals allow for errors that are correlated within a
-            fifth of the windows. NaN in x means "not measured" and counts as no error; x0 and u must be finite. You
-            may pass a list with the windows of each of several flights: `expected` then counts flights.
+        windows: windows of the changed system, in order of time and without overlap. You need more windows than
+            parameters. If they follow each other, for example in one flight, intervals allow for errors that are
+            correlated within a fifth of the windows. NaN in x means "not measured" and counts as no error; x0 and u
+            must be finite. You may pass a list with the windows of each flight: `expected` then counts flights.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` to write your own.
         validation: windows for early stopping and penalties; you should take them from another flight. By default the
             last fifth of `windows` is held out if the method needs validation.
         learned_from: windows that the source was trained on, by default those that `hj.fit` stores in its networks.
             "auto" uses them to estimate the source's own error, and the report warns if `windows` are unlike them.
         settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, which is
-            independent of units; "auto" takes `learned_from` there if it can.
+            independent of units; "auto" scales by `learned_from` instead if it is known.
         level: confidence level of the intervals, between 0 and 1.
 
     Raises:
@@ -152,7 +152,7 @@ def adapt(
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
     adapted = solution.field
     if disturbance_of(field) is None:
-        adapted = uncorrected(disturbance.without_zeros(adapted))  # what windows need
+        adapted = uncorrected(disturbance.without_zeros(adapted))  # only corrections that were fitted
     status = Status(int(solution.status))
     if status != Status.DIVERGED and isinstance(settings.objective, TrajectoryLoss):
         scale = settings.objective.divisor()
@@ -267,7 +267,7 @@ def _parameters(
         covariance = np.asarray(sandwich(choice.equations, int(free.sum()), cluster))[np.ix_(places, places)]
         covariance = covariance + np.diag(np.where(unseen, np.inf, 0.0))
         inherited, of_source = np.asarray(choice.inherited)[np.ix_(places, places)], float(choice.degrees)
-    # What the network may have taken is a bound and no estimate from a sample: its degrees are infinite (GUM, G.4.3).
+    # `absorbed` is a bound, not an estimate from a sample, so its degrees are infinite (GUM, G.4.3).
     parts = np.stack([np.diag(covariance), np.diag(inherited), absorbed])
     degrees = satterthwaite(parts, np.array([own_degrees, of_source, np.inf]))
     covariance = covariance + inherited
@@ -275,7 +275,7 @@ def _parameters(
         return {"parameters": found, "without_intervals": NOT_FINITE}
     whole = covariance + np.diag(absorbed)
     bounds = intervals(field, jnp.asarray(whole), level, degrees)
-    apart = intervals(field, jnp.asarray(covariance), level, degrees)  # the source has the same network
+    apart = intervals(field, jnp.asarray(covariance), level, degrees)  # of changes: the source has the same network
     scaled, moved = "efficiency" in np.array(groups)[free], dict[str, float]()
     for i, name in enumerate(values):
         value, low, high = jax.device_get(tuple(bounds[name]))

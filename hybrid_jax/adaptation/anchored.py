@@ -32,7 +32,7 @@ class Anchored(NamedTuple):
     """The step with the best penalty."""
 
     change: Float[Array, " w"]  # of the network's weights
-    left_out: Float[Array, "b w"]  # of the weights fitted without each block of windows
+    left_out: Float[Array, "b w"]  # the change that is fitted without each block of windows
     odds: Float[Array, ""]  # evidence of the best step over no step
     naive: Float[Array, ""]  # the same odds if the source had no errors
 
@@ -48,7 +48,7 @@ class Subspace(NamedTuple):
 def subspace(
     field: AbstractVectorField, windows: Trajectories, starts: Starts | None, solver: Solver, scale: Scale
 ) -> Subspace:
-    """Linearise the errors by the network's weights along random directions in the range of Jᵀ."""
+    """Linearise the errors in the network's weights along random directions in the range of Jᵀ."""
     weights, _ = weights_of(field)
     smooth, weigh = from_starts(windows, starts)
 
@@ -91,7 +91,7 @@ def fit_anchored(found: Subspace, noise: Float[Array, ""], error: Float[Array, "
 
     penalties = jnp.asarray(PENALTIES, gram.dtype)
     sizes = jnp.broadcast_to(1 / (penalties * information[-1]), (len(values), len(penalties))).T
-    apparent = error / values  # any of the directions may be all of it
+    apparent = error / values  # each direction could explain the whole error
     told_of = jax.vmap(evidence)(jnp.concatenate([sizes + apparent, sizes, apparent[None]]))
     with_both, naive = jnp.split(told_of[:-1], 2)
     best = jnp.argmax(with_both)
@@ -127,7 +127,7 @@ class Effect(NamedTuple):
 
     Attributes:
         total: over all states.
-        of_states: of each state, after what another start explains.
+        of_states: of each state, less what another initial state explains.
     """
 
     total: Float[Array, ""]
@@ -156,19 +156,18 @@ def network_effect(
 def taken_by_network(
     effect: Float[Array, " d"], equations: NormalEquations, of_states: Float[Array, "d p p"], quantities: int
 ) -> Float[Array, " p"]:
-    """Compute the variance of each parameter from an effect that physics lacks, of the size of the network's.
+    """Compute each parameter's variance due to an effect that physics lacks and that is as large as the network's.
 
-    An effect b in place of the network's moves a fit by H⁻¹ Jᵀ b, H = JᵀJ: parameter j by at most
-    Σ_s ‖b_s‖ (H⁻¹ J_sᵀ J_s H⁻¹)_jj^½ over states s, by the inequality of Cauchy and Schwarz, if it is just like the
-    parameter's own effect. An effect may depend on q quantities. One that is a random mixture of q effects which are
-    orthogonal to each other, of which the parameter's own is one, has on average a share 1/q of its square in common
-    with that, so that the variance is the square of the bound over q.
+    An effect b moves a fit by H⁻¹ Jᵀ b, H = JᵀJ. By the Cauchy–Schwarz inequality, this moves parameter j by at most
+    Σ_s ‖b_s‖ (H⁻¹ J_sᵀ J_s H⁻¹)_jj^½ over states s, if b is proportional to the parameter's own effect. A random
+    mixture of q orthogonal effects, one of which is the parameter's own, shares on average 1/q of its square with it,
+    so the variance is the squared bound over q.
 
     Args:
         effect: ‖b_s‖², see `Effect`.
-        equations: of the same windows and the fitted parameters.
-        of_states: J_sᵀ J_s, of these and others.
-        quantities: q, on which an effect may depend.
+        equations: normal equations of the same windows for the fitted parameters.
+        of_states: J_sᵀ J_s for all parameters.
+        quantities: the number q of quantities on which an effect may depend.
     """
     found = inverse(jnp.sum(equations.gram, axis=0)).matrix
     moved = jnp.sqrt(jnp.maximum(jnp.einsum("pq,sqr,rp->sp", found, of_states, found), 0.0))

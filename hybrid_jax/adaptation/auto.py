@@ -30,32 +30,28 @@ from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 
 PLAUSIBLE = Plausible()
-VAGUE = 1 / 3  # of a plausible change: if a network may have taken more, a parameter is called effective
-ROUNDS = 2  # the second one around what the first has taken: squared errors are not quadratic over large changes
+VAGUE = 1 / 3  # of a plausible change: if the network may have absorbed more, a parameter is called effective
+ROUNDS = 2  # the second linearises at the first's result: squared errors are not quadratic over large changes
 
 
 class Choice(NamedTuple):
-    """c candidates and the chosen one."""
+    """The c candidates and the chosen one, with the p parameters of the extended physics, see `extended`."""
 
     names: tuple[str, ...]  # of the candidates
-    # Probability of each change; the network's is relative to the candidate chosen before it.
-    probability: Float[Array, " c"]
+    probability: Float[Array, " c"]  # of each change; the network's is relative to the one chosen before it
     refused: Bool[Array, " c"]  # which would be more probable than the chosen one if the source had no errors
     taken: Int[Array, ""]  # index of the chosen candidate
     alone: Bool[Array, ""]  # whether physics without the network replaced the source
-    parameters: tuple[str, ...]  # names of the p parameters of the extended physics, see `extended`
-    free: Bool[Array, "c p"]  # which of these each candidate fitted
-    # Parameters of each candidate in the physics' own parametrisation, to first order unless chosen.
-    theta: Float[Array, "c p"]
-    equations: NormalEquations  # normal equations of each window at the chosen parameters
-    # Change of the network's weights in each candidate; None without a trainable network.
-    change: Float[Array, "c w"] | None
+    parameters: tuple[str, ...]  # names of the parameters
+    free: Bool[Array, "c p"]  # which parameters each candidate fitted
+    theta: Float[Array, "c p"]  # in the physics' own parametrisation, to first order unless chosen
+    equations: NormalEquations  # of each window at the chosen parameters
+    change: Float[Array, "c w"] | None  # of the network's weights; None without a trainable network
     ends: Float[Array, "b 2 d"]  # errors of left-out blocks or flights, see `errors_at_ends`
-    inherited: Float[Array, "p p"]  # covariance at the chosen parameters from errors of those that the source keeps
+    inherited: Float[Array, "p p"]  # covariance due to errors of the parameters that the source keeps
     degrees: Float[Array, ""]  # degrees of freedom of `inherited`
-    # Variance from what the network may have taken from each parameter, see `taken_by_network`.
-    absorbed: Float[Array, " p"]
-    vague: Bool[Array, " p"]  # of a rigid body, parameters of which that is a large part of the plausible change
+    absorbed: Float[Array, " p"]  # variance of what the network may have absorbed, see `taken_by_network`
+    vague: Bool[Array, " p"]  # rigid bodies only: whether that is a large part of a plausible change
 
 
 @dataclass(frozen=True)
@@ -63,14 +59,14 @@ class Auto(Method):
     """Choose the most probable of several changes; see `selection`.
 
     The candidates for a rigid body are no change, new θ_p, and new θ_p with constant forces and torques, drag and rotor
-    efficiencies; for other systems no change, new θ_p, and new θ_p with a constant disturbance. Blocks of windows that
-    are left out in turn must confirm a change. A penalised change of the network's weights is then tried on top of the
-    chosen one. If physics without the network predicts the source's own motion better, it replaces the source.
+    efficiencies; for other systems no change, new θ_p, and new θ_p with a constant disturbance. A change must also
+    predict left-out blocks of windows better. A penalised change of the network's weights is then tried on top of it.
+    If physics without the network predicts the source's own motion better, it replaces the source.
 
     Attributes:
         networks: whether the network may change.
         blocks: number of blocks of windows that are left out in turn to estimate the expected errors.
-        max_steps: largest number of steps of each fit.
+        max_steps: maximum number of steps of each fit.
         plausible: prior standard deviations of the changes.
     """
 
@@ -96,12 +92,12 @@ class Auto(Method):
         Args:
             learned_from: windows that the source was trained on, by default those that it stores; without them the
                 source is assumed to be exact.
-            flights: the flight that each window is from (n,), if they are from several: errors to expect are then of
-                flights that were left out, else of blocks.
+            flights: the flight of each window (n,), if there are several: expected errors then come from left-out
+                flights instead of blocks.
         """
-        jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
+        jax.eval_shape(lambda: ravel_parameters(field)[0])  # raises without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))
-        # Only these settings matter; as an array, another scale needs no other program.
+        # Only these settings matter. The scale is an array, so that another value does not compile again.
         scale, solver = scale_of(settings.objective), settings.solver
         larger, physics, sizes = _begin(self, field, train)
         options, effect, step = (sizes, solver, scale, self.max_steps), None, None
@@ -117,7 +113,7 @@ class Auto(Method):
         options = *options, jnp.array(len(train))
         (found, every, starts), fitted = first, _ = _fits(larger, still, train, both, *options), None
         for _ in range(ROUNDS):
-            if network:  # also if physics replaced the source: then it is the difference of two models
+            if network:  # even if physics replaced the source: the effect is the difference of the two models
                 effect = anchored.network_effect(field, train, solver, scale, starts)
             chosen, nothing, move, rows = _judge(larger, found, every, source, learned_from, shares, effect, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
@@ -138,7 +134,7 @@ _shares = jit_by_size(UNOPTIMISED)(selection.shares_outside)
 
 
 class OfSource(NamedTuple):
-    """The errors on `distinct` windows of the source of what is adapted, and whether that is physics `alone`."""
+    """The fit to `distinct` windows of the source's own motion, and whether physics `alone` replaced the source."""
 
     own: Fit
     alone: Bool[Array, ""]
@@ -154,7 +150,7 @@ def _begin(method: Auto, field, train: Trajectories):
 
 @jit_by_size(FASTEST_COMPILE)
 def _fits(field, move, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
-    """Fit nothing and some parameters, from where the parameters moved by `move`, which smooths the starts as well."""
+    """Fit no parameters and the free ones, from parameters moved by `move`, at which the starts are smoothed too."""
     start, unravel = ravel_parameters(field)
     found, starts = selection.fit_each(unravel((start + move).astype(start.dtype)), windows, free, *options, moved=move)
     return (*(jax.tree.map(itemgetter(row), found) for row in (0, 1)), starts)
@@ -162,7 +158,7 @@ def _fits(field, move, windows: Trajectories, free, *options) -> tuple[Fit, Fit,
 
 @jit_by_size(UNOPTIMISED)
 def _replace(method: Auto, larger, own: Fit, rival: tuple[Fit, Fit] | None, distinct, sizes) -> tuple[Any, OfSource]:
-    """Replace the source by its physics if they predict its own motion better, fitted again if that is better still."""
+    """Replace the source by its physics, refitted if that is better, if they predict its own motion better."""
     if rival is None:
         return larger, OfSource(own, jnp.array(False), distinct)
     start, unravel = ravel_parameters(anchored.without_network(larger))
@@ -190,9 +186,9 @@ def _judge(
 
 @jit_by_size(UNOPTIMISED)
 def _confirm(method: Auto, larger, changed, still, chosen: Posterior, units) -> tuple[Fit, Any, Posterior, Array]:
-    """Return the fit and the starts of the chosen change, or those of none if left-out blocks do not confirm it.
+    """Return fit and starts of the chosen change, or of no change if left-out blocks do not confirm it.
 
-    The last are the parameters fitted without each block, or each of `units`.
+    The last result are the parameters fitted without each block, or without each of `units`.
     """
     free, start = jnp.stack([*free_parameters(larger).values()])[chosen.taken], ravel_parameters(larger)[0]
     blocks = selection.blocks_of(len(still[0].equations.score), method.blocks)
@@ -207,13 +203,13 @@ def _confirm(method: Auto, larger, changed, still, chosen: Posterior, units) -> 
 
 @jit_by_size(FASTEST_COMPILE)
 def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale) -> anchored.Subspace:
-    """Linearise by the network's weights at the chosen candidate."""
+    """Linearise the errors in the network's weights at the chosen candidate."""
     return anchored.subspace(ravel_parameters(larger)[1](found.theta), train, starts, solver, scale)
 
 
 @jit_by_size(UNOPTIMISED)
 def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options) -> Solution:
-    """Add the network's change if it is probable, and compute the errors of units that were left out."""
+    """Add the network's change if it is probable, and compute the errors of left-out units."""
     (found, chosen, left_out, source, nothing, effect, step, units), (sizes, solver) = outcome, options
     start, unravel = ravel_parameters(larger)
     names, free = zip(*free_parameters(larger).items(), strict=True)
@@ -230,7 +226,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     changes = jnp.zeros((len(left_out), 0))
     if step is not None:
         step = anchored.fit_anchored(step, found.noise, nothing.error, blocks, units)
-        removed = anchored.weights_of(larger)[0] - anchored.weights_of(field)[0]  # all of them, if physics replaced it
+        removed = anchored.weights_of(larger)[0] - anchored.weights_of(field)[0]  # all, if physics replaced it
         odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
         better = odds > selection.STRONG
         changes, change = jnp.where(better, step.left_out, 0.0), jnp.tile(removed, (len(names) + 1, 1))
@@ -249,16 +245,16 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(units[1])))
     absorbed = jnp.zeros_like(start)
     if effect is not None:
-        # For example the velocity, the body rates and the rotor speeds, on which aerodynamic forces depend.
+        # Aerodynamic forces depend, for example, on the velocity, the body rates and the rotor speeds.
         quantities = len(disturbance_units(larger)) + train.u.shape[-1]
         most = anchored.taken_by_network(effect.of_states, equations, found.of_states, quantities)
         absorbed = jnp.where(alone, absorbed, most)
-    # Other systems' sizes are relative to the source's value, and change with the parametrisation.
+    # Only rigid bodies: other systems' sizes are relative to the source's value and depend on the parametrisation.
     vague = jnp.sqrt(absorbed) > VAGUE * (sizes if "drag" in groups_of(names_of(larger)) else jnp.inf)
     first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
     choice = Choice(*first, inherited, jnp.asarray(degrees), absorbed, vague)
     adapted = candidate(extended(field, train.x0.shape[1]), choice, taken)
-    status = jnp.where(jnp.any(found.seen), found.status, Status.STALLED)  # of what has no effect nothing is found
+    status = jnp.where(jnp.any(found.seen), found.status, Status.STALLED)  # no parameter has an effect
     finite = (status == Status.OK) | ~jnp.isinf(ends).any()
     return Solution(adapted, found.steps, jnp.where(finite, status, Status.DIVERGED), choice)
 

@@ -17,16 +17,16 @@ from hybrid_jax.state_space import StateSpace
 from hybrid_jax.trajectories import Trajectories, errors_of
 
 LEVEL = 0.8
-JOINED = 10  # windows that touch, at most so many, are predicted as one
-FAR = 1e3  # times the error: an interval that ends there says nothing, for example where all errors are rounding
+JOINED = 10  # adjacent windows, at most so many, are joined and predicted as one
+FAR = 1e3  # times the error: wider intervals are not printed, for example where all errors are rounding
 NO_INTERVAL = "no interval: the parts left out are too few or differ too much"
 Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
 
 
 def expected(logs: Float[np.ndarray, "n ..."], flights: int | None = None) -> Float[np.ndarray, "3 ..."]:
-    """Return the expected error on another flight and its 80 % interval, by Student's t of the flights' log-errors.
+    """Return the expected error on another flight and its 80 % interval, by Student's t for the flights' log-errors.
 
-    They may be log-errors of parts of fewer `flights`, of which the means differ as much as the parts.
+    For log-errors of parts of flights, pass the number of `flights`: their means are assumed to vary like the parts.
     """
     n, middle = len(logs), np.mean(logs, axis=0)
     if n < 2:
@@ -41,15 +41,15 @@ def expected_errors(
 ) -> Expected:
     """Return the RMSE at the end of single and of joined windows, with an 80 % prediction interval for another flight.
 
-    The mean `squares`, NaN where a state was not measured, are those of whole flights if `flights`, see `expected`, or
-    of blocks of one flight. The interval from blocks (Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7) uses
-    Student's t for the logarithm of their mean; `seconds` are the durations of the windows. Squares after a second are
-    skewed, and a few seldom show the largest, so that their own standard deviation is too small: they count as
-    lognormal, of which the logarithm of the mean has the variance s²/b + s⁴ / (2 (b − 1)), s² the variance of the
-    logarithm (Cox's method; Zhou and Gao, Statistics in Medicine 1997).
+    `squares` are mean squared errors, NaN where a state was not measured, of whole flights if `flights` (see
+    `expected`), else of blocks of one flight; `seconds` are the durations of the windows. The interval from blocks
+    (Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7) uses Student's t for the logarithm of their mean. Squares
+    are skewed, and a few blocks seldom contain the largest, so their sample standard deviation is too small. They are
+    taken as lognormal: the logarithm of the mean then has the variance s²/b + s⁴ / (2 (b − 1)), with s² the variance
+    of the logarithms (Cox's method; Zhou and Gao, Statistics in Medicine 1997).
     """
     blocks = len(squares)
-    with warnings.catch_warnings(action="ignore"):  # a state that is measured at no end
+    with warnings.catch_warnings(action="ignore"):  # a state that no end measures
         squares = np.where(np.isnan(squares), np.nanmean(squares, axis=0), squares)
     squares = np.where(np.isfinite(squares), squares, np.nan)  # a diverged one has no RMSE
     quantile = scipy.special.stdtrit(max(blocks - 1, 1), (1 + LEVEL) / 2)
@@ -102,13 +102,13 @@ def errors_at_ends(
 
     nowhere = jnp.full_like(block.x0[0], jnp.nan)  # touches nothing
     _, (ends, touches) = jax.lax.scan(one, (nowhere, nowhere), (block, counted, jnp.arange(len(counted))))
-    last = counted & ~jnp.roll(touches, -1).at[-1].set(False)  # windows after which no other goes on
+    last = counted & ~jnp.roll(touches, -1).at[-1].set(False)  # the end of each chain
     weights = jnp.stack([counted, last], axis=1)[..., None] & ~jnp.isnan(block.x[:, -1:])
     return jnp.sum(jnp.where(weights, ends, 0), axis=0) / jnp.sum(weights, axis=0)
 
 
 def longest_chain(windows: Trajectories, blocks: tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]) -> int:
-    """Return the most adjacent windows that are joined, see `blocks_of`."""
+    """Return the largest number of adjacent windows that are joined in one of the blocks, see `blocks_of`."""
     x0, x, longest = np.asarray(windows.x0), np.asarray(windows.x), 1
     for places, counted in zip(*blocks, strict=True):
         own = places[counted]

@@ -78,7 +78,7 @@ class LeastSquares(Method):
     Attributes:
         disturbance: whether to fit a disturbance; "auto" fits one if the windows need it, see `select_disturbance`.
         indices: the disturbed states, see `with_disturbance`.
-        max_steps: the most steps of each fit.
+        max_steps: maximum number of steps of each fit.
     """
 
     disturbance: Literal["auto"] | bool = "auto"
@@ -100,7 +100,7 @@ class LeastSquares(Method):
         larger = sized(with_disturbance(field, indices), d)
         start = larger if self.disturbance is True else field
         check_determined(start, n)
-        if self.disturbance == "auto" and n > ravel_parameters(larger)[0].size:  # else there are too few to decide
+        if self.disturbance == "auto" and n > ravel_parameters(larger)[0].size:  # enough to decide
             found = select_disturbance(field, train, indices=indices, **options).fit
         else:
             found = fit_free(sized(start, d), train, **options)
@@ -197,9 +197,9 @@ class Source(Method):
 
 
 def scale_of(objective: Objective) -> Scale:
-    """The error of each state that counts as 1 in the objective; None if each counts in its own unit."""
+    """Return the error of each state that counts as 1 in the objective; None if each counts in its own unit."""
     if not isinstance(objective, TrajectoryLoss):
-        remedy = "or take method='fine_tune', which minimises any"
+        remedy = "or use method='fine_tune', which minimises any objective"
         given = type(objective).__name__
         raise ValueError(f"settings.objective must be a TrajectoryLoss for least squares, got {given}; {remedy}")
     return objective.divisor()

@@ -5,17 +5,17 @@ from jaxtyping import Bool, Float
 
 from hybrid_jax.trajectories import Trajectories
 
-ORDER = 3  # of the differences, which a smooth error of the model hardly has
-FAR = 8.0  # robust standard deviations: of a million normal errors none is so large
-DEVIATION = 1.4826  # of normal errors over their median size
-ROUGH = 0.3  # of the largest error in the window: less is a smooth error
+ORDER = 3  # of the differences, which are small for a smooth model error
+FAR = 8.0  # robust standard deviations, which none of a million normal errors reaches
+DEVIATION = 1.4826  # the standard deviation of normal errors over their median size
+ROUGH = 0.3  # of the window's largest error: an error with smaller differences is smooth
 
 
 def outliers(errors: Float[np.ndarray, "n t d"], windows: Trajectories) -> Bool[np.ndarray, " n"]:
-    """Return which windows contain an outlier, also as their first state; errors are measured minus predicted states.
+    """Return which windows contain an outlier, which may be the initial state; errors are measured minus predicted.
 
-    There, differences of successive errors are much larger than usual (Hampel 1974), and nearly as large as the errors
-    themselves and as the same differences of the predicted states, so that no motion explains them.
+    At an outlier, differences of successive errors are much larger than usual (Hampel 1974), nearly as large as the
+    errors, and larger than the same differences of the predicted states, so that no motion explains them.
     """
     if len(errors) < 1 or errors.shape[1] < ORDER:
         return np.zeros(len(errors), bool)

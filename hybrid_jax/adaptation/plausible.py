@@ -22,7 +22,7 @@ from hybrid_jax.trajectories import Trajectories
 GROUPS = {"efficiency": "efficiency", "reaction_torque": "reaction_torque", "added_drag": "drag"}
 GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
 
-# What each candidate fits, as groups of parameters. Those apply of which the field has all groups.
+# The groups of parameters that each candidate fits. A candidate applies if the field has all of its groups.
 CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "source": (),
     "theta": ("theta",),
@@ -46,15 +46,15 @@ class Plausible:
     """How large changes usually are: standard deviations of a normal prior that is centred at the source.
 
     Attributes:
-        theta: of each parameter of a rigid body in its own parametrisation, for example 0.3 for 30 % of a ratio.
-        relative: of a parameter of another system, relative to the source's value; one that is 0 there is free. It is
-            absolute for a logarithm, the name of which begins with log_.
+        theta: each parameter of a rigid body in its own parametrisation, for example 0.3 for 30 % of a ratio.
+        relative: each parameter of another system, relative to the source's value; a parameter that is 0 is free. It
+            is absolute for a logarithm, whose name should begin with log_.
         force: constant force over the mass [m/s²].
         torque: constant torque over the inertia [rad/s²].
         drag: added drag over the mass [1/s].
         efficiency: logarithm of each rotor's efficiency.
         reaction_torque: logarithm of a factor of all reaction torques.
-        disturbance: constant disturbance of another system, over the RMS rate of each state in the windows.
+        disturbance: constant disturbance of another system, relative to each state's RMS rate in the windows.
 
     Raises:
         ValueError: if a size is not positive.
@@ -83,7 +83,7 @@ class Plausible:
         names, theta = names_of(field), ravel_parameters(field)[0]
         groups = groups_of(names)
         k = groups.count("disturbance")
-        parts = k if k and windows.x0.shape[1] % k == 0 else 1  # of a grid a component is one part
+        parts = k if k and windows.x0.shape[1] % k == 0 else 1  # each component of a grid is one part
         rates = (windows.x[:, -1] - windows.x0) / (windows.horizon * windows.dt)
         rates = jnp.sqrt(jnp.nanmean(jnp.square(rates).reshape(len(rates), parts, -1), axis=(0, 2)))
         if "drag" in groups:
@@ -108,7 +108,7 @@ def _numbers(field: AbstractVectorField, d: int | None) -> list[Array]:
 
 
 def values_of(field: AbstractVectorField, d: int | None = None) -> dict[str, float]:
-    """Return the parameters of a field's physics by name, of the `extended` one for a state of d numbers."""
+    """Return the physics' parameters by name; given the size d of the state, of the `extended` field."""
     named = field if d is None else eqx.filter_eval_shape(extended, field, d)
     return dict(zip(names_of(named), map(float, jax.device_get(_numbers(field, d))), strict=True))
 

@@ -1,4 +1,4 @@
-"""Sum variances of different origin, and pool parameters of several sources, with the error of the networks."""
+"""Pool the parameters of several sources, which differ by the errors of their networks; sum variances."""
 
 from collections.abc import Sequence
 
@@ -12,16 +12,16 @@ from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import check_level, named_parameters
 from hybrid_jax.runtime import entry
 
-SOURCES = 3  # at least so many: the variance between two says nothing
+SOURCES = 3  # the fewest: the variance between two is too uncertain
 
 
 @entry
 def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parameter]:
     """Combine the parameters of several results. Intervals include the variance within and between results.
 
-    Sources with different seeds differ in what their networks absorbed. The variance between them takes the place of
-    the bound on it that a single result has, as in multiple imputation (Rubin, Multiple Imputation for Nonresponse in
-    Surveys, 1987, Sec. 3.1).
+    Sources with different seeds differ in what their networks absorbed. The variance between them replaces the bound
+    that a single result has, as in multiple imputation (Rubin, Multiple Imputation for Nonresponse in Surveys, 1987,
+    Sec. 3.1).
 
     Args:
         results: adaptations of sources that were trained with different seeds, all to the same windows.
@@ -53,16 +53,15 @@ def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parame
 def combined(
     estimates: Float[np.ndarray, " m"], variances: Float[np.ndarray, " m"], level: float = 0.95, degrees: float = np.inf
 ) -> tuple[float, float]:
-    """The mean of m estimates and the half-width of its interval, given the variance of each (Rubin, Eq. 3.1.2–8).
+    """Return the mean of m estimates and the half-width of its interval, given their variances (Rubin, Eq. 3.1.2–8).
 
-    Degrees of freedom follow Barnard and Rubin (Biometrika 1999), at least m − 1 where nearly all variance is between
-    the estimates, and at most `degrees`.
+    Degrees of freedom follow Barnard and Rubin (Biometrika 1999): at least m − 1, or `degrees` if that is less.
     """
     m = len(estimates)
     between = (1 + 1 / m) * np.var(estimates, ddof=1)
     total = np.mean(variances) + between
     share = between / total
-    # Inverse degrees of freedom of the variance between the estimates, and of that within.
+    # Inverse degrees of freedom of the variances between and within the estimates.
     ours = share**2 / (m - 1)
     own = (degrees + 3) / (degrees + 1) / degrees / (1 - share) if np.isfinite(degrees) and share < 1 else 0.0
     freedom = max(1 / (ours + own), min(m - 1, degrees)) if ours + own > 0 else np.inf
@@ -74,9 +73,8 @@ def satterthwaite(variances: Float[np.ndarray, "c p"], degrees: Float[np.ndarray
 
     An estimate v of a variance σ² with ν degrees of freedom is σ² χ²_ν / ν: its mean is σ², its variance 2 σ⁴ / ν. The
     sum Σ v_i thus has the mean Σ σ_i² and the variance Σ 2 σ_i⁴ / ν_i. Student's quantile is right for a multiple of
-    χ²_ν with these two moments, that is for ν = (Σ v_i)² / Σ (v_i² / ν_i), with v_i in place of σ_i² (Satterthwaite,
-    Biometrics Bulletin 1946; Welch, Biometrika 1947; ISO/IEC Guide 98-3, GUM, Sec. G.4.1). It is between the smallest
-    ν_i and Σ ν_i.
+    χ²_ν with these two moments: with v_i for σ_i², ν = (Σ v_i)² / Σ (v_i² / ν_i) (Satterthwaite, Biometrics Bulletin
+    1946; Welch, Biometrika 1947; ISO/IEC Guide 98-3, GUM, Sec. G.4.1). It is between the smallest ν_i and Σ ν_i.
     """
     total = np.sum(variances, axis=0)
     shares = np.divide(variances, total, out=np.ones_like(variances), where=np.isfinite(total) & (total > 0))
@@ -85,7 +83,7 @@ def satterthwaite(variances: Float[np.ndarray, "c p"], degrees: Float[np.ndarray
 
 
 def _estimates(result: Adaptation) -> dict[str, tuple[float, float, float]]:
-    """Return by name the value, its variance, and the degrees of freedom of that."""
+    """Return each parameter's value, variance and degrees of freedom by name."""
     theta, _ = ravel_parameters(result.field)
     assert result.covariance is not None
     assert result.degrees is not None

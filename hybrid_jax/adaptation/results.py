@@ -21,8 +21,8 @@ SHOWN = 0.01  # less probable candidates are not reported
 NOT_CONFIRMED = "errors in windows that were left out of the fit do not confirm it"
 AS_LARGE = "the source's own errors may be as large without any change"
 WITHIN = (
-    "Some intervals contain the value before. They are of the values themselves, which the network makes uncertain; "
-    "the changes are more certain, since the network is the same before and after."
+    "Some intervals contain the value before: they include the network's uncertainty. The changes are more certain, "
+    "since the network is the same before and after."
 )
 
 
@@ -54,7 +54,7 @@ class Parameter:
 
     @property
     def contains_before(self) -> bool:
-        """Whether it has an interval, which contains the source's value."""
+        """Whether the interval contains the source's value; False without an interval."""
         return self.low <= self.before <= self.high
 
     def __str__(self) -> str:
@@ -86,7 +86,7 @@ class Adaptation:
         changed: parameters that differ significantly from the source's, the most significant first.
         set_aside: number of samples in windows with outliers, which were not used.
         not_measured: share of the states of the windows, 0 to 1, that are NaN, which counts as not measured.
-        candidates: "auto" only: probability of each change by name, 0 to 1; the network's is relative to the one taken.
+        candidates: "auto" only: probability of each change by name, 0 to 1; the network's is relative to `chosen`.
         chosen: "auto" only: name of the chosen candidate.
         refused: "auto" only: candidates that would be more probable than the chosen one if the source had no errors.
         alone: "auto" only: whether physics, fitted to the source's own motion, replaced physics and network.
@@ -144,7 +144,7 @@ class Adaptation:
             yield f"Chosen: {self.chosen}. Probability of each change: {found}."
             if rather is not None:
                 yield f"Probability that the network changed, rather than the most probable of these: {rather:.2g}."
-            # If the evidence of the most probable change is strong, left-out windows refused it.
+            # If the evidence of the most probable change is strong, left-out windows rejected it.
             likely = next(iter(known))
             strong = known[likely] > STRONG * known.get("source", 1.0)
             for reason, sure in ((NOT_CONFIRMED, True), (AS_LARGE, False)):

@@ -58,7 +58,7 @@ def last_layer(
 def linear_residual(
     field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> Hybrid:
-    """Add a linear map of the standardised [x, u], regressed on the defects; raises as `last_layer`."""
+    """Add a linear map of the standardised [x, u], regressed on the defects; raises like `last_layer`."""
     (before, u, after), canonical = transitions(windows), jax.vmap(state_space(field).canonical)
     z = jnp.concatenate([canonical(before, (before + after) / 2), u], axis=1)
     mean, scale = mean_and_scale(z)
@@ -74,11 +74,11 @@ def fit_ridge(
     penalties: tuple[float, ...] = PENALTIES,
     settings: Settings | None = None,
 ) -> RidgeFit:
-    """Return the updated field at the penalty of smallest validation loss; pure: it compiles and maps."""
+    """Update a field with the penalty of smallest validation loss. You can use this under `jit` and `vmap`."""
     check(train, "train")
     check(validation, "validation")
     if not penalties:
-        raise ValueError("penalties must contain a positive number at least, got none")
+        raise ValueError("penalties must contain at least one positive number, got none")
     for penalty in penalties:
         checks.positive("penalties", penalty, "positive finite numbers")
     settings, grid = Settings() if settings is None else settings, jnp.asarray(penalties, float)
@@ -100,7 +100,7 @@ def transitions(windows: Trajectories) -> tuple[Float[Array, "s d"], Float[Array
 
 
 def defects(field: AbstractVectorField, windows: Trajectories, solver: Solver = None) -> Float[Array, "s d"]:
-    """Return e, the derivative that the field lacks in each interval, mean of its two ends, to second order in dt.
+    """Return the derivative e that the field lacks in each interval, the mean of both ends, to second order in dt.
 
     With Φ one solver step, (x₁ − Φ(x₀)) / dt is off by ½ dt ∂f/∂x e; the step backwards from x₁ is off by the opposite.
     """
@@ -115,7 +115,7 @@ def defects(field: AbstractVectorField, windows: Trajectories, solver: Solver = 
 
 
 def mean_and_scale(z: Float[Array, "s n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """The mean and scale of each channel: its standard deviation, or 1e-3 of its mean if that is more, or 1."""
+    """Return each channel's mean and scale: its standard deviation, or 1e-3 of its mean if that is more, or 1."""
     mean, spread = jnp.mean(z, axis=0), jnp.std(z, axis=0)
     floor = 1e-3 * jnp.abs(mean)  # the spread of a constant channel is round-off, which must not become a feature
     return mean, jnp.where(spread + floor > 0, jnp.maximum(spread, floor), 1.0)

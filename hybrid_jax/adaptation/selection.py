@@ -19,14 +19,14 @@ from hybrid_jax.estimation.starts import Starts, from_starts, smoothed
 from hybrid_jax.trajectories import RANGE, Trajectories
 
 BLOCKS = 10
-CLUSTERS = 5  # of windows of one flight, for intervals: in gusts, errors a second apart are still correlated
-FEW = 10  # windows, of which no order is seen
-SHIFTS = 20  # other windows that each is compared with
+CLUSTERS = 5  # of a flight's windows, for intervals: in gusts, errors a second apart are still correlated
+FEW = 10  # with fewer windows, their order cannot be recognised
+SHIFTS = 20  # number of other windows with which each is compared
 SURELY = 2.0  # standard errors by which one model must predict better to replace another
-ENOUGH = 5  # blocks, to know a standard error
-MOST = 1.0  # gain of a block, a logarithm: more would only add to the standard error
-ALIKE = 2  # so many blocks of one flight count as one: neighbours are alike, and another flight differs more
-STRONG = 20.0  # odds against no change from which one is believed (Kass and Raftery 1995)
+ENOUGH = 5  # blocks that give a standard error
+MOST = 1.0  # largest log-gain of a block that counts: more would only add to the standard error
+ALIKE = 2  # so many blocks of a flight count as one: neighbouring blocks are alike, and another flight differs more
+STRONG = 20.0  # odds of a change over no change that are strong evidence (Kass and Raftery 1995)
 TINY = float(np.finfo(np.float32).tiny)
 
 
@@ -34,10 +34,10 @@ class Fit(NamedTuple):
     """A fit to n windows, and the quadratic form of the squared errors around it."""
 
     theta: Float[Array, " p"]  # the p parameters, in the order of `ravel_parameters`
-    equations: NormalEquations  # of each window, there
+    equations: NormalEquations  # of each window, at theta
     of_states: Float[Array, "d p p"]  # JᵀJ of the errors of each state, summed over windows
     noise: Float[Array, ""]  # variance of one error over scale, from differences of successive errors
-    seen: Bool[Array, " p"]  # which parameters the windows tell more of than rounding and the prior
+    seen: Bool[Array, " p"]  # which parameters the windows determine beyond rounding and better than the prior
     steps: Int[Array, ""]  # evaluations of the Jacobian
     status: Int[Array, ""]  # how it ended, a `Status`
 
@@ -69,13 +69,13 @@ def fit_each(
         held, given = jnp.sqrt(noise) / sizes, (field, smooth, solver, max_steps, scale)
         found, jacobian, r = fit_and_linearise(*given, free, weigh, held, distinct, known, moved)
         equations = jax.vmap(normal_equations.equations_of)(jacobian, r)
-        # What windows tell less of than its prior could be anything, at hardly another error.
+        # A parameter that windows determine less than the prior could have any value at nearly the same error.
         more = jnp.diagonal(jnp.sum(equations.gram, axis=0)) > noise / jnp.square(sizes)
         seen = more & normal_equations.has_effect(equations, windows, scale)
         theta = ravel_parameters(found.field)[0]
         of_states = jnp.einsum("nsdp,nsdq->dpq", jacobian, jacobian)
         fit = Fit(theta, masked(equations, seen), of_states, noise, seen, found.steps, found.status)
-        return (jacobian, r, ~jnp.any(free)), fit  # where nothing is fitted, these are of the start
+        return (jacobian, r, ~jnp.any(free)), fit  # if nothing was fitted, these are at the start
 
     shape = jax.eval_shape(weigh, smooth.x)
     nothing = (*(jnp.zeros((*shape.shape, *more), shape.dtype) for more in (free.shape[1:], ())), jnp.array(False))
@@ -83,7 +83,7 @@ def fit_each(
 
 
 class Unchanged(NamedTuple):
-    """Without any change: the `apparent` variance of each parameter, and the summed squared `error` over scale."""
+    """The source's own errors: the `apparent` variance of each parameter, and the summed squared `error` over scale."""
 
     apparent: Float[Array, " p"]
     error: Float[Array, ""]
@@ -92,7 +92,7 @@ class Unchanged(NamedTuple):
 def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, learned_from, shares) -> Unchanged:
     """Estimate apparent changes beyond noise from the source's own motion (DerSimonian and Laird 1986).
 
-    Where windows are unlike that motion, by `shares_outside`, the network's error is assumed as large as its effect.
+    Where windows are unlike that motion (`shares_outside`), the network's error is taken to be as large as its effect.
     """
     outside, missed = shares
     places = jnp.maximum(1.0, (1 - missed) * len(found.equations.score))
@@ -107,7 +107,7 @@ def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, learned_fro
 
 
 def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:
-    """Repeat or select the source's windows until they are as many as the others, and no longer, for one program."""
+    """Repeat, select and shorten the source's windows to the shape of the others, so that one program fits both."""
     n, m, t = len(windows), len(learned_from), windows.horizon
     places = np.arange(n) % m if m < n else np.linspace(0, m - 1, n).astype(int)
     own = Trajectories(learned_from.x0, learned_from.u[:, :t], learned_from.x[:, :t], learned_from.dt)
@@ -121,15 +121,15 @@ class Posterior(NamedTuple):
     probability: Float[Array, " c"]  # of each change
     naive: Float[Array, " c"]  # the same probability if the source had no errors
     taken: Int[Array, ""]  # index of the chosen candidate
-    sizes: Float[Array, " p"]  # the prior of a fit whose errors have the variance of the noise, not the dispersion
+    sizes: Float[Array, " p"]  # the prior for a fit that assumes the variance of the noise, not the dispersion
 
 
 def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array, " p"]) -> Posterior:
     """Compare candidates by the squared errors around one fit; `sizes` and `apparent` are the prior of the changes.
 
-    A parameter with an infinite size has the variance that one window determines.
+    A parameter with an infinite size gets the variance that one window determines as its prior.
     """
-    variance = dispersion(every, sizes)  # what remains where everything may change
+    variance = dispersion(every, sizes)  # what remains if everything may change
     information = jnp.sum(around.equations.gram, axis=0) / variance
     pull = -jnp.sum(around.at(start).score, axis=0) / variance
     one_window = len(around.equations.score) / jnp.maximum(jnp.diagonal(information), TINY)
@@ -155,7 +155,7 @@ def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array
 
 
 def spread(equations: NormalEquations, free: Bool[Array, " p"], of_source: Float[Array, "p p"]) -> Float[Array, "p p"]:
-    """Propagate the covariance of the parameters that are not free to those that are fitted beside them."""
+    """Propagate the covariance of the parameters that are not free to the fitted ones."""
     gram = jnp.sum(equations.gram, axis=0)
     fitted = inverse(jnp.sum(masked(equations, free).gram, axis=0)).matrix * free * free[:, None]
     told = jnp.isfinite(jnp.diagonal(of_source))
@@ -169,7 +169,7 @@ def dispersion(found: Fit, sizes) -> Float[Array, ""]:
     places, counted = blocks_of(len(found.equations.score), BLOCKS)
     score = jnp.sum(found.equations.score[places] * counted[..., None], axis=1)
     total = jnp.sum(found.equations.gram, axis=0)
-    # A parameter of unit effect; what is not identifiable stays at the source.
+    # Scaled to unit effect; parameters that are not identifiable stay at the source.
     prior = found.noise / jnp.square(sizes)
     unit = 1 / jnp.sqrt(jnp.diagonal(total) + prior)
     held = unit[:, None] * (total + jnp.diag(prior)) * unit
@@ -181,8 +181,8 @@ def dispersion(found: Fit, sizes) -> Float[Array, ""]:
 def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Trajectories) -> Float[Array, "2"]:
     """Return the largest share of samples outside the other windows' 1 to 99 % range, over quantities of the state.
 
-    The first is of `asked` outside `known`: all that is known, since a few windows have a narrower range. Inputs do not
-    count: a vehicle that has changed, for example by a load, needs other ones for the same motion. It compiles.
+    The first is of `asked` outside `known`: pass all known windows, since a few have a narrower range. Inputs do not
+    count: a changed vehicle, for example with a load, needs different inputs for the same motion.
     """
     space, t = state_space(field, known.x0.shape[-1]), min(known.horizon, asked.horizon)
 
@@ -201,7 +201,7 @@ def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Traje
 def blocks_of(
     windows: int, blocks: int, flights: Int[np.ndarray, " n"] | None = None
 ) -> tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]:
-    """Return the indices of each block's, or flight's, windows, and which count: a short block repeats its last."""
+    """Return the window indices of each block, or flight, and which count: a short block repeats its last window."""
     if flights is not None:
         first, sizes = np.unique(flights, return_index=True, return_counts=True)[1:]
         own = np.arange(sizes.max())
@@ -231,7 +231,7 @@ def left_out_thetas(found: Fit, free: Bool[Array, " p"], sizes, start, blocks) -
 def without_others(every: Fit, free: Bool[Array, " p"], start) -> Float[Array, " p"]:
     """Return the change of the free parameters if the others stay, to first order around a fit of all.
 
-    Parameters are correlated: with the others set back alone, predictions can be far worse than the start's.
+    Parameters are correlated: if the others were simply set back, predictions could be far worse than at the start.
     """
     gram, change = jnp.sum(every.equations.gram, axis=0), every.theta - start
     others = jnp.where(free, 0.0, change)
@@ -240,12 +240,12 @@ def without_others(every: Fit, free: Bool[Array, " p"], start) -> Float[Array, "
 
 
 def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) -> Bool[Array, ""]:
-    """Whether a change lowers the logarithm of the error of blocks left out by more than `SURELY` standard errors.
+    """Return whether a change lowers the log-error of left-out blocks by more than `SURELY` standard errors.
 
-    `ALIKE` neighbouring blocks count as one. Evidence assumes independent errors; where physics lacks something they
-    are not. The logarithm is the likelihood of a block of unknown variance, in which no block outweighs the others. It
-    counts as at most `MOST`: a change that a few blocks show clearly, and the others a little, is no less sure. See
-    `left_out_thetas`.
+    Evidence assumes independent errors, but errors are correlated where physics lacks something. `ALIKE` neighbouring
+    blocks count as one. The logarithm is the likelihood of a block of unknown variance, so that no block outweighs the
+    others. Gains count up to `MOST`: a change that a few blocks show clearly, and the others a little, is as certain.
+    See `left_out_thetas`.
     """
     after = jax.vmap(lambda theta, place: found.at(theta).square[place])(thetas, blocks[0])
     before, after = (jnp.sum(square * blocks[1], axis=1) for square in (still.equations.square[blocks[0]], after))
@@ -256,7 +256,7 @@ def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) ->
 
 
 def correlated(windows: Trajectories) -> int:
-    """How many consecutive windows form a cluster: a fifth if they are from one flight or a few."""
+    """Return how many consecutive windows form a cluster: a fifth if they are from one or a few flights, else 1."""
     starts, ends = np.asarray(windows.x0), np.asarray(windows.x)[:, -1]
     touch = bool((starts[1:] == ends[:-1]).all(axis=1).any())
     of_flights = touch or overlap(windows) or _follow(starts, ends)
@@ -264,7 +264,7 @@ def correlated(windows: Trajectories) -> int:
 
 
 def _follow(starts: Float[np.ndarray, "n d"], ends: Float[np.ndarray, "n d"]) -> bool:
-    """Whether windows begin much nearer to the end of the previous one than to other ends, after a gap."""
+    """Return whether windows begin much nearer to the end of the previous one than to other ends, after a gap."""
     n, spread = len(starts), np.std(starts, axis=0)
     if n < FEW or not spread.any():
         return False

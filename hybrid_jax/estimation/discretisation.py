@@ -1,4 +1,4 @@
-"""What half the solver's step would change in a fit: intervals do not include it, and a network learns it."""
+"""Check how much half the solver's step would change a fit: intervals do not include it, and a network learns it."""
 
 from dataclasses import replace
 
@@ -20,15 +20,15 @@ from hybrid_jax.trajectories import Trajectories
 Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
 Scale = Float[Array, " d"] | None  # the error of each state that counts as 1; without one, 1 in its own unit
 
-MANY, SOME = 10_000, 1000  # windows: of more, so many are compared
+MANY, SOME = 10_000, 1000  # of more than MANY windows, or SOME for a network, SOME are compared
 NAMED = 50  # parameters; a field with more is a network
-COARSE = 0.5  # standard errors that half the solver's step may move a parameter, or share of the errors of predictions
-FINE = 1e-3  # of how far the states move: smaller errors do not count as noise of which a fit is
+COARSE = 0.5  # standard errors by which half the step may move a parameter, or share of the predictions' errors
+FINE = 1e-3  # of the states' motion: the smallest error that counts as noise
 REMEDY = "windows with a smaller dt, or a solver with more substeps, such as RK4(substeps=2)"
 
 
 def is_named(field: AbstractVectorField) -> bool:
-    """Whether all that is learned are a few parameters of physics, and no network."""
+    """Return whether a field learns only a few parameters of physics, and no network."""
     size = ravel_learned(physics_of(field))[0].size
     return 0 < size <= NAMED and size == ravel_learned(field)[0].size
 
@@ -36,12 +36,12 @@ def is_named(field: AbstractVectorField) -> bool:
 def discretisation(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, named: bool
 ) -> float:
-    """Return what half the solver's step would change in a fit of these windows.
+    """Return how much half the solver's step would change a fit of these windows.
 
     Args:
-        named: True for by how many standard errors a parameter of the physics would move at most, and 0 if surely by
-            less than COARSE, as none moves by more than all predictions together. False for a network, which can learn
-            any of it: the change of the predictions over their errors.
+        named: if True, the result is the largest move of a physical parameter in standard errors, or 0 if it is surely
+            less than COARSE, since no parameter moves by more than all predictions together. If False, it is the
+            change of the predictions over their errors, all of which a network can learn.
     """
     n = len(windows)
     some = windows if n <= (MANY if named else SOME) else windows[np.linspace(0, n - 1, SOME).astype(int)]
@@ -79,12 +79,12 @@ def compare_steps(
 def warn_of_steps(moved: float, remedy: str, named: bool = True) -> None:
     if moved > COARSE:
         what = f"move a parameter by {moved:.2g} standard" if named else f"change predictions by {moved:.2g} of their"
-        checks.warn(f"half the solver's step would {what} errors: give {remedy}")
+        checks.warn(f"half the solver's step would {what} errors: use {remedy}")
 
 
 @jit_by_size(UNOPTIMISED)
 def _standard_errors(field: AbstractVectorField, windows: Trajectories, solver: Solver, weight, change):
-    """Compute by how many standard errors, in noise of 1, a change of the predictions moves a parameter at most."""
+    """Return the largest move of a parameter by a change of the predictions, in standard errors for unit noise."""
     fixed = fixed_residual(field)
     theta, at = ravel_learned(physics_of(fixed))
 

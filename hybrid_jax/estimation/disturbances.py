@@ -20,9 +20,9 @@ from hybrid_jax.runtime import FASTEST_COMPILE, UNOPTIMISED, jit_with
 from hybrid_jax.trajectories import Trajectories, windows_of
 
 FILTERS = 5, 20, 60  # time constants, in intervals
-PENALTIES = 0.03, 0.1, 0.3, 1.0, np.inf  # of a change of weights, over the variance of what it explains; the last: none
+PENALTIES = 0.03, 0.1, 0.3, 1.0, np.inf  # on changes of scaled weights; with the last, they do not change
 CHUNK = 512  # intervals that are compared at once
-PARTS, WINDOWS = 3, 200  # parts that are left out in turn, and windows of each part that judge a penalty
+PARTS, WINDOWS = 3, 200  # parts that are left out in turn, and windows of each part that compare penalties
 
 
 def fit_disturbance(
@@ -30,11 +30,11 @@ def fit_disturbance(
 ) -> DisturbanceModel:
     """Learn to predict the disturbance that a field lacks, by ridge regression on its errors after one interval.
 
-    You should use it if the errors of a model last, because the system has states that you do not measure. Parts of the
-    sequences that are left out in turn choose the penalty; an infinite one leaves the field's predictions unchanged.
-    If you start from a model that was learned before, its weights change only if this explains more than twice as much
-    of the errors in each part left out as it alters predictions of the earlier data (after Mallows, 1973). For example,
-    noise in a hover does not change them.
+    You should use it if the errors of a model last, because the system has states that you do not measure. The penalty
+    is chosen by cross-validation over parts of the sequences; an infinite one leaves the predictions unchanged. If you
+    pass a model that was learned before, its weights change only if this explains, in each left-out part, more than
+    twice as much of the errors as it alters predictions of the earlier data (after Mallows, 1973). For example, noise
+    in a hover does not change them.
 
     To predict from the last state of each window:
 
@@ -104,7 +104,7 @@ def _observed(model: DisturbanceModel, past: Trajectories, solver: Solver) -> Fl
 def errors_after_one(
     field: AbstractVectorField, past: Trajectories, solver: Solver = None
 ) -> Float[np.ndarray, "n t e"]:
-    """The error of a field after each interval over its length, in the tangent space of the state, per second."""
+    """Return a field's error after each interval, over its length [s], in the tangent space of the state."""
     before = np.concatenate([past.x0[:, None], past.x[:, :-1]], axis=1)
     (n, t, d), m = before.shape, past.u.shape[-1]
     count = -(-n * t // CHUNK) * CHUNK  # so that all sequences share a program
@@ -124,7 +124,7 @@ def _one_step(field, rows: Any, dt: float, solver: Solver) -> Float[Array, "n e"
 
 
 def _parts(field: AbstractVectorField, sequences: Sequence[Trajectories], steps: int) -> list[Trajectories]:
-    """Sequences of one window each, at least PARTS of them; ValueError for wrong ones."""
+    """Check the sequences and split them into at least PARTS sequences of one window each."""
     checks.count("steps", steps)
     found = [
         each[i : i + 1]
@@ -141,13 +141,13 @@ def _parts(field: AbstractVectorField, sequences: Sequence[Trajectories], steps:
 
 
 def _cut(one: Trajectories, pieces: int) -> Trajectories:
-    """One long window in pieces, or as it is where it is too short."""
+    """Cut one long window into pieces, unless it is too short."""
     states, u = np.concatenate([one.x0, one.x[0]]), np.asarray(one.u[0])
     return windows_of(states, u, one.dt, steps=one.horizon // pieces) if one.horizon >= pieces else one
 
 
 def _states(field: AbstractVectorField, windows: Trajectories) -> tuple[int, ...]:
-    """The states that the field depends on; for example, a vehicle's position has no effect on its motion."""
+    """Return the states that the field depends on; for example, a vehicle's position does not affect its motion."""
     x, u = (np.resize(np.asarray(part[0]), (CHUNK, part.shape[-1])) for part in (windows.x, windows.u))
     slope = _slopes(field, x, u)
     return tuple(np.flatnonzero(np.abs(np.asarray(slope)).max(axis=(0, 1)) > 0).tolist())
@@ -174,7 +174,7 @@ def _sizes(model: DisturbanceModel, states: np.ndarray) -> Float[Array, " f"]:
 
 
 def _solved(start: DisturbanceModel, states: np.ndarray, errors: np.ndarray) -> Float[np.ndarray, "penalties e f"]:
-    """Weights by ridge regression on scaled features, with each penalty on what differs from the start's weights."""
+    """Fit weights by ridge regression on scaled features, with each penalty on the change from the start's weights."""
     before, sizes = np.asarray(start.weights, float), np.asarray(start.sizes, float)
     features, scale = _features(start, states), sizes[: len(before)]
     scaled, goals = features / sizes, (errors - features @ before.T) / scale
@@ -187,7 +187,7 @@ def _solved(start: DisturbanceModel, states: np.ndarray, errors: np.ndarray) -> 
 def _support(
     start: DisturbanceModel, weights: Float[np.ndarray, "penalties e f"], states: np.ndarray, errors: np.ndarray
 ) -> Float[np.ndarray, " penalties"]:
-    """Mean square of errors that weights explain, less twice what they alter in the motion that was learned from."""
+    """Return the mean squared error that weights explain, less twice what they alter on the earlier data."""
     sizes = np.where(np.isinf(start.sizes), 0.0, start.sizes)
     scale, features = sizes[: len(start.weights)], _features(start, states)
     change = (weights - np.asarray(start.weights)) / scale[:, None]
@@ -197,7 +197,7 @@ def _support(
 
 
 def _scores(start: DisturbanceModel, weights, flights: Sequence, steps: int, solver: Solver) -> np.ndarray:
-    """Mean logarithm of the squared error after `steps` intervals, over the quantities of the state, of all weights."""
+    """Return for each weights the mean log squared error after `steps` intervals, over quantities of the state."""
     cut = [windows_of(seen, np.asarray(one.u[0]), one.dt, steps=steps, stride=1) for seen, one in flights]
     x0, u, end = (np.concatenate(parts) for parts in zip(*((w.x0, w.u, w.x[:, -1]) for w in cut), strict=True))
     chosen = np.round(np.linspace(0, len(x0) - 1, WINDOWS)).astype(int)
@@ -211,7 +211,7 @@ def _scores(start: DisturbanceModel, weights, flights: Sequence, steps: int, sol
 
 @jit_with(FASTEST_COMPILE)
 def _squares(model, weights, windows: Any, dt: float, solver: Solver) -> Float[Array, " e"]:
-    """Mean squared error at the end of windows, number by number."""
+    """Return the mean squared error of each number of the state at the end of windows."""
     x0, u, end = windows
     model = eqx.tree_at(lambda each: each.weights, model, weights)
     d = x0.shape[-1] - model.hidden

@@ -1,4 +1,7 @@
-"""Least squares in shared parameters θ and each window's or record's own unknowns, by Schur complements (Bock 1983)."""
+"""Least squares for shared parameters θ and for each piece's own unknowns, by Schur complements (Bock 1983).
+
+A piece is a window or a record.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -14,11 +17,11 @@ from hybrid_jax.estimation.levenberg_marquardt import begin, in_python, minimise
 from hybrid_jax.estimation.normal_equations import RANK, NormalEquations, inverse, inverses
 from hybrid_jax.status import Status
 
-TRACE = 1e-2  # share of a direction: names with less are left out
+TRACE = 1e-2  # smallest share of a direction that is named
 
 
 class Reduced(NamedTuple):
-    """The normal equations of θ after elimination; a step Δθ changes the rest by −(offset + slope Δθ)."""
+    """The normal equations of θ after elimination; a step Δθ moves the own unknowns by −(offset + slope Δθ)."""
 
     equations: NormalEquations
     offset: Float[Array, "n s"]
@@ -41,7 +44,7 @@ def reduced(equations: NormalEquations, p: int, damping: Float[Array, ""] | floa
 
 @partial(jax.jit, static_argnums=1)
 def move(equations: NormalEquations, p: int, damping: Float[Array, ""], free: Bool[Array, " p"], least: float):
-    """Return a step of θ, the steps of the rest (n, s), and the expected decrease of the cost."""
+    """Return a step of θ, the steps of the own unknowns (n, s), and the expected decrease of the cost."""
     (gram, score, _), offset, slope = reduced(equations, p, damping)
     gram, score = jnp.sum(gram, axis=0), jnp.sum(score, axis=0)
     seen = free & (jnp.diagonal(gram) > least)
@@ -129,7 +132,7 @@ def covariance(
     through = np.concatenate([np.broadcast_to(np.eye(p), (len(gram), p, p)), -slope], axis=1)
     half = theta @ through.swapaxes(1, 2) @ meat  # (n, p, q)
     cov = (half @ through).sum(axis=0) @ theta
-    told = told & (np.diagonal(cov) >= 0)  # few pieces that hardly determine a number may give it a negative variance
+    told = told & (np.diagonal(cov) >= 0)  # few pieces may give a negative variance
     cov = np.where(told[:, None] & told, cov, 0.0)
     variance = np.einsum("nsp,pq,nsq->ns", slope, cov, slope) - 2 * np.einsum(
         "nsp,npt,nts->ns", slope, half[..., p:], back

@@ -25,9 +25,9 @@ from hybrid_jax.runtime import entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories, errors_of
 
-MANY, CHUNK = 10_000, 1000  # windows: of more, a triangle takes the place of J and r, and is found by so many at a time
+MANY, CHUNK = 10_000, 1000  # more than MANY windows are compressed to a triangle, CHUNK at a time
 TOGETHER = 64  # windows that are linearised at a time
-LEAST = 0.1  # of what rounding does to the states: a step of which less is expected is the last
+LEAST = 0.1  # of the states' rounding: a step with a smaller expected decrease is the last
 
 Theta = Float[Array, " p"]
 
@@ -40,8 +40,8 @@ class LeastSquaresFit(eqx.Module):
         mse: L_MSE on the windows, with errors divided by `scale`.
         steps: the number of evaluations of the residuals and their Jacobian.
         status: how the fit ended.
-        discretisation: by how many standard errors half the solver's step would change a parameter at most; 0 if
-            surely by less than 0.5, or if predictions change by rounding only; -1 under `jit`, where it is unknown.
+        discretisation: the largest change of a parameter by half the solver's step, in standard errors; 0 if it is
+            surely below 0.5 or predictions change only by rounding; -1 under `jit`, where it is unknown.
     """
 
     field: AbstractVectorField
@@ -75,7 +75,7 @@ def fit_least_squares(
         field: the initial field; a residual beside its physics does not change.
         windows: windows of the system. NaN in x means "not measured" and counts as no error.
         solver: the integrator over each interval, by default one step of RK4.
-        max_steps: the largest number of evaluations of the residuals and their Jacobian.
+        max_steps: the maximum number of evaluations of the residuals and their Jacobian.
         scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
 
     Raises:
@@ -100,11 +100,11 @@ def _linearised(errors: Callable[[Theta, Trajectories], Array], theta: Theta, wi
 
 
 def _triangle(errors: Callable[[Theta, Trajectories], Array], theta: Theta, windows: Trajectories):
-    """Compress all windows into p + 1 errors by QR, some windows at a time: memory does not grow with their number."""
+    """Compress all windows to p + 1 errors by QR, some at a time, so that memory does not grow with their number."""
     n, p = len(windows), theta.size
 
     def add(i, triangle):
-        first = jnp.minimum(i * CHUNK, n - CHUNK)  # the last chunk begins earlier, with windows that were counted
+        first = jnp.minimum(i * CHUNK, n - CHUNK)  # the last chunk repeats windows
         part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, CHUNK), windows)
         jacobian, r = _linearised(errors, theta, part)
         rows = jnp.concatenate([jacobian.reshape(CHUNK, -1, p), r.reshape(CHUNK, -1, 1)], axis=2)
@@ -153,9 +153,9 @@ def fit_and_linearise(
 
     Args:
         weigh: an affine map of the errors, such as `starts.projected`.
-        held: error per unit of a parameter's distance from the start minus `moved`, to which a fit that fails returns.
+        held: error per unit of a parameter's distance from the start minus `moved`, where a failed fit ends.
         distinct: how many windows are distinct, if the others repeat them in order.
-        known: the Jacobian and the errors at the start, and whether they are that or must be computed.
+        known: the Jacobian and the errors at the start, and whether they are valid; else they are computed.
     """
     start, unravel = ravel_parameters(field)
     compressed, own = weigh is None and len(windows) > MANY, weigh or (lambda errors: errors)
@@ -219,7 +219,7 @@ def fit_and_linearise(
         return (z + move, upper), expected, jnp.square(LEAST * rounding(windows, scale) / size)
 
     shape = jax.eval_shape(lambda: linearised(start)[1] if compressed else own(jnp.asarray(windows.x)))
-    zero = jnp.zeros(start.shape)  # of JAX's default precision, as all numbers of the loop but the errors are
+    zero = jnp.zeros(start.shape)  # in JAX's default precision, like the loop's numbers except the errors
     nothing = jnp.zeros((*shape.shape, start.size), shape.dtype), jnp.zeros(shape.shape, shape.dtype)
     jacobian, found = nothing if known is None else known[:2]
     units = jnp.zeros(start.shape, shape.dtype), jnp.ones((), shape.dtype)
@@ -258,4 +258,4 @@ def prediction_errors(
 
 
 def _nonzero(size: Float[Array, "*p"]) -> Float[Array, "*p"]:
-    return jnp.where(size > 0, size, 1)  # a parameter without effect then stays where it is
+    return jnp.where(size > 0, size, 1)  # a parameter without effect then does not change

@@ -1,7 +1,7 @@
 """Levenberg–Marquardt (Levenberg 1944; Marquardt 1963) for all least-squares fits.
 
-Unlike Optimistix, one evaluation serves the start, the steps and the end, with any elimination, and a fit stops at the
-limit of rounding.
+Unlike Optimistix, it compiles one evaluation for the start, the steps and the end, allows any elimination, and stops at
+the limit of rounding.
 """
 
 from collections.abc import Callable
@@ -16,9 +16,9 @@ from hybrid_jax.batches import solve
 from hybrid_jax.status import Status
 
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
-SMALLEST, LARGEST = 1e-12, 1e8  # damping: beyond, no direction leads down
-HIDDEN = 10  # times the rounding of one number: what rounding does to the sum of squares
-PROMISED = 1e-3  # of the cost: a fit that no step lowers has not converged if without damping so much was expected
+SMALLEST, LARGEST = 1e-12, 1e8  # damping; with more, no step lowers the cost
+HIDDEN = 10  # rounding of the sum of squares, in roundings of one number
+PROMISED = 1e-3  # of the cost: a fit that no step lowers has stalled if more was expected without damping
 SLOW = 2  # steps in a row that lower the cost by less than the tolerance end the fit
 
 Move = tuple[Float[Array, " p"], Float[Array, ""]]  # a step, and by how much it should lower the cost
@@ -58,7 +58,7 @@ def begin(point: PyTree, found: PyTree, damping: float = DAMPING) -> State:
 def judged(state: State, cost: Float[Array, ""], tolerance: float = 0.0) -> tuple[Bool[Array, ""], State]:
     """Accept or reject the point that was tried, and update the damping (Madsen, Nielsen and Tingleff 2004, Eq. 2.21).
 
-    A step as good as half of what was expected keeps the damping: a rule that asks for more stops in curved valleys.
+    A step that achieves half of the expected decrease keeps the damping: a stricter rule stops in curved valleys.
     """
     first, change = state.steps == 0, cost - state.cost
     accepted = first | (change <= -0.01 * state.expected) | (state.last & jnp.isfinite(change))
@@ -78,7 +78,7 @@ def judged(state: State, cost: Float[Array, ""], tolerance: float = 0.0) -> tupl
 def aimed(state: State, tried: PyTree, expected: Float[Array, ""], least: Float[Array, ""] | float = 0.0) -> State:
     """Set the next point to try; it is the last one if the expected decrease is below `least` or rounding.
 
-    The damping of steps that failed is no reason to expect little: the fit then goes on until it stalls.
+    If the expected decrease is small only because failed steps raised the damping, the fit continues until it stalls.
     """
     hidden = HIDDEN * jnp.finfo(state.cost.dtype).eps * state.cost
     promised = expected * jnp.maximum(state.damping, 1)
@@ -96,9 +96,8 @@ def minimise(
 ) -> State:
     """Try points, at most `max_steps`, until one is the last.
 
-    `evaluate` gives, from a point and the previous state, the cost and other results there; `aim`, from these results
-    and the damping, the next point, the expected decrease, and the least useful one. `loop` is `in_python` outside of
-    compiled programs.
+    `evaluate(point, state)` returns the cost and other results at a point. `aim(results, damping)` returns the next
+    point, the expected decrease and the smallest useful one. `loop` should be `in_python` outside compiled programs.
     """
 
     def step(state: State) -> State:
@@ -117,8 +116,8 @@ def corrected(
 ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
     """Return the better of a point and that point with a second-order correction, and its cost.
 
-    `correction` is a step against what the linear model missed in the errors at a point. In curved valleys this follows
-    the bend, as geodesic acceleration does (Transtrum and Sethna 2012).
+    `correction` returns a step that reduces errors which the linear model missed. In curved valleys this follows the
+    bend, like geodesic acceleration (Transtrum and Sethna 2012).
     """
 
     def attempt(carry, _):
@@ -148,7 +147,7 @@ def move_of_rows(
 
 
 def move_of_equations(gram: Float[Array, "p p"], score: Float[Array, " p"], damping: Float[Array, ""]) -> Move:
-    """Minimise the same from JᵀJ and Jᵀr, with parameters scaled to effect 1; one without effect does not change."""
+    """Minimise the same from JᵀJ and Jᵀr, with parameters scaled to unit effect; one without effect does not change."""
     size = jnp.sqrt(jnp.diagonal(gram))
     seen = size > 0
     unit = jnp.where(seen, 1 / jnp.where(seen, size, 1), 0)

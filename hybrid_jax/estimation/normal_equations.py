@@ -17,13 +17,13 @@ from hybrid_jax.trajectories import Trajectories
 
 FLAT = 1e-12  # least size of an error
 CHUNK = 250  # windows in memory at a time
-RANK = 10  # times p and the rounding of one number: a smaller eigenvalue, of parameters of equal effect, is zero
+RANK = 10  # times p and machine epsilon: smaller eigenvalues, of parameters scaled to equal effect, count as zero
 
 
 class NormalEquations(NamedTuple):
-    """The normal equations of q numbers from each of n pieces, with J the Jacobian of their errors r.
+    """The normal equations of q numbers from each of n windows or records, with J the Jacobian of their errors r.
 
-    Pieces are windows or records; the numbers are θ_p, or all learned numbers followed by each piece's own unknowns.
+    The numbers are θ_p, or all learned numbers followed by the window's or record's own unknowns.
     """
 
     gram: Float[Array, "*n q q"]  # JᵀJ
@@ -32,14 +32,14 @@ class NormalEquations(NamedTuple):
 
     @staticmethod
     def of_errors(jacobian: Float[Array, "s q"], r: Float[Array, " s"], robust: float = np.inf) -> "NormalEquations":
-        """From one piece; an error of more than `robust` counts linearly, not as a square (Huber 1964)."""
+        """Compute them for one window; an error above `robust` counts linearly, not as a square (Huber 1964)."""
         size = jnp.maximum(jnp.abs(r), FLAT)
         weighted = jacobian * jnp.minimum(1.0, robust / size)[:, None]
         square = r**2 if np.isinf(robust) else jnp.where(size <= robust, r**2, 2 * robust * size - robust**2)
         return NormalEquations(weighted.T @ jacobian, weighted.T @ r, jnp.sum(square))
 
 
-# A program of its own: selecting a disturbance and the covariance share it.
+# Compiled on its own, so that selecting a disturbance and the covariance share it.
 @jit_by_size()
 def normal_equations(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, scale: Scale
@@ -72,16 +72,16 @@ def masked(equations: NormalEquations, free: Bool[Array | np.ndarray, " p"]) -> 
 
 @jit_by_size()
 def has_effect(equations: NormalEquations, windows: Trajectories, scale: Scale) -> Bool[Array, " p"]:
-    """Which parameters change the predictions by more than rounding."""
+    """Return which parameters change the predictions by more than rounding."""
     return jnp.diagonal(jnp.sum(equations.gram, axis=0)) > jnp.square(least_squares.rounding(windows, scale))
 
 
 class Inverse(NamedTuple):
     """The pseudo-inverse of JᵀJ: zero along directions that change no prediction by more than rounding."""
 
-    matrix: Float[Array, "*n p p"]  # the pseudo-inverse
-    told: Bool[Array, "*n p"]  # the identifiable parameters, with no part in such a direction
-    rank: Int[Array, "*n"]  # number of directions of θ_p that change a prediction by more
+    matrix: Float[Array, "*n p p"]
+    told: Bool[Array, "*n p"]  # the identifiable parameters, which do not contribute to such a direction
+    rank: Int[Array, "*n"]  # number of the other directions
 
 
 def inverse(gram: Float[Array, "p p"], least: float | None = None) -> Inverse:
@@ -100,7 +100,7 @@ def inverse(gram: Float[Array, "p p"], least: float | None = None) -> Inverse:
 
 
 def inverses(grams: Float[Array, "n p p"], least: float | None = None) -> Inverse:
-    """Invert one after the other: two batches at once can wait for each other, see `batches.solve`."""
+    """Invert one after another, since two batches at once can deadlock, see `batches.solve`."""
     return jax.lax.map(partial(inverse, least=least), grams)
 
 
@@ -109,7 +109,7 @@ def steps_without(
 ) -> Float[Array, "b p"]:
     """Compute the Gauss–Newton step without each of several parts, from the sums over all windows and these parts.
 
-    It is not finite if a part is necessary to identify a parameter; one that is never identifiable does not change.
+    It is not finite if a part is necessary to identify a parameter; parameters that are never identifiable do not move.
     """
     found = inverses(gram - grams)
     steps = -jnp.einsum("bpq,bq->bp", found.matrix, score - scores)
@@ -119,7 +119,7 @@ def steps_without(
 def left_out(equations: NormalEquations, horizon: int) -> Float[Array, " n"]:
     """Predict L_MSE of each window by a fit of θ_p to all others (PRESS; Allen 1974), exact for linear residuals.
 
-    It is not finite if the others do not identify all that all windows do.
+    It is not finite if the others identify fewer parameters than all windows do.
     """
     gram, score, square = equations
     steps = steps_without(jnp.sum(gram, axis=0), jnp.sum(score, axis=0), gram, score)

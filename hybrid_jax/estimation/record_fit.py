@@ -30,8 +30,8 @@ from hybrid_jax.records import Between, Record, completed, on_grid
 from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 
-FASTEST = 2.0  # rate of a decay times RK4's step, which is unstable above 2.8
-CONTINUOUS = 1e-6  # what a segment's end may be off, over the size of a state, where that state has no process noise
+FASTEST = 2.0  # decay rate times RK4's step, which is unstable above 2.8
+CONTINUOUS = 1e-6  # allowed gap between segments, over the size of a state, if the state has no process noise
 
 
 class RecordFit(eqx.Module):
@@ -49,9 +49,9 @@ class RecordFit(eqx.Module):
         covariance: the covariance (p, p) of the learned numbers, in the order of `ravel_learned`.
         steps: number of Levenberg–Marquardt steps, summed over rounds.
         status: how the last round ended.
-        discretisation: by how many standard errors half the solver's step would change a learned number at most; 0 if
-            there is none, infinite if a part of the model is faster than RK4's step.
-        directions: what no sample determines: states at the starts, and combinations of learned numbers.
+        discretisation: the largest change of a learned number by half the solver's step, in standard errors; 0 without
+            learned numbers, infinite if a part of the model is faster than RK4's step.
+        directions: initial states and combinations of learned numbers that no sample determines.
     """
 
     model: StateSpaceModel
@@ -94,24 +94,24 @@ def fit_records(
 ) -> RecordFit:
     """Fit the learned numbers of a model and the initial states to all measured outputs.
 
-    You get a warning if the fit did not converge, if half the solver's step gives other numbers (`discretisation`), and
-    of what no sample determines (`directions`).
+    You get a warning if the fit did not converge, if half the solver's step gives different numbers (`discretisation`),
+    and if no sample determines some of the numbers (`directions`).
 
     Args:
         model: the initial model.
-        records: one or more records. Each output is compared at the samples that a record has of it.
+        records: one or more records. Each output is compared at its own samples in each record.
         dt: length of the intervals in which the inputs are constant [s].
         between: how inputs act between their samples: "held", "linear" or "averaged", see `records.on_grid`.
         segment: length of the segments of multiple shooting [s], which come before whole simulations; by default there
             are none. You need them for unstable systems, a poor initial model, and process noise.
         prior: standard deviations of learned numbers from their start, by the beginning of their path, for example
             {"field.residual": 0.3}; the others are free.
-        noise: expected size of each output's errors in the first round, relative to which `prior` is weighed; by
+        noise: expected size of each output's errors in the first round, relative to which `prior` is weighted; by
             default the standard deviation of its samples.
-        robust: an error counts linearly beyond this many times the usual one, for example 3 for data with outliers; in
-            the first round `noise` is the usual one, or a tenth of its default. By default all errors are squared.
-        rounds: number of fits, each with outputs weighted by the errors of the round before.
-        max_steps: largest number of Levenberg–Marquardt steps in each round.
+        robust: errors beyond this many times their usual size count linearly, for example 3 for data with outliers. In
+            the first round, that size is `noise`, or a tenth of its default. By default all errors are squared.
+        rounds: number of fits, each with outputs weighted by the errors of the previous round.
+        max_steps: maximum number of Levenberg–Marquardt steps in each round.
         starts: number of searches in the first round, of which the best continues. The first begins at the model, and
             the others at numbers drawn from `prior`; numbers without a prior are not drawn.
         solver: a solver of diffrax, by default `RK4`.
@@ -142,7 +142,7 @@ def fit_records(
         deviation = {name: np.maximum(each.std(axis=0), TINY) for name, each in y.items()}
         known = {name: np.full_like(deviation[name], size) for name, size in (noise or {}).items()}
         scale = {name: jnp.asarray(each) for name, each in (deviation | known).items()}
-        # The least squares of the first round would follow outliers, and end in a minimum of their own.
+        # Plain least squares in the first round would follow outliers to another minimum.
         cautious = robust if known.keys() == scale.keys() else robust / 10
         problem = Problem(model, scale, cautious, dt, RK4() if solver is None else solver, substeps)
         steps = record_search.steps_of(segment, gridded, dt)
@@ -214,11 +214,11 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
         at = (jnp.concatenate(jnp.asarray(each)[:, :, 0]) for each in (found.states, segments.u))
         rates = np.nan_to_num(np.asarray(slopes(*at)))
         if np.abs(np.linalg.eigvals(rates)).max() * problem.dt / problem.substeps > FASTEST:
-            return np.inf  # the search stops where the solver becomes unstable, and half the step moves nothing there
+            return np.inf  # the search stops where the solver becomes unstable, and half the step changes nothing
     now, fine = found.y, fine.y
     size = {name: FINE * np.std(segments.y[name][segments.there[name]], axis=0) for name in now}
     size = {name: jnp.asarray(each + size_of(errors[name], problem.robust)) for name, each in size.items()}
-    # Samples that are off by as much leave the errors that half the step does, without another program.
+    # Shifted samples give the same errors as half the step, without compiling again.
     moved = segments._replace(y={name: each - (fine[name] - now[name]) for name, each in segments.y.items()})
     search = search._replace(problem=dataclasses.replace(problem, scale=size))
     both = (search._replace(segments=each).equations(end.theta, end.own) for each in (segments, moved))
@@ -232,16 +232,16 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
 def _covariance(search: record_search.Search, end: End, errors):
     """Return the covariance of θ (p, p) and the variances of the nodes (r, s); infinite where no output changes.
 
-    In a simulation model errors persist, so each piece's score is one observation (a sandwich; White 1980). From few
-    samples this is too small, and the larger of it and that of independent errors is taken (Angrist and Pischke, Mostly
-    Harmless Econometrics, 2009, 8.2). With process noise errors are independent.
+    In a simulation, model errors persist, so each piece's score is one observation (a sandwich; White 1980). For few
+    samples this is too small, so it is at least the covariance for independent errors (Angrist and Pischke, Mostly
+    Harmless Econometrics, 2009, 8.2). With process noise, errors are independent.
     """
     independent, own = elimination.covariance(end.equations, len(end.theta))
     if search.off is not None:
         return independent, own
     gram, score, _ = search.local(end.theta, end.own).equations
     meat = np.asarray(end.equations.gram + jnp.einsum("rsp,rsq->rpq", score, score) - jnp.sum(gram, axis=1))
-    found, starts = elimination.covariance(end.equations, len(end.theta), meat)  # what was expected counts as it is
+    found, starts = elimination.covariance(end.equations, len(end.theta), meat)  # priors count as usual
     problem = search.problem
     r = np.concatenate(
         [np.clip(e / problem.scale[k], -problem.robust, problem.robust).ravel() for k, e in errors.items()]

@@ -39,15 +39,15 @@ def simulate(
     Args:
         model: the model to simulate.
         record: the inputs, and the times of the outputs' samples; the values of outputs are not read.
-        start: the state at the first time (d,), by default the model's.
+        start: the state at the first time (d,), by default the model's start.
         dt: length of the intervals in which inputs are constant [s].
         begin: the first time [s], by default at the first sample of an output.
         between: how inputs act between samples.
-        solver: of diffrax, by default `RK4`.
-        substeps: steps of the solver in each interval.
+        solver: a solver of diffrax, by default `RK4`.
+        substeps: number of solver steps in each interval.
 
     Raises:
-        ValueError: a record without an input, or without any output.
+        ValueError: if the record lacks an input or all outputs.
     """
     model = _of_outputs(model, record)
     gridded = [on_grid(record, model.inputs, tuple(model.outputs), dt, between, begin)]
@@ -71,16 +71,16 @@ def predict(
     if the past is too short for this.
 
     Args:
-        model: with known numbers; its start is the expected state at the first time of the past.
+        model: a model with known numbers; its start is the expected state at the first time of the past.
         past: the last samples; it should be longer if more states are hidden.
         future: the inputs from the end of the past on, and the times of the outputs' samples to predict; the values of
             outputs are not read.
         dt: length of the intervals in which inputs are constant [s].
         between: how inputs act between samples.
-        options: others of `fit_records`, such as noise, robust, segment, solver and substeps.
+        options: other arguments of `fit_records`, such as noise, robust, segment, solver and substeps.
 
     Raises:
-        ValueError: a record without an input or any output, or with inputs that begin long after the past.
+        ValueError: if a record lacks an input or all outputs, or inputs begin long after the past.
     """
     joined = dict(future.signals)
     for name in (each for each in model.inputs if past.signals.get(each) and joined.get(each)):  # with samples

@@ -22,10 +22,10 @@ from hybrid_jax.estimation.shooting import Local, Model, Predicted, Problem, Seg
 from hybrid_jax.records import Gridded, Record, Signal, integral
 from hybrid_jax.state_space import StateSpace
 
-APPROACH = (1.0, 0.1, 0.01)  # what a segment's end may be off, over the size of a state, in turn
+APPROACH = (1.0, 0.1, 0.01)  # allowed gap between segments, over the size of a state, in turn
 MOST = 3000  # unknowns
-CLUSTERS = 20  # of a simulation's errors, each taken as one observation
-GAP = 5.0  # intervals between samples, which is a gap
+CLUSTERS = 20  # of a simulation's errors, each of which is one observation
+GAP = 5.0  # sample intervals without a sample that count as a gap
 TINY, SMALL = 1e-12, 1e-3
 SLOW = 300  # dt in one interval, or records in one input: more is a mistake in a unit of time
 
@@ -38,7 +38,7 @@ class Sums(NamedTuple):
     cost: Float[np.ndarray, " r"]
 
     def add(self, rows, jacobian, errors, deviations) -> None:
-        """Add errors with known standard deviations; an infinite one counts nothing."""
+        """Add errors with known standard deviations; errors with an infinite one do not count."""
         weight = 1 / np.maximum(deviations, TINY)
         jacobian, errors = jacobian * weight[..., None], errors * weight
         self.gram[:, rows[:, None], rows] += jacobian.swapaxes(1, 2) @ jacobian
@@ -53,14 +53,12 @@ class Search(NamedTuple):
     """
 
     problem: Problem  # the comparison and its weights
-    # Linearisation points of the states at the nodes, the expected start of each record first.
-    centres: Float[Array, "r s d"]
+    centres: Float[Array, "r s d"]  # where the nodes are linearised; the first is the expected start of the record
     deviations: Float[np.ndarray, " p"]  # prior standard deviations of θ from its start (p); infinite if free
     theta: Float[np.ndarray, " p"]  # its start (p)
-    segments: Segments  # the records cut; one node each, or one for a record in a simulation
+    segments: Segments  # of the records; one node each, or one for a record in a simulation
     spread: Float[Array | np.ndarray, "#r e"]  # prior standard deviations of each record's start from its centre
-    # Standard deviation of the gap between a segment's end and the next node (e); None in a simulation.
-    off: Float[np.ndarray, " e"] | None = None
+    off: Float[np.ndarray, " e"] | None = None  # standard deviation of gaps between segments; None in a simulation
 
     @property
     def still(self) -> Float[Array, "r q"]:
@@ -185,7 +183,7 @@ def directions(search: Search, end: End, records: Sequence[Record]) -> tuple[str
 
 
 def check_signals(model: Model, records: Sequence[Record], gridded: list[Gridded], dt: float) -> None:
-    """Warn of times and angles in other units."""
+    """Warn of times and angles that seem to have wrong units."""
     found = []
     for record, each in zip(records, gridded, strict=True):
         begin, end = each.start, each.start + len(each.u) * dt
@@ -207,7 +205,7 @@ def check_signals(model: Model, records: Sequence[Record], gridded: list[Gridded
 
 
 def _turns(signal: Signal) -> list[str]:
-    """Return what is wrong with a signal that jumps as an angle does where it is wrapped."""
+    """Return a warning if a signal jumps like a wrapped angle."""
     pairs = np.stack([signal.values[:-1], signal.values[1:]], axis=1)[np.diff(signal.t) < GAP * signal.interval]
     remedies = {2 * np.pi: "jumps by 2π: if it is an angle, unwrap it", 360.0: "jumps by 360: an angle must be in rad"}
     narrow = {turn: np.ptp(signal.values, axis=0) < 1.1 * turn for turn in remedies}
@@ -215,7 +213,7 @@ def _turns(signal: Signal) -> list[str]:
 
 
 def check_rates(model: Model, records: Sequence[Record]) -> None:
-    """Raise ValueError if an output that is the rate of another one in the model has another unit in a record."""
+    """Raise ValueError if an output and its rate, which is another output, have different units in a record."""
     random, m = np.random.default_rng(0), sum(records[0].signals[name].values.shape[1] for name in model.inputs)
     x, u = (jnp.asarray(random.normal(size=(2, k))) for k in (model.size, m))
 
@@ -248,7 +246,7 @@ def steps_of(segment: float | None, gridded: list[Gridded], dt: float) -> int:
 
 
 def approached(search: Search, segment: float | None) -> tuple[Search, Float[Array, " p"], Float[Array, "r q"]]:
-    """Return the start of the search: after multiple shooting, with smaller and smaller gaps."""
+    """Return the start of the search; with segments, multiple shooting with smaller and smaller gaps improves it."""
     space, theta, own = search.problem.model.space, jnp.asarray(search.theta), search.still
     if segment is None:
         return search, theta, own
@@ -280,7 +278,7 @@ def sizes_of(search: Search, theta, own) -> Float[np.ndarray, " e"]:
 
 
 def sizes_between(space: StateSpace, states: Float[Array | np.ndarray, "t d"], x) -> Float[np.ndarray, " e"]:
-    """Return how far states are from x at most."""
+    """Return the largest distance between states and x, number by number."""
     return np.abs(np.asarray(_changes(space, jnp.asarray(states)[None], x))).max(axis=(0, 1))
 
 

@@ -2,7 +2,7 @@
 
 In a *simulation* only the initial state of a record is unknown. In *multiple shooting* (Bock 1983) each segment has an
 unknown initial state, and the gaps between segments count as process noise, as in full-information estimation (Rao,
-Rawlings and Mayne 2003): this converges from worse starts.
+Rawlings and Mayne 2003); this converges from poorer starts.
 """
 
 from functools import partial
@@ -27,14 +27,12 @@ Model = Any  # a `StateSpaceModel`, or what has its methods
 class Segments(NamedTuple):
     """r records of s segments of t intervals, padded where a record is shorter."""
 
-    # Mean inputs over each interval, preceded by the earlier intervals that the model needs.
-    u: Float[Array | np.ndarray, "*r s a+t m"]
+    u: Float[Array | np.ndarray, "*r s a+t m"]  # mean inputs, after those of earlier intervals that the model needs
     valid: Bool[Array | np.ndarray, "*r s t"]  # which intervals are within the record
     y: dict[str, Float[Array | np.ndarray, "*r s n k"]]  # the samples of each output, 0 if missing
     there: dict[str, Bool[Array | np.ndarray, "*r s n"]]  # which samples exist
     index: dict[str, Int[Array | np.ndarray, "*r s n"]]  # the interval of the segment that contains each sample
-    # Position in it, from 0 to 1; None if all samples are at the ends of intervals.
-    share: dict[str, Float[Array | np.ndarray, "*r s n"]] | None
+    share: dict[str, Float[Array | np.ndarray, "*r s n"]] | None  # position in it, 0 to 1; None if always at the end
     whitening: Float[Array | np.ndarray, "*r s e e"] | None = None  # of all errors of a segment, by default none
 
 
@@ -46,14 +44,10 @@ def cut(records: list[Gridded], steps: int) -> Segments:
     def filled(path, *leaves):
         name = path[-1].key if len(path) > 1 else None
         n = 0 if name is None else widest[name]
-        return np.stack([_fill(leaf, n, 1) if n else leaf for leaf in leaves])
+        pads = [((0, 0), (0, n - leaf.shape[1]), *[(0, 0)] * (leaf.ndim - 2)) for leaf in leaves] if n else ()
+        return np.stack([np.pad(*each) for each in zip(leaves, pads, strict=True)] if n else leaves)
 
     return jax.tree_util.tree_map_with_path(filled, *parts)
-
-
-def _fill(array: np.ndarray, n: int, axis: int) -> np.ndarray:
-    missing = [(0, n - size if i == axis else 0) for i, size in enumerate(array.shape)]
-    return np.pad(array, missing)
 
 
 def _cut(record: Gridded, steps: int, most: int) -> Segments:
@@ -80,8 +74,7 @@ class Problem(eqx.Module):
 
     model: Model  # its learned numbers are the start of the search
     scale: dict[str, Float[Array, " k"]]  # the size of an error that counts as 1, of each output (k)
-    # An error of more than so many times its scale counts linearly, not as a square (Huber 1964).
-    robust: float = eqx.field(static=True)
+    robust: float = eqx.field(static=True)  # errors above this many times the scale count linearly (Huber 1964)
     dt: float = eqx.field(static=True)  # length of an interval [s]
     solver: Solver = eqx.field(static=True)  # integrates the field over an interval
     substeps: int = eqx.field(static=True)  # steps of the solver in each interval

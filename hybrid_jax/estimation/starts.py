@@ -1,6 +1,6 @@
 """Remove the noise of measured initial states from windows' errors (errors in variables; Fuller 1987).
 
-Each window starts at a smoothed state, and the effect of another start is projected out of its errors.
+Each window starts at a smoothed state, and the effect of this state's error is projected out of the window's errors.
 """
 
 import math
@@ -29,11 +29,10 @@ class Starts(NamedTuple):
 
     x0: Float[Array, "*n d"]  # the smoothed start
     jump: Float[Array, "*n d"]  # measured minus smoothed start, over scale
-    # Derivative of each state of the window with respect to the start, both over scale.
-    effect: Float[Array, "*n t d d"]
+    effect: Float[Array, "*n t d d"]  # derivative of the window's states with respect to the start, both over scale
     inverse: Float[Array, "*n d d"]  # inverse of the start's normal equations
-    # Weight of a measured start's square relative to a prediction's; the measured start is used if the field's errors
-    # are larger than the measurements', for example after a large change.
+    # Squared weight of the measured start relative to a prediction; it is large if the field's errors are larger than
+    # the noise, for example after a large change.
     trust: Float[Array, "*n"]
 
 
@@ -70,7 +69,7 @@ def smoothed(
     effect, r, left, noise, successive = in_chunks(jax.vmap(one), windows, TOGETHER)
     successive, noise = jnp.sum(successive), jnp.sum(noise) / math.comb(2 * order, order)
     left = jnp.sum(left) / jnp.sum(~jnp.isnan(windows.x))
-    noise = jnp.where(successive > 0, noise / jnp.maximum(successive, 1), left)  # not known apart
+    noise = jnp.where(successive > 0, noise / jnp.maximum(successive, 1), left)  # too few samples for differences
     trust = jnp.clip(left / jnp.maximum(noise, 1e-12), 1.0, 1e6)
 
     def start(each):
@@ -99,7 +98,7 @@ def from_starts(windows: Trajectories, starts: Starts | None) -> tuple[Trajector
 
 
 def projected(starts: Starts, errors: Float[Array, "n t d"]) -> Float[Array, "n 1+t d"]:
-    """Project the effect of another start out of the errors, and of the measured starts' errors."""
+    """Project the effect of another start out of the errors of the starts and of the predictions."""
 
     def one(start: Starts, r):
         change = start.inverse @ (start.trust * start.jump + jnp.einsum("tij,ti->j", start.effect, r))

@@ -28,8 +28,8 @@ from hybrid_jax.estimation.normal_equations import (
 from hybrid_jax.runtime import UNOPTIMISED, entry, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
-# Times the rounding of one number. The errors of many windows cancel, so that an interval needs less of a margin than a
-# step does: the yaw of a small quadrotor tells its rotors apart by 100 times the rounding.
+# Times machine epsilon. Rounding errors of many windows cancel, so this is less than for a step: the yaw of a small
+# quadrotor, for example, distinguishes its rotors by 100 times the rounding.
 TOLD = 8
 
 
@@ -37,9 +37,9 @@ class Interval(NamedTuple):
     """An estimate and its confidence interval, in one unit.
 
     Attributes:
-        value: the estimate, a number, or one for each of several runs.
-        low: the lower end of the interval, of the same shape.
-        high: the upper end.
+        value: the estimate, one number or one for each of several runs.
+        low: the lower end of the interval, with the same shape.
+        high: the upper end, with the same shape.
     """
 
     value: Float[Array | np.ndarray, "*runs"]
@@ -106,7 +106,7 @@ def _covariance(equations: NormalEquations, p: Int[Array, ""] | int, cluster: in
         gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
         without = inverses(jnp.sum(gram, axis=0) - gram, TOLD)
         told = told & without.told.all(axis=0)
-        # What leaving a cluster out does to θ_p.
+        # Changes of θ_p without each cluster.
         moves = jnp.einsum("gpq,gq->gp", without.matrix, score - jnp.mean(score, axis=0))
         moves = moves - jnp.mean(moves, axis=0)
         found = (clusters - 1) / clusters * moves.T @ moves
@@ -122,7 +122,7 @@ def sandwich(equations: NormalEquations, fitted: int, cluster: int = 1) -> Float
 
 
 def sandwich_of_repeated(equations: NormalEquations, fitted: int, distinct: Int[Array, ""]) -> Float[Array, "p p"]:
-    """Compute `sandwich` from windows of which only the first `distinct` are independent: the others repeat them."""
+    """Compute `sandwich` if only the first `distinct` windows are independent and the others repeat them."""
     of = jnp.arange(len(equations.score)) % distinct
     score = jax.ops.segment_sum(equations.score, of, len(equations.score))
     return _covariance(equations._replace(score=score), fitted, 1, distinct)
@@ -137,7 +137,7 @@ def intervals(
 ) -> dict[str, Interval]:
     """Return the physical parameters of a field with confidence intervals; names are as in `named_parameters`.
 
-    The error is normal in the physics' own parametrisation: the interval is value · exp(±z s) of a parameter that is
+    The error is normal in the physics' own parametrisation: the interval is value · exp(±z s) for a parameter that is
     stored as a logarithm and returned by `theta()`, otherwise value ± z s.
 
     Args:
@@ -196,8 +196,8 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
 
     If the class has a method `theta() -> dict[str, Array]`, such as `RigidBody`, it gives names and values in physical
     units; each entry must be a monotonic function of one parameter. Otherwise the names are the class's fields.
-    Entries of arrays are k_rotors[0], aerodynamic_moment[0,2], …; a constant disturbance uses the state
-    space's names of states, or indices: disturbance[vx], disturbance[0].
+    Entries of arrays are, for example, k_rotors[0] and aerodynamic_moment[0,2]. A constant disturbance uses the names
+    of states, or indices: disturbance[vx], disturbance[0].
     """
     physics, disturbance = physics_of(field), disturbance_of(field)
     if isinstance(physics, Hybrid) and disturbance is not None:
@@ -246,7 +246,7 @@ def select_disturbance(
         field: the initial field, with or without a disturbance.
         windows: windows of the system, independent of each other.
         solver: the integrator over each interval, by default one step of RK4.
-        max_steps: the largest number of steps of each fit.
+        max_steps: the maximum number of steps of each fit.
         scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
         indices: the disturbed states, see `with_disturbance`.
     """

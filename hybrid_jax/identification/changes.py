@@ -9,17 +9,16 @@ from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.identification.fitting import Identified
 
-# Share of a value by which flights of one vehicle differ, and share that a parameter explains at least.
-ALIKE, LEAST = 0.03, 0.2
-REACH, SURE = 1.96, 1.5  # standard errors of an interval; half-widths that a change is at least
+ALIKE, LEAST = 0.03, 0.2  # share of a value by which flights of one vehicle differ; smallest share explained
+REACH, SURE = 1.96, 1.5  # standard errors of an interval; smallest change in half-widths of the interval
 
 
 def changes(
     field: AbstractVectorField, covariance: Float[np.ndarray, "p p"], found: Identified
 ) -> dict[str, tuple[float, float, float, float]]:
-    """Return, for each parameter, the share of the change it explains by itself, its value and its interval.
+    """Return, for each changed parameter, the share of all changes that it explains, its value and its interval.
 
-    Often only combinations of parameters are identifiable. The change of one is fitted to the differences of all
+    Often only combinations of parameters are identifiable. Each parameter's change is fitted to the differences of all
     estimates by generalised least squares with their covariances; the best explanation is first.
     """
     with jax.enable_x64(True):  # in which models are identified

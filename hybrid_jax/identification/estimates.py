@@ -23,14 +23,14 @@ from hybrid_jax.flights.conversion import motors_of
 from hybrid_jax.flights.log import runs_of
 from hybrid_jax.flights.recording import Recording, Signal
 
-FASTEST, LONGEST = 0.002, 60.0  # s: least interval, and how much of each log is used
-GRAVITY, HOVER = 9.81, 0.5  # m/s²; the specific force of hover is that close to gravity
-FLYING = 0.3  # share of the motors' 0.9-quantile below which a vehicle stands
-SLOW = 1.0  # s of a trend that is taken out; longer than the lag, which would not show otherwise
-EXPLAINED = 0.3  # correlation of roll and pitch with the regression from which on it counts
+FASTEST, LONGEST = 0.002, 60.0  # s: shortest interval, and how much of each log is used
+GRAVITY, HOVER = 9.81, 0.5  # m/s²; in hover, the specific force differs by less from gravity
+FLYING = 0.3  # share of the motors' 0.9-quantile below which a vehicle is on the ground
+SLOW = 1.0  # s; slower trends are removed. It is longer than the lag, which would not be visible otherwise
+EXPLAINED = 0.3  # correlation of roll and pitch with the regression above which it counts
 FOLLOWS = 0.5  # correlation of thrust with the motors above which it determines their lag
-LEAST_SPREAD = 0.3  # m/s², of the specific force, for a curve of thrust
-ARM, MASS = 0.1, 1.0  # m and kg, where they were not given
+LEAST_SPREAD = 0.3  # m/s², of the specific force, to fit a thrust curve
+ARM, MASS = 0.1, 1.0  # m and kg, if not given
 TOP = 1000.0  # rad/s at full command if speeds are unknown: only thrust matters
 
 
@@ -177,7 +177,7 @@ def _curve(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, " 3"
     powers *= [pieces[0].commands, pieces[0].commands, True]
     curve = np.linalg.lstsq(powers, force[known], rcond=None)[0]
     if curve[1] + 2 * curve[2] * np.quantile(lagged[known], 0.01) <= 0:
-        return None  # it would fall: the commands cover too little
+        return None  # it would fall: the commands cover too small a range
     return curve, float(np.corrcoef(powers @ curve, force[known])[0, 1])
 
 
@@ -205,8 +205,8 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
     learn = [name for name in LEARN if found.moves or name not in OF_VELOCITY]
     inertia, torque, spin, why = _turning(found, thrust, places)
     return f"""\
-# Written from logs by hybrid-jax inspect. Numbers with a # are explained; those marked
-# PLACEHOLDER are not identifiable from logs: measure them.
+# Written from logs by hybrid-jax inspect. You should measure the numbers that are marked
+# PLACEHOLDER: logs do not identify them.
 learn = {json.dumps(learn)}
 
 [vehicle]

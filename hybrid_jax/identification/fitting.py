@@ -33,11 +33,11 @@ from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 from hybrid_jax.vehicle import STATE_SIZE
 
-ROUNDS, MAX_STEPS = 3, 20  # of weights, and of Levenberg–Marquardt in each
-CANDIDATES = 8  # windows for each one that is fitted
-CLUSTER, FEWEST_CLUSTERS = 2.0, 6  # s of windows that are taken as one observation, at least so many of them
+ROUNDS, MAX_STEPS = 3, 20  # rounds with new weights, and Levenberg–Marquardt steps in each
+CANDIDATES = 8  # windows from which each fitted one is selected
+CLUSTER, FEWEST_CLUSTERS = 2.0, 6  # s of windows that form one observation, and fewest observations
 OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "mass", "k", "k_rotors", "drag"}
-FORCE_STEPS = 5  # times as many steps have windows of forces, which no instability limits
+FORCE_STEPS = 5  # factor by which windows for forces are longer: no instability limits them
 AXES_OF = {"Ix": 0, "Iy": 1, "Iz": 2, "torque_coefficient": 2}
 TOLERANCE = 1e-5  # share of the cost: a step that lowers it by less is slow
 NO_EFFECT = 1.0  # information below which a parameter is not identifiable: its standard error is its size
@@ -86,14 +86,14 @@ def identify(
 
     Args:
         field: an `Actuated` field if the input is commands; any other field takes the measured rotor speeds.
-        recordings: one or more, of one vehicle.
+        recordings: one or more recordings of one vehicle.
         layout: how they are cut into windows, by default `Layout()`.
         measured: the quantities to compare; by default all that every recording has.
         free: names of the parameters to fit, for example "k" or "efficiency[2]"; by default all.
         known: covariance of the parameters that are not fitted, which widens the intervals of the others; by default 0.
 
     Returns:
-        A parameter that is not identifiable has an infinite interval and does not change, nor do those in
+        A parameter that is not identifiable does not change and has an infinite interval, for example those in
         `terms.OF_VELOCITY` unless each recording has a velocity or position.
 
     Raises:
@@ -107,7 +107,7 @@ def identify(
             raise ValueError(f"{recordings[0].name}: {n} windows for {moves.sum()} parameters are too few; record more")
         theta, own, p = jnp.asarray(search.theta), search.still, len(search.theta)
         if len(own) > layout.most:
-            kept = _telling(search.equations(theta, own), p, layout.most, moves & measurable)
+            kept = _informative(search.equations(theta, own), p, layout.most, moves & measurable)
             search, windows, own = search.part(kept), jax.tree.map(lambda part: part[kept], windows), own[kept]
         options = {"free": moves & measurable, "least": NO_EFFECT, "max_steps": MAX_STEPS, "tolerance": TOLERANCE}
         for _ in range(ROUNDS):
@@ -162,12 +162,12 @@ def identify_in_turn(
     """Fit first the thrust to the accelerometer, then the torques to the gyro, given the thrust.
 
     An error in the torques, for example the delay of a filtered gyro, then cannot bias the thrust curve and the lag.
-    The second intervals include the uncertainty of the first fit. If one of the two has no parameter or no sensor, this
+    The second intervals include the uncertainty of the first fit. If one of the fits lacks parameters or a sensor, this
     is `identify`. Windows for the forces are `FORCE_STEPS` times as long.
 
     Args:
         field: an `Actuated` field if the input is commands; any other field takes the measured rotor speeds.
-        recordings: one or more, of one vehicle.
+        recordings: one or more recordings of one vehicle.
         layout: how they are cut into windows for the torques, by default `Layout()`.
     """
     layout = Layout() if layout is None else layout
@@ -192,7 +192,7 @@ def window_errors(
 
     Args:
         field: an `Actuated` field if the input is commands; any other field takes the measured rotor speeds.
-        recordings: one or more, of one vehicle.
+        recordings: one or more recordings of one vehicle.
         layout: how they are cut into windows, by default `Layout()`.
     """
     layout = Layout() if layout is None else layout
@@ -203,7 +203,7 @@ def window_errors(
     return {name: np.where(there[name][:, 0, :, None], -part[:, 0], np.nan) for name, part in found.items()}
 
 
-def _telling(equations: NormalEquations, p: int, most: int, moves) -> Int[np.ndarray, " most"]:
+def _informative(equations: NormalEquations, p: int, most: int, moves) -> Int[np.ndarray, " most"]:
     """Select the windows to fit: half have the greatest leverage tr G⁻¹ Gᵢ, the others are spread evenly.
 
     Gᵢ is the information of window i at the start of the search, and G their sum.
@@ -254,7 +254,7 @@ def _widened(name: str, interval: Interval, shares) -> Interval:
 
 
 def measure_velocity(recordings: Sequence[Recording]) -> bool:
-    """Whether each recording has a velocity, or a position."""
+    """Return whether each recording has a velocity or a position."""
     return all({"velocity", "body_velocity", "position"} & each.signals.keys() for each in recordings)
 
 
@@ -266,7 +266,7 @@ def _names(field) -> list[tuple[str, str]]:
 
 
 def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which numbers of θ are fitted: no effect of velocity if no recording measures one."""
+    """Return which numbers of θ are to be fitted, and which can be: effects of velocity only if it is measured."""
     own = _names(field)
     for name in free or ():
         if name.partition("[")[0] not in dict(own):
@@ -277,7 +277,7 @@ def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) 
 
 
 def _covariance(equations: NormalEquations, cluster: int, moves, known, measurable) -> Array:
-    """The clustered sandwich, plus S C Sᵀ of known parameters with S = −H⁻¹ ∂g/∂known; ∞ if not identifiable."""
+    """Return the clustered sandwich plus S C Sᵀ for known parameters, S = −H⁻¹ ∂g/∂known; ∞ if not identifiable."""
     gram = np.asarray(equations.gram.sum(axis=0))
     seen = (np.diagonal(gram) > NO_EFFECT) & moves & measurable
     found, both = np.zeros_like(gram), np.ix_(seen, seen)

@@ -29,13 +29,13 @@ from hybrid_jax.trajectories import Trajectories, concatenate, split, windows_of
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}  # of prediction errors
 STEPS = 10  # intervals of a window
 TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
-ENOUGH = 10  # windows for each parameter that is learned by default, or its error exceeds its effect
+ENOUGH = 10  # windows for each parameter that is learned by default; with fewer, its error exceeds its effect
 NAMES = "position", "velocity", "attitude", "body rates"  # of a rigid body's quantities, in the order of `UNITS`
-FOLDS = 3  # at most so many groups of flights are left out in turn
+FOLDS = 3  # groups of flights that are left out in turn, at most
 STRETCHES = 5  # of flights after a change, which are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
 PHYSICS, OUTPUTS = "theta_least_squares", "accelerations"
-PAST = " with its past"  # of a candidate that also predicts its disturbance from the errors before
+PAST = " with its past"  # names a candidate that also predicts its disturbance from earlier errors
 FROZEN, CANDIDATES = "thrust, rates frozen", ("physics", "hybrid", f"physics{PAST}", f"hybrid{PAST}")  # simplest first
 
 
@@ -49,7 +49,7 @@ class Learned(NamedTuple):
         lag: the time constant of the rotors behind the logged motors [s].
         left_out: RMSE of frozen rates and of each candidate on held-out flights after each interval of `dt`, in the
             units of `prediction_errors.UNITS`.
-        windows: some training windows, by which `adapted` judges the model's errors without any change.
+        windows: some training windows, from which `adapted` estimates the model's errors without a change.
         expected: the error on a new flight after `STEPS` intervals: value, low and high end of the 80 % interval.
     """
 
@@ -63,10 +63,10 @@ class Learned(NamedTuple):
 
 
 def learnable(model: VehicleModel, seconds: float, window: float, moves: bool = True) -> tuple[VehicleModel, str]:
-    """Leave out of the parameters that are learned by default those that the logs do not determine; say which.
+    """Return the model without the default parameters that the logs do not determine, and a line that names them.
 
-    `seconds` are those of flight in all logs, `window` is the length of one [s], and `moves` whether logs have a
-    velocity. A model is returned as it is if its file, or the user, named parameters.
+    `seconds` is the time in flight in all logs, `window` the length of a window [s], and `moves` is whether logs have a
+    velocity. The model does not change if its file or the user names the parameters to learn.
     """
     if model.learn != LEARN:
         return model, ""
@@ -81,11 +81,11 @@ def learnable(model: VehicleModel, seconds: float, window: float, moves: bool = 
 
 
 def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Learned:
-    """Learn a vehicle from all flights. Held-out flights decide whether a network is added to the physics.
+    """Learn a vehicle from all flights, with a network added to the physics if it is better on held-out flights.
 
     Args:
         model: the vehicle and the names of its parameters to learn.
-        logs: two flights or more, sampled at one interval, checked and in the air.
+        logs: two or more flights with one sample interval, checked, without time on the ground.
         seed: the random seed of the network.
     """
     lag = _lag(model, logs) if LAG in model.learn else model.terms.motor_time_constant
@@ -117,15 +117,15 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
 def adapted(
     field: AbstractVectorField, logs: Sequence[FlightLog], learned_from: Trajectories | None, most: int = ADAPTED
 ) -> tuple[AbstractVectorField, Adaptation]:
-    """Adapt the physics of a model to at most `most` windows of flights after a change, and what it has of the past.
+    """Adapt a model's physics, and its past if it has one, to at most `most` windows of flights after a change.
 
-    Also return the adaptation of the model without its past, but with the errors to expect of the model with it.
+    Also return the adaptation of the model without its past, but with the expected errors of the model with it.
 
     Args:
         field: the source model.
         logs: flights after the change.
         learned_from: windows that the source was trained on, see `hybrid_jax.adapt`.
-        most: the largest number of windows to adapt to.
+        most: the maximum number of windows to adapt to.
     """
     windows = cut_each(logs, STEPS, STEPS, most)
     found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)
@@ -139,16 +139,16 @@ def adapted(
 def expected_with_past(
     model: DisturbanceModel, logs: Sequence[FlightLog], horizons: Sequence[str], most: int | None = None
 ) -> Expected:
-    """Return the errors to expect of a past that is learned from logs, by stretches of them that are left out in turn.
+    """Return the expected errors of a model whose past is learned from logs, by leaving out stretches in turn.
 
-    A stretch is a flight, or a part of one that is longer than what a past remembers. Each is predicted by what the
-    others teach, but with what was measured before it.
+    A stretch is a flight, or a part of one that is longer than the past's memory. It is predicted by a past that is
+    learned from the other stretches and has observed the samples before it.
 
     Args:
-        model: the model with its past before these logs.
+        model: the model with the past that it had before these logs.
         logs: flights after a change.
         horizons: as in `Adaptation.expected`, for example "0.1 s".
-        most: the largest number of intervals to learn from.
+        most: the maximum number of intervals to learn from.
     """
     flights = sequences(logs, 2 * STEPS)
     found: dict[str, list[list[Float[np.ndarray, " 4"]]]] = {horizon: [[] for _ in flights] for horizon in horizons}
@@ -226,10 +226,10 @@ def _hybrid(physics: Any, logs: Sequence[FlightLog], seed: int, settings: Settin
 def choose(scores: Mapping[str, Float[np.ndarray, " flights"]]) -> str:
     """Choose a candidate by its log-errors on held-out flights; the first is the baseline, and the simplest are first.
 
-    A model should be reliable on flights that nobody has recorded, so one that is worse than the baseline on any flight
-    is rejected. Of the others, the simplest within one standard error of the smallest mean is chosen, by paired
-    differences (Breiman et al., "Classification and regression trees", 1984). Each flight counts once, because its
-    windows share wind, battery and manoeuvre.
+    A model should be reliable on new flights, so a candidate that is worse than the baseline on any flight is rejected.
+    Of the others, the simplest within one standard error of the smallest mean is chosen, by paired differences
+    (Breiman et al., "Classification and regression trees", 1984). Each flight counts once, because its windows share
+    wind, battery and manoeuvre.
     """
     baseline = next(iter(scores.values()))
     considered = {name: each for name, each in scores.items() if np.isfinite(each).all() and (each <= baseline).all()}
@@ -240,10 +240,9 @@ def choose(scores: Mapping[str, Float[np.ndarray, " flights"]]) -> str:
 
 
 def expected_from_parts(parts: Sequence[Sequence[Float[np.ndarray, " 4"]]]) -> Float[np.ndarray, "3 4"]:
-    """Return what `expected` does, from the RMSE of parts of each flight.
+    """Return `expected` from the RMSE of parts of each flight, which counts once because its parts are alike.
 
-    Each flight counts once, as its parts are alike. Of a single flight, another one is assumed to differ from all of
-    its parts as much as one part from another.
+    With a single flight, another flight is assumed to differ from it as much as its parts differ from each other.
     """
     if len(parts) == 1:
         return expected(np.log(parts[0]), flights=1)
@@ -263,7 +262,7 @@ def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[n
 
 
 def windows_for(field: AbstractVectorField, log: FlightLog, steps: int, stride: int) -> Trajectories:
-    """Cut a flight into windows, as `cut_windows` does, with the filters' states of a field that has a past."""
+    """Cut a flight into windows like `cut_windows`, with the filters' states if the field has a past."""
     if not isinstance(field, DisturbanceModel):
         return cut_windows([log], steps, stride)
     parts = [(each, observe(field, each)[0]) for each in sequences([log], steps)]

@@ -18,11 +18,11 @@ from hybrid_jax.flights.recording import AXES, Recording, Signal
 from hybrid_jax.identification.slow_commands import SLOW
 
 MOTORS = "rotor_speed"
-DRAGGED = 0.6  # correlation of forces with the velocity from which on they are drag
-GUESSED = 10.0  # factor by which a thrust that is learned may be off; units are farther off
+DRAGGED = 0.6  # correlation of forces with the velocity above which they are drag
+GUESSED = 10.0  # factor by which a thrust that is learned may be wrong; wrong units differ by more
 OF_THRUST = {"curve", "mass", "k", "k_rotors"}
-# Checks of a flight: what they need, and the longest interval [s] of that at which they tell something. Identification
-# leaves out gaps and the ground by itself, and learns or ignores the lag.
+# The signals that checks need, the longest sample interval [s] at which they are useful, and their names.
+# Identification skips gaps and time on the ground, and learns or ignores the lag.
 COMPARED = (
     (("position", "velocity"), 0.05, ("dp/dt against v",)),
     (("attitude", "rates"), 0.05, (RATES,)),
@@ -51,7 +51,7 @@ def compared(recording: Recording, field: Any, learn: Sequence[str]) -> list[Che
 def _flight(recording: Recording, signals: dict[str, Signal], dt: float) -> FlightLog:
     """Return the airborne flight, or all of it if it is never airborne.
 
-    States that are missing, or slower than dt, are at rest at the origin.
+    States that are missing, or sampled more slowly than dt, are replaced by rest at the origin.
     """
     motors, kept = signals[MOTORS], {MOTORS: signals[MOTORS]}
     for name in STATES:

@@ -76,7 +76,7 @@ class Multirotor(eqx.Module):
 def measure(
     quantity: str, field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], gravity: float = 9.81
 ) -> Float[Array, " k"]:
-    """h(x, u) of one of `MEASURED`, with `flights.recording.AXES`; the specific force is Rᵀ (v̇ + g e_z) [m/s²]."""
+    """Return one of `MEASURED`, with the axes of `recording.AXES`; the specific force is Rᵀ (v̇ + g e_z) [m/s²]."""
     if quantity in STATES:
         return x[STATES[quantity]]
     if quantity == "rotor_speed":

@@ -20,8 +20,8 @@ from hybrid_jax.identification.multirotor import MEASURED
 from hybrid_jax.records import integral
 from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
-UNKNOWN = {"velocity": 2.0, "tilt": 0.3, "rates": 1.0}  # spread of what nothing measures: m/s, rad, rad/s
-WARM = 0.4  # s of commands before a window, from which the speeds of rotors at its start follow
+UNKNOWN = {"velocity": 2.0, "tilt": 0.3, "rates": 1.0}  # spread of unmeasured states: m/s, rad, rad/s
+WARM = 0.4  # s of commands before a window, which determine the rotor speeds at its start
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Layout:
     Attributes:
         dt: the solver's step, and the interval at which measurements are compared [s].
         steps: number of intervals of a window.
-        most: largest number of windows, spread evenly; `identify` chooses half by their information.
+        most: maximum number of windows, spread evenly; `identify` chooses half by their information.
         span: duration of the samples before a window from which its initial state is estimated [s].
         disturbance: initial standard deviation of a window's constant disturbances (6), 0 for none: along x, y and z
             [m/s²], and about x, y and z [rad/s²].
@@ -64,8 +64,7 @@ class Windows(NamedTuple):
     segments: Segments  # their inputs and measurements, one segment each
     centres: Float[np.ndarray, "n d"]  # estimate of each initial state, without rotor speeds (n, 19)
     spread: Float[np.ndarray, "n e"]  # standard deviations of its error (n, 18); 0 if exact
-    # Intervals between samples of slow commands, from the first of a window's inputs on [s] (n, i, 2).
-    between: Float[np.ndarray, "n i 2"]
+    between: Float[np.ndarray, "n i 2"]  # intervals between samples of slow commands, after the first input [s]
 
 
 def cut(
@@ -195,9 +194,9 @@ def initial_states(
 
 
 def fitted(signal: Signal, starts: Float[np.ndarray, " n"], layout: Layout, numbers: Callable | None = None):
-    """Fit a quadratic to the last samples: value (n, k), its standard deviation (k), slope and its deviation.
+    """Fit a quadratic to the last samples; return its value (n, k), the standard deviation (k), slope and deviation.
 
-    They are the samples of `layout.span`, at least six, or all if there are fewer; `numbers` converts them.
+    It uses the samples of `layout.span`, but at least six if there are so many; `numbers` converts them.
     """
     found = []
     for t in starts:

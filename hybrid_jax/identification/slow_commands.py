@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float, Int
 
 from hybrid_jax.flights.recording import Signal
 
-SLOW = 0.03  # s between samples, from which on commands are unknown in between
+SLOW = 0.03  # s between samples above which commands are unknown in between
 MODES = 2  # terms of the series, with three quarters of the variance
-ITERATIONS = 10  # of the noise beside the bridges
-REACH = 0.1  # s before a window by which commands still matter to it
+ITERATIONS = 10  # of the noise
+REACH = 0.1  # s before a window in which commands still affect it
 
 
 def is_slow(signal: Signal) -> bool:
