@@ -3,7 +3,7 @@
 While noise and model are correct, the corrections of a parameter are uncorrelated; after a change they are biased. The
 test statistic is their exponentially weighted sum over its standard deviation (local approach: Benveniste, Basseville,
 Moustakides, "The asymptotic local approach to change detection and model validation", 1987). It also detects changes
-without a constant force, for example in an inertia.
+that cause no constant force, for example in an inertia.
 """
 
 import equinox as eqx
@@ -15,8 +15,8 @@ from hybrid_jax.online.kalman import Correction
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import SPANS, Tuning
 
-# Squared statistics, χ² of one degree, above which a parameter and a disturbance take part in a change: with less, a
-# gust would open a torque, on which it pulls through the tilt.
+# Squared statistics (χ², one degree of freedom) above which a parameter and a disturbance take part in a change. With
+# less, a gust would also reset a torque, which it affects through the tilt.
 EAGER, PART = 6.0, 16.0
 NOTHING = 1e-10  # variance of a sum of corrections that are only rounding
 
@@ -26,11 +26,10 @@ class ChangeTest(eqx.Module):
 
     pull: Float[Array, "*n 2 p"]  # weighted sums of the corrections of θ
     spread: Float[Array, "*n 2 p"]  # variances of these sums without a change
-    quiet: Float[Array, "*n"]  # time since the last alarm at a pace of 1 [s]
+    quiet: Float[Array, "*n"]  # time since the last alarm, for a pace of 1 [s]
 
     @classmethod
     def begin(cls, p: int, dtype) -> "ChangeTest":
-        """Initialise before the first sample."""
         return cls(jnp.zeros((2, p), dtype), jnp.zeros((2, p), dtype), jnp.full((), 1e3, dtype))
 
     @property
@@ -47,7 +46,7 @@ class ChangeTest(eqx.Module):
         pause: float,
         least: Float[np.ndarray, " p"] | float = 0.0,
     ) -> tuple["ChangeTest", Float[Array, " p"]]:
-        """Add the innovations of a sample; also return 1 for each parameter above `least` after an alarm, else 0."""
+        """Add the innovations of a sample; also return 1 for each parameter above `least` at an alarm, else 0."""
         white, gains = correction.white, correction.gains[:, -self.pull.shape[-1] :]
         kept = jnp.where(sample.measured, jnp.exp(-periods / jnp.asarray(SPANS, white.dtype)[:, None]), 1.0)
         pull = kept * self.pull + jnp.where(sample.measured, white @ gains, 0.0)

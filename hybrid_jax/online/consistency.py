@@ -20,9 +20,9 @@ from hybrid_jax.online.sensor_signs import SensorSigns
 from hybrid_jax.online.state import OnlineState
 from hybrid_jax.online.tuning import ALARMS, BOUND, BURST, REJECT, TRIAL, WINDOW
 
-NEAR = 0.95  # share of its bound from which a parameter counts as at it
-PERSISTENT = 5.0  # alarms as which a parameter at its bound, or an unlikely error, counts in a second
-UNLIKELY = 0.5  # share of REJECT from which errors count as alarms, and as a burst after half a second
+NEAR = 0.95  # share of its bound above which a parameter is at its bound
+PERSISTENT = 5.0  # alarms per second while a parameter is at its bound or errors are unlikely
+UNLIKELY = 0.5  # share of REJECT above which errors count as alarms, and as a burst after half a second
 SETTLED = 0.5  # count of alarms below which an estimate is kept
 
 
@@ -40,20 +40,20 @@ def believed(
     alarm, unlikely = jnp.where(verdict.changed, 1.0, 0.0), nis > UNLIKELY * REJECT
     added = alarm + jnp.where(at_bound | unlikely, PERSISTENT * periods, 0.0)
     counted = state.doubt * jnp.exp(-periods * sample.elapsed / TRIAL) + added
-    # Once it is too large it is doubled, and so takes time to fall.
+    # Once it is too large, it is doubled, so that it takes time to fall.
     begins = (counted >= ALARMS) & (state.doubt < ALARMS)
     for fault in filter(None, faults):
         begins = begins | fault.found
     doubt = jnp.where(begins, 2 * ALARMS, jnp.minimum(counted, 2 * ALARMS))
-    # Hypotheses weigh what they knew before an alarm against what they have learned since; one filter cannot.
+    # Hypotheses compare the estimates from before and after an alarm; a single filter cannot.
     moves = jnp.where(unlikely, PERSISTENT * periods, 0.0) + (alarm if state.mixture is None else 0.0)
     burst = state.burst * jnp.exp(-periods * sample.elapsed) + moves
     good = (nis < REJECT) & (doubt < ALARMS) & (burst < BURST)
     trusted = jnp.where(good, verdict.theta, state.settled)
-    # A mean, as the last value may be that of a gust, or of a fault before its first alarm.
+    # `settled` is a mean, since the last value may belong to a gust or to a fault before its first alarm.
     kept = doubt < SETTLED
     for fault in filter(None, faults):
-        # While an exchange or a wrong sign may be true, what is learned may be wrong.
+        # During a possible exchange or wrong sign, θ may be wrong.
         kept = kept & ~fault.possible
     rate = jnp.where(kept, -jnp.expm1(-periods / TRIAL), 0.0)
     settled = state.settled + rate * (trusted - state.settled)
@@ -69,7 +69,7 @@ def sound(new: OnlineState, begun: OnlineState, old: OnlineState, variances: Flo
     )
     parts = [new.root, new.x, new.theta, new.nis, new.excitation.sensitivity, new.excitation.root]
     if (mixture := again.mixture) is not None and new.mixture is not None:
-        # It is for all parameters now.
+        # The filter of all parameters is now used.
         again = eqx.tree_at(lambda s: s.mixture.log_weights, again, mixture.log_weights[::-1])
         parts += [new.mixture.z, new.mixture.root, new.mixture.log_weights]
     total = sum(jnp.sum(jnp.abs(part)) for part in parts)

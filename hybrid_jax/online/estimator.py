@@ -3,8 +3,8 @@
 The filter state is z = [x, θ]: the state x of the system, because one-step predictions need it without noise, and θ,
 all parameters of the physics and the disturbance.
 
-- A test of the innovations detects a change (`change_test`); an alarm resets the variance of what takes part in it.
-- θ follows a slow random walk, that of the disturbance (or, without one, of all) a faster one while they are biased.
+- A test of the innovations detects a change (`change_test`); an alarm resets the variance of the changed parameters.
+- θ follows a slow random walk; while innovations are biased, it is faster for the disturbance (without one, for all).
 - Filters of a few parameters may compete with the filter of all (`multiple_model`).
 - Directions of θ that are not excited keep their value and variance (`excitation`).
 - An inconsistent estimate is replaced by the last good one (`consistency`).
@@ -39,7 +39,7 @@ from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, fl
 from hybrid_jax.online.tuning import BREEZE, HOLD, MEMORY, PAUSE, TAKEN, Tuning
 from hybrid_jax.runtime import entry
 
-RISE, FALL = 10.0, 0.2  # of the logarithm of how much faster [1/s]
+RISE, FALL = 10.0, 0.2  # rates of the logarithm of this factor [1/s]
 
 
 class OnlineAdaptation(AbstractEstimator):
@@ -49,9 +49,8 @@ class OnlineAdaptation(AbstractEstimator):
         update, state = eqx.filter_jit(filter.update), filter.begin(x)
         state = update(state, x, u)  # at each sample; then filter.model(state), filter.intervals(state)
 
-    You should compile `update`: it is some hundred times as fast then. You can use all methods under `jit`, and under
-    `vmap` over stacked states. A sample of another shape raises ValueError. Invalid numbers in a sample do not; see
-    `flags`.
+    You should compile `update`, which makes it some hundred times as fast. You can use all methods under `jit`, and
+    under `vmap` over stacked states. A sample of another shape raises ValueError; for invalid numbers see `flags`.
 
     Attributes:
         field: the model. Its physics is adapted from its present values, and its network does not change.
@@ -187,7 +186,7 @@ class OnlineAdaptation(AbstractEstimator):
         if (order := state.order) is not None:
             order = order.after(state.joint, self._rates, slope, belief, correction, sample, opens, model)
         signs = state.signs if state.signs is None else state.signs.after(slope, belief, sample, model)
-        # What changed opens to its prior. The state, too, has followed the wrong model since then.
+        # After a change the state is reset too, since it has followed the wrong model.
         belief = kalman.reset_state(belief, sample, opens, variances)
         new = OnlineState(
             x=belief.z[:d],
@@ -251,7 +250,7 @@ class OnlineAdaptation(AbstractEstimator):
         return jnp.broadcast_to(jnp.square(jnp.asarray(self.noise, x.dtype)), x.shape)
 
     def _varies(self) -> np.ndarray:
-        """Whether each parameter is a disturbance."""
+        """Return whether each parameter is a disturbance."""
         return np.array([name.startswith(DISTURBANCE) for name in self.names])
 
     def _models(self) -> ModelSet:
@@ -275,14 +274,15 @@ class OnlineAdaptation(AbstractEstimator):
         diffusion = periods * sample.elapsed * jnp.square(walk)
         diffusion = diffusion + state.opened * jnp.maximum(1 - jnp.sum(jnp.square(state.root[d:]), axis=1), 0.0)
         varies, share = (jnp.asarray(np.where(self._varies(), *each), ones.dtype) for each in ((1, 0), (TAKEN, 1)))
-        # A disturbance takes what is not estimated. Hypotheses compete by likelihood, for which all doubt counts.
+        # The disturbance absorbs directions that are not estimated. Hypotheses compete by likelihood, so they need all
+        # of the uncertainty.
         alone = tuning.excitation and self._varies().any() and not self.hypotheses
         part = told.estimated(share) if alone else None
         belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted, part)
         predicted = kalman.reset_state(kalman.limit_covariance(belief, ones), sample, sample.restart, model.variances)
         belief, correction = kalman.correct(predicted, sample, model)
         if tuning.excitation:
-            # Each alarm but the first in 10 s is like a step of a random walk by the prior: a gust that has just begun.
+            # Each alarm after the first in 10 s counts as a step of a random walk by the prior, as in a beginning gust.
             begun = jnp.sqrt(jnp.maximum(state.doubt - 1, 0.0) / MEMORY)
             breeze = jnp.maximum(jnp.minimum(begun, tuning.drift * tuning.gusts), BREEZE)
             walk = jnp.maximum(walk, breeze * varies)
@@ -291,7 +291,7 @@ class OnlineAdaptation(AbstractEstimator):
         return kalman.triangular(belief, d), told, slope, correction
 
     def _haste(self, state: OnlineState, sample: Sample, opens: Bool[Array, ""]) -> Float[Array, " p"]:
-        """Update the log-scale of the random walk: of disturbances or, without one, of all that do not open now."""
+        """Update the log-scale of the random walk: of disturbances or, without one, of all parameters unless reset."""
         varies, tuning = self._varies(), self.tuning
         pulled = state.test.pulled / EAGER - 1
         rise = jnp.where(pulled > 0, RISE * jnp.minimum(pulled, 4.0), -FALL)

@@ -1,13 +1,12 @@
 """Move θ, and shrink its covariance, only along directions that the samples excite.
 
 In hover, a thrust coefficient and a disturbance along z are distinguishable only by the controller's response to noise.
-That noise is correlated with the input, so the filter becomes certain of a wrong value, with a bias of about BIAS / √I
+This noise is correlated with the input, so the filter becomes certain of a wrong value, with a bias of about BIAS / √I
 of the prior, where I is the information of a sample in units of the prior. Directions with little information are
 therefore considered, not estimated: they keep their value and variance, and add to the uncertainty of the others
-(Schmidt, "Application of state-space methods to navigation problems", 1966). The others are corrected on the condition
-that these keep their value, so what the samples tie together, for example thrust over inertia, stays together. The
-information is computed from the innovations' sensitivity to θ (Friedland, "Treatment of bias in recursive filtering",
-1969).
+(Schmidt, "Application of state-space methods to navigation problems", 1966). The others are corrected conditionally on
+them, so that combinations which the samples determine, for example thrust over inertia, do not change. The information
+is computed from the innovations' sensitivity to θ (Friedland, "Treatment of bias in recursive filtering", 1969).
 """
 
 import equinox as eqx
@@ -18,10 +17,10 @@ from hybrid_jax.online.kalman import Belief, Correction
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import MEMORY, Tuning
 
-BIAS = 0.04  # for an information of 1 in a sample, in the prior
-LARGEST = 1e5  # information of a number beyond which its last digits would count for some
-SHARPER = 5  # passes that make shares zero or one
-LOOSE, LEAST = 1e-4, 1e-9  # variance of a condition over what it is about; share of a parameter
+BIAS = 0.04  # of the prior, for an information of 1 in a sample
+LARGEST = 1e5  # information of a number, limited so that rounding does not count as information
+SHARPER = 5  # iterations that make shares zero or one
+LOOSE, LEAST = 1e-4, 1e-9  # relative variance of a condition; smallest share of a parameter
 TAKES_PART = 0.1  # share above which a parameter is part of a direction that is not excited
 
 
@@ -37,16 +36,15 @@ class Excitation(eqx.Module):
 
     @classmethod
     def begin(cls, d: int, p: int, dtype) -> "Excitation":
-        """Initialise before the first sample, without information."""
         return cls(jnp.zeros((d, p), dtype), jnp.eye(p, dtype=dtype))
 
     def bias(self, tuning: Tuning) -> Float[Array, "*n p p"]:
-        """Covariance of the bias of a hypothesis, which learns from any information; see above."""
+        """Return the covariance of the bias of a hypothesis, which uses all information; see above."""
         size = BIAS**2 / tuning.excitation if tuning.excitation else 0.0
         return size * self.root @ self.root.mT
 
     def considered(self) -> Float[Array, "*n p p"]:
-        """The projection on the directions that are not excited."""
+        """Return the projection on the directions that are not excited."""
         found = self.root @ self.root.mT
         for _ in range(SHARPER):
             twice = found @ found
@@ -54,7 +52,7 @@ class Excitation(eqx.Module):
         return found
 
     def estimated(self, share: Float[Array, " p"]) -> Float[Array, "*n p p"]:
-        """The projection on the other directions, in units of the prior."""
+        """Return the projection on the other directions, in units of the prior."""
         return jnp.eye(len(share), dtype=share.dtype) - share[:, None] * self.considered() / share
 
 
@@ -88,12 +86,12 @@ def after_sample(
 def consider(
     before: Belief, after: Belief, correction: Correction, told: Excitation, share: Float[Array, " p"]
 ) -> tuple[Belief, Correction]:
-    """Correct θ on the condition that it stays along considered directions; also return what then corrects it."""
+    """Correct θ on the condition that it does not move along considered directions; also return its new gains."""
     d, considered = len(correction.white), told.considered()
     gains, root = correction.gains[:, d:], before.root[d:]
     moves = jnp.eye(len(share), dtype=root.dtype)
     sizes = jnp.sum(jnp.square(root), axis=1)
-    # Conditions enter one by one, as samples do in `kalman.correct`: nothing is seen to change along `row`.
+    # Process conditions one by one, like samples in `kalman.correct`: the measured change along `row` is zero.
     for i, row in enumerate(considered / share):
         parts = jnp.maximum(considered[i, i], LEAST)
         held = jnp.sum(jnp.square(considered[i])) / parts

@@ -1,4 +1,4 @@
-"""Hypotheses on a change of a few parameters, as the user defines them and as `multiple_model` uses them."""
+"""Hypotheses about a change of a few parameters, as you define them and as `multiple_model` uses them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ class Hypothesis:
             efficiency[0] is one entry, efficiency a whole array.
         together: shared factors (unit variance) that scale several parameters, for example a mass.
         rates: standard deviation of the rate of change of a parameter in `parameters` [1/s]. The rate is a random walk
-            that moves by as much in half a second.
+            that moves by one standard deviation in half a second.
         lead: how far ahead those parameters are extrapolated in the model [s].
 
     Raises:
@@ -50,7 +50,7 @@ class Hypothesis:
 
 
 class Subspace(NamedTuple):
-    """A hypothesis of numbers a with θ = S a, in prior standard deviations of p parameters."""
+    """A hypothesis of k numbers a with θ = S a, in prior standard deviations of p parameters."""
 
     effects: tuple[tuple[float, ...], ...]  # the k rows of Sᵀ
     own: tuple[bool, ...]  # whether each parameter has its own number
@@ -59,7 +59,7 @@ class Subspace(NamedTuple):
 
 
 class ModelSet(NamedTuple):
-    """h hypotheses with equally many numbers each: first the field's own parameters, then the user's hypotheses."""
+    """h hypotheses of k numbers each: first the field's own parameters, then the user's hypotheses."""
 
     effects: Float[np.ndarray, "h p k"]  # S
     ahead: Float[np.ndarray, "h p k"]  # S of the extrapolated model, including rates
@@ -90,7 +90,7 @@ def subspace_of(hypothesis: Hypothesis, names: tuple[str, ...], scales: tuple[fl
 
 
 def model_set(hypotheses: tuple[Subspace, ...], p: int, dt: float) -> ModelSet:
-    """Stack all hypotheses in arrays, padded with numbers without effect."""
+    """Stack all hypotheses, padded with numbers that have no effect."""
     sizes = [len(hypothesis.effects) + int(np.count_nonzero(hypothesis.rates)) for hypothesis in hypotheses]
     h, k = len(hypotheses) + 1, max(sizes)
     effects, prior, diffusion = np.zeros((h, p, k)), np.zeros((h, k)), np.zeros((h, k))

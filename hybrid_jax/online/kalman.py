@@ -16,7 +16,7 @@ from hybrid_jax.integrate import rk4_step
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import BOUND, Tuning
 
-Each = Callable[[Callable], Callable]  # a function of one filter → of arrays of several, as `jax.vmap`
+Each = Callable[[Callable], Callable]  # maps a function over filters, like `jax.vmap`
 Field = Callable[[Array, Array], Array]  # ẋ as a function of x and a
 
 
@@ -81,14 +81,14 @@ def predict(
 ) -> tuple[Belief, Float[Array, "d n"]]:
     """Predict one period if a known input was applied; also return the Jacobian of the next x.
 
-    `part` projects a on the directions that are estimated, by default all; only these call for caution.
+    `part` projects a on the directions that are estimated, by default all; `Tuning.caution` applies to these.
     """
     z, root = belief
     d = len(model.variances)
     moved, slope = step_with_jacobian(model, field, z[:d], z[d:])
     own, a = root[d:], z[d:]
     learned = own if part is None else part @ own
-    # Products of errors of a and of x, which a linear filter leaves out, move the state while a is uncertain.
+    # While a is uncertain, products of errors in a and x, which a linear filter neglects, move the state.
     noise = model.process_noise + model.tuning.caution**2 * jnp.sum(jnp.square(slope[:, d:] @ learned), axis=1)
     if transition is not None:
         own, a = transition @ own, transition @ a
@@ -135,7 +135,7 @@ def correct(belief: Belief, sample: Sample, model: FilterModel) -> tuple[Belief,
         errors.append(jnp.where(used, (sample.x[i] - z[i]) / size, 0.0))
         error = jnp.clip(errors[-1], -clip, clip)
         gain = column / size
-        # Potter's update: that of the covariance, column columnᵀ / variance, without a difference of squares.
+        # Potter's update subtracts column columnᵀ / variance from the covariance without a difference of squares.
         z, root = z + gain * error, root - column[:, None] * row / (variance + jnp.sqrt(noise * variance))
         likelihood = likelihood - jnp.where(used, jnp.square(error) + jnp.log(variance), 0.0) / 2
         white.append(error)

@@ -26,9 +26,8 @@ from hybrid_jax.online.kalman import Belief, Correction, FilterModel
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import SETTLE
 
-# Logarithms: how many times less likely one can become than the likeliest, and is after an alarm than what was before.
-FLOOR, CHANGE = 25.0, 4.0
-LEAST = 1e-3  # weight, relative to the largest, up to which one is left out of the estimate
+FLOOR, CHANGE = 25.0, 4.0  # log-odds against a hypothesis: at most; and after an alarm, relative to no change
+LEAST = 1e-3  # weight, relative to the largest, below which a hypothesis is not in the estimate
 
 
 class Mixture(eqx.Module):
@@ -52,7 +51,6 @@ class Verdict(NamedTuple):
 
 
 def initial(models: ModelSet, x: Float[Array, " d"], variances: Float[Array, " d"]) -> Mixture:
-    """Initialise before the first sample x."""
     h, p, k = models.effects.shape
     none = jnp.zeros(k, x.dtype)
     z = jnp.tile(jnp.concatenate([x, none]), (h + 1, 1))
@@ -63,7 +61,7 @@ def initial(models: ModelSet, x: Float[Array, " d"], variances: Float[Array, " d
 
 
 def weights(mixture: Mixture) -> Float[Array, " h+1"]:
-    """Posterior weights; those below LEAST × max are set to zero."""
+    """Return the posterior weights; those below LEAST × max are set to zero."""
     found = jnp.maximum(jnp.exp(mixture.log_weights) - LEAST, 0.0)
     return found / jnp.sum(found)
 
@@ -76,7 +74,7 @@ def with_previous(mixture: Mixture, own: Float[Array | np.ndarray, "h-1 ..."]) -
 
 
 def covariance(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "p p"]:
-    """Covariance of θ within the components (from the joint filter for unmodelled parameters) and between them."""
+    """Return the covariance of θ within the hypotheses (other parameters: of the joint filter) and between them."""
     share, means = weights(mixture), _means(mixture, models, joint)
     effects = with_previous(mixture, models.ahead)
     d = len(joint.z) - effects.shape[1]
@@ -89,7 +87,7 @@ def covariance(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array
 
 
 def _means(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "h+1 p"]:
-    """θ of each hypothesis, extrapolated by its lead."""
+    """Return θ of each hypothesis, extrapolated by its lead."""
     effects = with_previous(mixture, models.ahead)
     d = len(joint.z) - effects.shape[1]
     return jnp.concatenate([jnp.sum(effects * mixture.z[:, None, d:], axis=2), joint.z[None, d:]])
@@ -106,13 +104,13 @@ def update(
         correction._replace(white=shares @ white), sample, periods, model.tuning, SETTLE
     )
     changed = jnp.max(concerned) > 0
-    # Bayes' rule; what is at the floor stays there, but for the filter of all parameters.
+    # Bayes' rule; a hypothesis at the floor stays there, except the filter of all parameters.
     before = mixture.log_weights
     likelihoods = jnp.concatenate([likelihoods, correction.log_likelihood[None]])
     log_weights = jnp.where((before <= -FLOOR).at[-1].set(False), -jnp.inf, before + likelihoods)
     log_weights = jnp.maximum(log_weights - jnp.max(log_weights), -FLOOR)
     mixture = eqx.tree_at(lambda m: m.log_weights, mixture, log_weights)
-    # The filter of all parameters has found what the test has not.
+    # The filter of all parameters has found a change that the test has not.
     taken = (log_weights[-1] == 0) & (before[-1] < 0) & (mixture.test.quiet > SETTLE)
     unexplained, changed = changed & (log_weights[-1] < 0), changed | taken
     mixture = reinitialised(mixture, models, model, sample, changed)
@@ -146,12 +144,12 @@ def filtered(
 def reinitialised(
     mixture: Mixture, models: ModelSet, model: FilterModel, sample: Sample, alarm: Bool[Array, ""]
 ) -> Mixture:
-    """After an alarm, reset each hypothesis to its prior and keep the likeliest one beside them."""
+    """After an alarm, reset each hypothesis to its prior and keep the likeliest one as the first."""
     d, h = len(sample.x), len(mixture.z)
     likeliest = jnp.where(mixture.log_weights == 0, 1.0, 0.0)
     likeliest = likeliest / jnp.sum(likeliest)
     joint = likeliest[h]
-    # The filter of all parameters goes on by itself; the field's own parameters then take the first place.
+    # The filter of all parameters continues elsewhere; if it is likeliest, the field's own parameters are the first.
     first = jnp.concatenate([likeliest[:1], likeliest[1:2] + joint, likeliest[2:h]])
     restart = jnp.concatenate([jnp.zeros_like(mixture.previous[:1]), jnp.ones_like(mixture.previous)])
 
@@ -164,7 +162,7 @@ def reinitialised(
     z = jnp.concatenate([(first @ mixture.z)[None], mixture.z[1:]])
     root = jnp.concatenate([jnp.tensordot(first, mixture.root, 1)[None], mixture.root[1:]])
     belief = model.each(one)(z, root, with_previous(mixture, models.prior), restart)
-    # What learns goes on with its weight.
+    # The filter of all parameters keeps its weight.
     least = jnp.full_like(mixture.log_weights, -CHANGE)
     log_weights = least.at[0].set(least[0] * joint).at[-1].set(jnp.maximum(mixture.log_weights[-1], least[0]))
     new = Mixture(belief.z, belief.root, first[0] * mixture.previous + first[1:], log_weights, mixture.test)

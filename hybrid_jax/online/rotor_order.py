@@ -1,11 +1,11 @@
 """Detect two exchanged rotors from the innovations of a filter.
 
-A disturbance that moves quickly explains a wrong order of the rotors, so innovations stay small; the right order
-explains the samples better still. For each pair a second filter, with the gains of the first, has its inputs exchanged.
-A sequential test compares their likelihoods (Wald, "Sequential analysis", 1947, ch. 3): it accepts the exchange at a
-logarithm of ACCEPT, and at −REFUSE begins anew at −CLEAR. What one sample adds is limited (Huber, "A robust version of
-the probability ratio test", 1965), so that a short error of the model, for example as a gust begins, decides nothing.
-If two rotors are exchanged, the logarithm falls to −CLEAR with a probability of at most e⁻⁵ (Ville's inequality).
+With a wrong order of the rotors, innovations are small because a disturbance that moves quickly explains it, but they
+are smaller with the right order. For each pair, a second filter with the gains of the first has its inputs exchanged. A
+sequential test compares their likelihoods (Wald, "Sequential analysis", 1947, ch. 3): it accepts the exchange at a
+log-ratio of ACCEPT, and restarts from −CLEAR at −REJECT. The change by one sample is limited (Huber, "A robust version
+of the probability ratio test", 1965), so that a short model error, for example at the start of a gust, does not decide.
+If two rotors are exchanged, the log-ratio falls to −CLEAR with a probability of at most e⁻⁵ (Ville's inequality).
 """
 
 from collections.abc import Callable
@@ -20,8 +20,8 @@ from hybrid_jax.online.kalman import Belief, Correction, Field, FilterModel
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import BOUND
 
-ACCEPT, REFUSE, CLEAR = 25.0, 10.0, 5.0  # logarithms of likelihood ratios
-FASTEST = 50.0  # by which they change at most [1/s], for a pace of 1: half a second decides
+ACCEPT, REJECT, CLEAR = 25.0, 10.0, 5.0  # logarithms of likelihood ratios
+FASTEST = 50.0  # largest rate of their change [1/s], for a pace of 1: a decision takes half a second
 
 
 class RotorOrder(eqx.Module):
@@ -33,7 +33,7 @@ class RotorOrder(eqx.Module):
 
     @classmethod
     def begin(cls, rotors: int, n: int, dtype) -> "RotorOrder | None":
-        """Initialise before the first sample; None without a pair."""
+        """Return the state before the first sample; None if there is no pair."""
         pairs = [{i: j, j: i} for i, j in combinations(range(rotors), 2)]
         orders = tuple(tuple(pair.get(i, i) for i in range(rotors)) for pair in pairs)
         return cls(jnp.zeros((len(pairs), n), dtype), jnp.zeros(len(pairs), dtype), orders) if pairs else None
@@ -45,7 +45,7 @@ class RotorOrder(eqx.Module):
 
     @property
     def possible(self) -> Bool[Array, "*n"]:
-        """Whether two may be."""
+        """Whether two rotors may be exchanged."""
         return jnp.max(self.evidence, axis=-1) > -CLEAR
 
     @property
@@ -69,14 +69,14 @@ class RotorOrder(eqx.Module):
         """Update after a sample, given the first filter's belief before and after it and the Jacobian of the next x."""
         d, clip, most = len(sample.x), model.tuning.clip, FASTEST * model.dt / model.tuning.pace
         x, theta = before.z[:d], before.z[d:]
-        orders = jnp.asarray(np.eye(len(sample.u))[np.array(self.orders)], x.dtype)  # a product has C, a gather has not
+        orders = jnp.asarray(np.eye(len(sample.u))[np.array(self.orders)], x.dtype)  # C has no gather
         own = model.each(lambda order, away: rates(order @ sample.u)(x, theta + away))(orders, self.away[:, d:])
         moved = self.away[:, :d] @ slope[:, :d].T + model.dt * (own - model.field(x, theta)[None])
         moved = jnp.where(sample.restart, 0.0, jnp.where(sample.acted, moved, self.away[:, :d]))
         away, ratio = jnp.concatenate([moved, self.away[:, d:]], axis=1), jnp.zeros_like(self.evidence)
         for i, error in enumerate(correction.errors):
             own = error - jnp.where(sample.used[i], away[:, i] / correction.sizes[i], 0.0)
-            # What no order explains says nothing.
+            # Errors that no order explains do not count.
             first, second = (jnp.minimum(jnp.square(each), clip**2) for each in (error, own))
             ratio = ratio + (first - second) / 2
             added = jnp.clip(own, -clip, clip) - correction.white[i]
@@ -85,6 +85,6 @@ class RotorOrder(eqx.Module):
         bounded = jnp.clip(theta + away[:, d:], -BOUND, BOUND) - theta
         away = jnp.concatenate([jnp.where(opens, 0.0, away[:, :d]), bounded], axis=1)
         evidence = self.evidence + jnp.clip(ratio, -most, most)
-        goes_on = evidence > -REFUSE  # false if it is not a number
+        goes_on = evidence > -REJECT  # false if it is NaN
         evidence = jnp.where(goes_on, jnp.minimum(evidence, 2 * ACCEPT), -CLEAR)
         return RotorOrder(jnp.where(goes_on[:, None], away, 0.0), evidence, self.orders)

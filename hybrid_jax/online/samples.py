@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-HUGE = 1e15  # a number beyond it, or NaN, was not measured
+HUGE = 1e15  # larger numbers, or NaN, were not measured
 
 
 class Sample(NamedTuple):
@@ -25,7 +25,7 @@ class Sample(NamedTuple):
 
     @property
     def measured(self) -> Bool[Array, ""]:
-        """Whether any number does; a sum, because the export to C does not support `any`."""
+        """Whether any number corrects it; a sum, because the export to C does not support `any`."""
         return jnp.sum(jnp.where(self.used, 1.0, 0.0)) > 0
 
 
@@ -42,7 +42,7 @@ def classify(x, u, elapsed, history: SampleHistory, dt: float, gap: float) -> tu
     """Classify the sample x after some periods of dt [s]; after a `gap` [s] the state restarts from it."""
     equal = jnp.where(x == history.last, history.equal + 1, 0.0)
     seen = (jnp.abs(x) < HUGE) & (equal == 0)
-    # Sums in place of `all` and `any`, which the export to C does not know.
+    # Sums instead of `all` and `any`, which the export to C does not support.
     acted = (jnp.sum(jnp.where(jnp.abs(u) < HUGE, 0.0, 1.0)) == 0) & (elapsed < 1.5)
     any_seen = jnp.sum(jnp.where(seen, 1.0, 0.0)) > 0
     waited = history.silent + dt * (elapsed - 1)

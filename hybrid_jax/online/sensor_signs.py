@@ -2,8 +2,8 @@
 
 A disturbance that moves quickly explains a wrong sign of a velocity, so innovations stay small. But no disturbance acts
 on a position: its change over some 0.2 s is the integral of the velocity. For each disturbed state, a sequential test
-compares how likely the changes of the states without a disturbance are with its sample and with the negative of it
-(Page, "Continuous inspection schemes", 1954). Noise of the sample itself counts against the wrong sign.
+compares how likely the changes of undisturbed states are with its sample and with the negative sample (Page,
+"Continuous inspection schemes", 1954). Noise of the sample counts against the wrong sign.
 """
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from hybrid_jax.online.samples import Sample
 from hybrid_jax.state_space import StateSpace
 
 SPAN = 0.2  # s, over which changes are compared, for a pace of 1
-ACCEPT, SUSPECT = 12.0, 1.0  # logarithms of likelihood ratios from which a sign is wrong, and may be
+ACCEPT, SUSPECT = 12.0, 1.0  # log-likelihood ratios above which a sign is wrong, and may be wrong
 
 
 class SensorSigns(eqx.Module):
@@ -25,13 +25,13 @@ class SensorSigns(eqx.Module):
 
     last: Float[Array, "*n d"]  # the last sample; the estimate where nothing was measured
     errors: Float[Array, "*n d"]  # recent changes of each state less the integral of its rate
-    effects: Float[Array, "*n j d"]  # what a wrong sign of each disturbed state adds to them
+    effects: Float[Array, "*n j d"]  # part of the errors due to a wrong sign of each disturbed state
     evidence: Float[Array, "*n j"]  # logarithm of how much likelier the wrong sign is; at least 0
     disturbed: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
     def begin(cls, space: StateSpace, x: Float[Array, " d"]) -> "SensorSigns | None":
-        """Initialise at the first sample; None if the state space does not say which states are disturbed."""
+        """Return the state at the first sample x; None if the state space does not say which states are disturbed."""
         disturbed, none = tuple(range(len(x))[space.disturbed or slice(0)]), jnp.zeros_like(x)
         if not disturbed:
             return None
@@ -44,7 +44,7 @@ class SensorSigns(eqx.Module):
 
     @property
     def possible(self) -> Bool[Array, "*n"]:
-        """Whether one may be."""
+        """Whether a sign may be wrong."""
         return jnp.max(self.evidence, axis=-1) > SUSPECT
 
     @property
@@ -64,10 +64,10 @@ class SensorSigns(eqx.Module):
         acted = sample.acted & ~sample.restart
         errors = jnp.where(acted, kept * self.errors + change, 0.0)
         effects = jnp.where(acted, kept * self.effects - 2 * middle[tested, None] * gains, 0.0)
-        # Samples of one span are not independent, and noise of the rates adds up over it.
+        # Samples within one span are not independent, and the noise of the rates adds up.
         noise = jnp.square(gains) * model.variances[tested, None] / (1 - kept**2)
         counted = (1 - kept) * jnp.where(sample.seen, free, 0.0) / (model.variances + jnp.sum(noise, axis=0))
         ratio = jnp.sum(counted * (effects * errors - jnp.square(effects) / 2 - 2 * noise), axis=1)
         evidence = self.evidence + jnp.where(sample.seen[tested], jnp.clip(ratio, -most, most), 0.0)
-        evidence = jnp.where(evidence > 0, jnp.minimum(evidence, 2 * ACCEPT), 0.0)  # also if it is not a number
+        evidence = jnp.where(evidence > 0, jnp.minimum(evidence, 2 * ACCEPT), 0.0)  # also if NaN
         return SensorSigns(x, errors, effects, evidence, self.disturbed)

@@ -27,7 +27,7 @@ Numbers = float | tuple[float, ...] | np.ndarray
 
 
 class OnlineState(eqx.Module):
-    """The state of an `OnlineAdaptation` with d states and p parameters. It has only numbers, so C can hold it.
+    """The state of an `OnlineAdaptation` with d states and p parameters; only numbers, so that C can store it.
 
     Attributes:
         x: the estimated state.
@@ -39,12 +39,12 @@ class OnlineState(eqx.Module):
         trusted: the last consistent θ, which the model uses.
         settled: their mean over the last 10 s without alarms, restored if alarms or unlikely errors persist.
         doubt: number of alarms in the last 10 s.
-        burst: number of alarms in the last second (of the filter of all parameters alone), and of unlikely errors.
+        burst: number of unlikely errors in the last second and, without hypotheses, of alarms.
         opened: 1 for each parameter whose variance rises to its prior before the next sample, after an alarm; else 0.
         haste: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.
         nis: mean normalised innovation squared, 1 if noise and model are correct.
         order: how likely an exchange of two rotors is; None without rotors.
-        signs: how likely a wrong sign of a disturbed state is; None if no other state tells.
+        signs: how likely a wrong sign of a disturbed state is; None if unknown which states are disturbed.
         history: statistics of the past samples.
         changes: number of alarms.
         restarts: number of restarts after a number that was not finite.
@@ -89,10 +89,10 @@ class Flags(NamedTuple):
         gap: whether nothing was measured for longer than `Tuning.gap`.
         changed: whether there was an alarm in the last second.
         inconsistent: whether errors are too large for the model at any θ, or alarms persist, for example because a
-            sensor has a wrong sign, unit or position, or rotors are exchanged. The estimate from before is then used.
+            sensor has a wrong sign, unit or position, or rotors are exchanged. The earlier estimate is then used.
         exchanged: which rotors seem to be exchanged with another in the input; empty without rotors.
-        reversed: which states seem to be measured with the wrong sign, as those whose rate they are say.
-        unexcited: which parameters recent samples do not excite, alone or in combination with others.
+        reversed: which states seem to be measured with the wrong sign, compared with the states whose rate they are.
+        unexcited: which parameters recent samples do not excite, by themselves or in combination with others.
         at_bound: which parameters are at the end of their range.
     """
 

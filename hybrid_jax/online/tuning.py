@@ -7,14 +7,13 @@ from hybrid_jax import checks
 
 # Times in seconds, for `Tuning.pace` 1.
 SPANS = (0.05, 0.5)  # of the two sums of the change test
-PAUSE, SETTLE, HOLD = 0.1, 0.3, 0.6  # least time from an alarm to the next, of a mixture, and to an unexplained one
+PAUSE, SETTLE, HOLD = 0.1, 0.3, 0.6  # shortest time between alarms, of a mixture, and to an unexplained alarm
 WINDOW, TRIAL, MEMORY = 0.2, 10.0, 2.0  # time constants of the mean NIS, the count of alarms, and the information
-BURST = 2.0  # alarms in a second (weighted by e⁻ᵗ) from which an estimate is not used: it is moving
+BURST = 2.0  # alarms in a second (weighted by e⁻ᵗ) from which an estimate is not used, because it is moving
 REJECT = 6.0  # mean normalised innovation squared (NIS) from which an estimate is not used
-ALARMS = 10.0  # alarms in 10 s from which it is not, until their count has halved from twice as many
-# Random walk of a disturbance, in its prior [1/√s], which a parameter's effect must exceed: a gust of a sixth of it.
-BREEZE = 0.25
-TAKEN = 10.0  # how much more willingly a disturbance takes what its sum with a parameter explains
+ALARMS = 10.0  # alarms in 10 s from which it is not used, until twice this count has halved
+BREEZE = 0.25  # random walk of a disturbance, in its prior [1/√s], above which effects count: gusts of 1/6 of it
+TAKEN = 10.0  # weight of a disturbance relative to a parameter, if samples determine only a sum of both
 FROZEN = 3  # equal samples in a row that mark a sensor as frozen
 BOUND = 4.0  # prior standard deviations that a parameter may move
 SLOWEST = 0.05  # period up to which a pace of 1 is right
@@ -25,8 +24,8 @@ class Tuning:
     """How an `OnlineAdaptation` forgets and detects changes.
 
     The defaults were tuned by hand on simulated flights of a quadrotor at 100 Hz, with other seeds than the report on
-    online adaptation. They are in standard deviations of the prior and of the noise, so they should fit your system if
-    `prior`, `noise` and `process` do. If changes are missed or alarms are false, you should begin with `alarm`; if
+    online adaptation. They are in standard deviations of the prior and the noise, so they should suit your system if
+    `prior`, `noise` and `process` do. If changes are missed or alarms are false, you should first change `alarm`; if
     intervals are too narrow, raise `drift` and `caution`; if your system is much slower, set `pace`.
 
     Attributes:
