@@ -27,10 +27,10 @@ from hybrid_jax.rotation import attitude_error, normalise
 from hybrid_jax.vehicle import BODY_RATES, QUATERNION, STATE_SIZE, Input, State, Vehicle
 
 VARIABLE_BOUND = 3.0  # there tanh is within 0.5 % of its limit, and its slope is still 1 %
-# The line search varies the damping (Levenberg–Marquardt), not the length of a step: after a large initial rate a long
-# Gauss–Newton step is mostly no descent direction, at any length.
+# The line search varies the damping (Levenberg–Marquardt), not the length of a step: with a large initial rate, the
+# Gauss–Newton step is often not a descent direction at any length.
 DAMPING_FACTORS = (0.1, 1.0, 10.0)
-FAILURE_FACTOR = 100.0  # on the damping, when none of them lowered the cost
+FAILURE_FACTOR = 100.0  # on the damping, if none of them lowers the cost
 INITIAL_DAMPING, MAX_DAMPING = 10.0, 1e8
 # 1/s² and 1/s: the largest gains of the recovery that are stable with inputs held for 0.05 s.
 ATTITUDE_GAIN, RATE_GAIN = 30.0, 10.0
@@ -50,7 +50,7 @@ class Plan(eqx.Module):
     damping: Scalar
 
 
-_Point = tuple[Plan, Float[Array, "t 13"]]  # and the states that the model predicts
+_Point = tuple[Plan, Float[Array, "t 13"]]  # and the predicted states
 _Start = tuple[State, Input]  # state and rotor speeds
 
 
@@ -71,7 +71,7 @@ def checked_states(
 
 @dataclass(frozen=True)
 class Controller:
-    """A model predictive controller. It has settings only: you pass its plan to a call, and get the next one back.
+    """A model predictive controller. It stores only settings: you pass a plan to each call, which returns the next.
 
     Attributes:
         vehicle: defines the limits and the initial guess (hover); the dynamics are the model that you pass to a call.
@@ -79,7 +79,7 @@ class Controller:
         steps: number of intervals of the horizon.
         interval: length of an interval [s], which is one step of RK4.
         period: time between two calls [s].
-        iterations: Gauss–Newton steps in each call.
+        iterations: number of Gauss–Newton steps in each call.
         damping: lower bound of the damping.
         min_speed: lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's.
         rotor_lag: time constant of the rotors [s]; see `lagged_speeds`.
@@ -125,7 +125,7 @@ class Controller:
         """Return the plan for the first call: hover throughout."""
         middle, half = self._range()
         hover = math.atanh((self.vehicle.hover_speed - middle) / half)
-        # With the dtype of later plans, or the second call would compile again.
+        # With the dtype of later plans, since the second call would otherwise compile again.
         variables = jnp.full((self.steps, self.vehicle.rotors), hover, float)
         return Plan(variables, jnp.asarray(jnp.inf, float), jnp.asarray(INITIAL_DAMPING, float))
 
@@ -166,13 +166,13 @@ class Controller:
         """Compute the rotor speeds [rad/s] to command for one period from state x, and the new plan.
 
         Args:
-            x: the state (13,), with the hidden states of the model behind it, if it has any.
+            x: the state (13,), followed by the hidden states of the model, if it has any.
             reference: the state to reach by the end of each interval (see `horizon`).
             plan: plan of the last call, or `begin()`.
             speeds: rotor speeds at state x [rad/s], by default the plan's commands; ignored without lag.
 
         Raises:
-            ValueError: shapes or types do not match; for concrete values also if one is not finite or a quaternion's
+            ValueError: if shapes or types do not match or, unless traced, a number is not finite or a quaternion's
                 norm is not 1. A compiled call normalises the quaternion of x.
         """
         if not callable(model):
@@ -202,7 +202,7 @@ class Controller:
 
     def _initial_guess(self, model, reference, start: _Start, plan: Plan) -> _Point:
         """Choose the shifted plan or the attitude recovery by cost."""
-        # One period later, interpolated; the last interval stays.
+        # The plan one period later, interpolated; the last interval is repeated.
         following = jnp.concatenate([plan.variables[1:], plan.variables[-1:]])
         shifted = plan.variables + (following - plan.variables) / self.stride
 
@@ -220,7 +220,7 @@ class Controller:
         return Plan(best[0], best[1], plan.damping), best[2]
 
     def _recovery(self, wanted: State, x: State) -> Float[Array, " rotors"]:
-        """Hover thrust and −30 φ − 10 (ω − ω_ref) [rad/s²], φ the attitude error, to leave a roll in the plan."""
+        """Return hover thrust with −30 φ − 10 (ω − ω_ref) [rad/s²], φ the attitude error, to end a planned roll."""
         vehicle, (middle, half) = self.vehicle, self._range()
         angle = attitude_error(wanted[QUATERNION], x[QUATERNION])
         acceleration = -ATTITUDE_GAIN * angle - RATE_GAIN * (x[BODY_RATES] - wanted[BODY_RATES])
@@ -260,7 +260,7 @@ class Controller:
         kept = Plan(plan.variables, plan.cost, jnp.minimum(plan.damping * FAILURE_FACTOR, MAX_DAMPING)), states
         lower = best[0].cost < plan.cost
         best, states = jax.tree.map(lambda new, old: jnp.where(lower, new, old), best, kept)
-        # At the optimum rounding decides which step lowers the cost, so its damping says nothing.
+        # At the optimum, rounding decides which step lowers the cost, so its damping is arbitrary.
         converged = gains[0] < jnp.finfo(gains.dtype).eps * (1 + plan.cost)
         return Plan(best.variables, best.cost, jnp.where(converged, INITIAL_DAMPING, best.damping)), states
 

@@ -261,10 +261,10 @@ def open_loop_costs(
     calls: Sequence[int],
     hardware: Hardware | None = None,
 ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-    """Compare the predicted cost of the plans of some calls with the cost when the plant executes them to their end.
+    """Return the predicted costs of some plans, and their costs if the plant executes them to their end.
 
-    Plans that are executed to their end reveal the model's full error. A plan begins when its command arrives, so a
-    call must be earlier than the end by the latency.
+    Plans that are executed to their end reveal the model's full error. A plan begins when its command arrives, so the
+    flight must continue after a call for at least the latency.
 
     Args:
         plant: the true vehicle, as in `fly`.

@@ -18,8 +18,7 @@ MOTION = slice(VELOCITY.start, BODY_RATES.stop)
 class Watched(eqx.Module):
     """State of an `Observer`."""
 
-    # Acceleration [m/s², world] and angular acceleration [rad/s², body] beyond the model.
-    disturbance: Float[Array, "*n 6"]
+    disturbance: Float[Array, "*n 6"]  # acceleration [m/s², world] and angular acceleration [rad/s², body]
     x: State  # the last sample
 
 
@@ -53,7 +52,7 @@ class Observer(AbstractEstimator):
 
 
 def observer_of(model: AbstractVectorField, bandwidth: Scalar | float, period: float) -> AbstractEstimator:
-    """The observer of a model; ValueError if it has hidden states that none estimates, or a second one is asked for."""
+    """Return the observer of a model; ValueError if it cannot estimate hidden states, or would be a second observer."""
     if not as_field(model).hidden:
         return Observer(model, bandwidth, period)
     if not isinstance(model, DisturbanceModel):
@@ -64,7 +63,7 @@ def observer_of(model: AbstractVectorField, bandwidth: Scalar | float, period: f
 
 
 class PastObserver(AbstractEstimator):
-    """Carry the state (x, z) of a model from `fit_disturbance`, whose filters z see the errors of its field.
+    """Estimate the state (x, z) of a model from `fit_disturbance`, whose filters z average the errors of its field.
 
     Attributes:
         field: the prediction model.

@@ -79,7 +79,7 @@ def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0
 
 
 def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.5) -> Path:
-    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, a [m], φ̇ constant; fastest at its centre, √2 a φ̇ [m/s].
+    """Fly Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, with constant φ̇; the speed at its centre is √2 a φ̇.
 
     Args:
         top_speed: speed at the centre [m/s].

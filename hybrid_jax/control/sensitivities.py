@@ -39,7 +39,7 @@ def lagged_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple
 
 
 def stage_shares(lag: float, dt: float) -> tuple[float, float, float]:
-    """Shares a, b, c of the previous speeds at the start, middle and end of an RK4 step.
+    """Return the shares a, b, c of the previous speeds at the start, middle and end of an RK4 step.
 
     For a chain of integrators with input f(s), 0 ≤ s ≤ 1, RK4 approximates ∫ f by (a + 4 b + c)/6, ∫ (1 − s) f by a/6 +
     b/3 and ½ ∫ (1 − s)² f by (a + b)/12. These shares make all three exact for f = exp(−s dt/τ). The true values 1,
@@ -47,7 +47,7 @@ def stage_shares(lag: float, dt: float) -> tuple[float, float, float]:
     """
     rate = dt / lag
     kept = math.exp(-rate)
-    if rate < 0.01:  # the differences below lose their digits
+    if rate < 0.01:  # the differences below would cancel
         return 1.0, math.exp(-rate / 2), kept
     first = (1 - kept) / rate
     second = (1 - first) / rate
@@ -56,7 +56,7 @@ def stage_shares(lag: float, dt: float) -> tuple[float, float, float]:
 
 
 def step_of(derivative: Derivative, x: State, inputs: Sequence[Any], dt: float) -> State:
-    """One RK4 step over dt [s] with these inputs at its start, middle and end."""
+    """Compute one RK4 step over dt [s] with these inputs at its start, middle and end."""
     evaluate = traced_once(derivative, x)
     term = diffrax.ODETerm(lambda t, x, _: evaluate(x, inputs[round(2 * float(t) / dt)]))
     return RK4().step(term, 0.0, dt, x, None, None, made_jump=False)[0]
@@ -108,7 +108,7 @@ def advance_with_jacobian(
 def condensed(
     model, x: Float[Array, "t 13"], before: Input, commands: Float[Array, "t 4"], lag: float, dt: float
 ) -> Float[Array, "t 13 t 4"]:
-    """∂(state at the end of each interval) / ∂(all commands); `before` are the initial rotor speeds."""
+    """Return ∂(state at the end of each interval) / ∂(all commands); `before` are the initial rotor speeds."""
     d, (t, m) = x.shape[1], commands.shape
     share, k = math.exp(-dt / lag) if lag else 0.0, np.arange(t)  # of the speeds that an interval keeps
     mixed = np.tril((1 - share) * share ** np.maximum(k[:, None] - k - 1, 0), -1).astype(x.dtype)

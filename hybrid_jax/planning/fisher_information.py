@@ -18,13 +18,13 @@ from hybrid_jax.vehicle import SENSOR_NOISE, STATE_SIZE
 
 
 class Information(NamedTuple):
-    """Sums over all windows, of errors over the noise's standard deviation; J = ∂x̂/∂θ_p."""
+    """Sums over all windows, with errors divided by the noise's standard deviation; J = ∂x̂/∂θ_p."""
 
     gram: Float[Array, "p p"]  # JᵀJ, the Gauss–Newton information if the first samples were exact
     noise: Float[Array, "p p"]  # the covariance of Jᵀ(x − x̂), with the noise of first samples and a past's disturbance
 
     def covariance(self, free: Bool[Array, " p"]) -> Float[Array, "p p"]:
-        """The covariance of the free parameters by least squares, infinite if not identifiable; zero for the others."""
+        """Return the least-squares covariance of the free parameters, infinite if not identifiable; else zero."""
         both = free & free[:, None]
         bread, told, _ = inverse(jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0))))
         return bread @ jnp.where(both, self.noise, 0.0) @ bread + jnp.diag(jnp.where(told, 0.0, jnp.inf))
@@ -40,11 +40,11 @@ def information_of(
     solver: Solver = None,
     past: DisturbanceModel | None = None,
 ) -> Information:
-    """Return the information in true states x every `dt` [s], cut into windows of `steps` intervals.
+    """Return the information of true states x, one every `dt` [s], cut into windows of `steps` intervals.
 
     Each window is a rollout from its first sample, whose noise acts on the whole window and on the previous one. Only
-    the first s states are measured; the others are unknown at the start of each window. The disturbance of which
-    `past` knows is as large as in its data, and forgotten within its time constants.
+    the first s states are measured; the others are unknown at the start of each window. The disturbance is as large as
+    in the data of `past`, and forgotten within its time constants.
     """
     count, measured = len(u) // steps, len(noise)
     starts, inputs = x[: count * steps : steps], u[: count * steps].reshape(count, steps, -1)
@@ -62,7 +62,7 @@ def information_of(
 
     # (n, t, s, p), (n, t, s, d) and (n, t, s, e)
     effects, of_start, disturbed = jax.vmap(one)(starts, inputs)
-    if as_field(field).hidden:  # what other hidden states could do as well tells nothing
+    if as_field(field).hidden:  # effects that hidden states can also have do not count
         other = of_start[..., measured:]
         back = inverses(jnp.einsum("ntdh,ntdk->nhk", other, other)).matrix
         effects = effects - jnp.einsum("ntdh,nhk,nsek,nsep->ntdp", other, back, other, effects)

@@ -122,7 +122,7 @@ class FlatOutputs(eqx.Module):
         return 4, self.harmonics, 2
 
     def unit(self) -> Float[np.ndarray, "4 harmonics 1"]:
-        """The amplitude that uses up the box, the tilt, or the thrust within the rotors' range."""
+        """Return the amplitudes that use up the box, the tilt, or the thrust within the rotors' range."""
         vehicle, bounds = self.vehicle, self.bounds
         least, most = (share * vehicle.max_rotor_speed for share in bounds.rotor_speed)
         thrust = vehicle.thrust_coefficient * (most**2 - least**2) / 2  # of each rotor, either way [N]
@@ -160,7 +160,7 @@ class FlatOutputs(eqx.Module):
         thrust = vehicle.mass * jnp.linalg.norm(lift, axis=1, keepdims=True)
         mixing = jnp.asarray(np.linalg.pinv(vehicle.mixer).T, lift.dtype)
         squares = jnp.concatenate([thrust, torque], axis=1) @ mixing
-        # Negative beyond the limits, so that a search finds back; and no infinite slope.
+        # Negative beyond the limits, so that a search can return, and without an infinite slope.
         return states, jnp.where(squares < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(jnp.abs(squares), 1.0))
 
     def _moving(self, coefficients: Coefficients, times: Float[np.ndarray, " n"]) -> list[Array]:

@@ -1,5 +1,6 @@
-"""D-optimal references or inputs within limits: the smallest confidence ellipsoid of the parameters (Fedorov, Theory of
-Optimal Experiments, 1972; Mehra, IEEE TAC 1974; as Fourier series Swevers et al. 1997).
+"""D-optimal references or inputs within limits, which minimise the confidence ellipsoid of the parameters.
+
+See Fedorov, Theory of Optimal Experiments, 1972; Mehra, IEEE TAC 1974; and for Fourier series Swevers et al. 1997.
 """
 
 import math
@@ -36,10 +37,10 @@ from hybrid_jax.runtime import FAST_COMPILE, entry
 from hybrid_jax.trajectories import windows_of
 from hybrid_jax.vehicle import STATE_SIZE
 
-SPARE = 0.98  # share of each limit that is used at most, as limits are looked at between samples only
-SHRUNK = 1 - np.arange(64) / 64  # factors on a series, the first of which that keeps the limits is taken
+SPARE = 0.98  # largest used share of each limit, since limits are checked at samples only
+SHRUNK = 1 - np.arange(64) / 64  # factors on a series; the first that satisfies the limits is used
 PENALTY = 30.0, 3000.0  # on the mean squared excess over a limit, at the first and at the last step
-TOLD_APART = 1e-5  # least eigenvalue of the scaled information, ten times its rounding in float32
+TOLD_APART = 1e-5  # smallest eigenvalue of the scaled information, ten times its rounding in float32
 RATE = 0.05  # of Adam, in units of the coefficients
 Starts = Float[Array, "s outputs harmonics 2"]
 
@@ -98,8 +99,8 @@ def excitation(
     the result satisfies them and is at least as informative as any start. Note that the standard errors are predicted
     for the plan, which the vehicle will not follow exactly.
 
-    Hidden states count as unmeasured, and unknown at the start of each window. Of a model from `fit_disturbance`, you
-    learn the parameters of its field, under a disturbance as large and as lasting as in its past.
+    Hidden states count as unmeasured, and unknown at the start of each window. For a model from `fit_disturbance`, the
+    parameters are those of its field, with a disturbance that is as large and lasts as long as in its data.
 
     Args:
         model: any field with a guess of its parameters: a multirotor with `FlightBounds`, another with `InputBounds`.
