@@ -1,8 +1,8 @@
 """Multi-process runs: initialisation, heartbeats, and results on every process.
 
-All processes run the same program on the same data and call these functions in the same order. Only results, and the
-decisions and files of process 0, are exchanged. Every function that communicates raises PeerLost if another process is
-lost; you can then run the same command again, with any number of processes, to continue from what process 0 has saved.
+All processes run the same program on the same data and call these functions in the same order. They exchange results,
+and the decisions and files of process 0. Every function that communicates raises PeerLost if another process is lost;
+you can then run the same command again, with any number of processes, to continue from what process 0 has saved.
 """
 
 import atexit
@@ -22,8 +22,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Sharding
 from jaxtyping import PyTree
 
-BEAT = 1.0  # s between two signs of life
-GRACE = 3.0  # s that what was sent before a loss may still take to arrive, or the news of who was lost
+BEAT = 1.0  # s between two heartbeats
+GRACE = 3.0  # s in which messages sent before a loss, or the news of it, may still arrive
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -35,12 +35,12 @@ class PeerLost(ConnectionError):
 class Peers:
     """Heartbeats between process 0 and all others; process 0 announces who is lost.
 
-    JAX itself aborts if a peer does not join, and waits forever for one that was stopped.
+    JAX itself aborts if a peer does not join, and waits forever for a stopped one.
     """
 
     def __init__(self, coordinator: str, processes: int, process: int, timeout: float):
         host, _, port = coordinator.rpartition(":")
-        self.lost = ""  # which process is lost and how, once there is one
+        self.lost = ""  # which process is lost and how, if any
         self._timeout, until = timeout, time.monotonic() + timeout
         self._links = (
             self._gather(int(port), processes, until) if process == 0 else self._join(host, int(port), process)
@@ -49,7 +49,7 @@ class Peers:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _gather(self, port: int, processes: int, until: float) -> dict[int, socket.socket]:
-        """The links to all others; PeerLost, on every process that joined, names those that did not."""
+        """Return links to all others; if some do not join, raise PeerLost with their names on every process."""
         links: dict[int, socket.socket] = {}
         with socket.create_server(("", port)) as door:
             while len(links) < processes - 1 and select.select([door], [], [], max(0.0, until - time.monotonic()))[0]:
@@ -57,7 +57,7 @@ class Peers:
                 link.settimeout(BEAT)
                 try:
                     links[int(link.recv(20))] = link
-                except (OSError, ValueError):  # a stranger
+                except (OSError, ValueError):  # not of this run
                     link.close()
         absent = [number for number in range(1, processes) if number not in links]
         news = f"process {', '.join(map(str, absent))} did not join within {self._timeout:g} s" if absent else ""
@@ -88,7 +88,7 @@ class Peers:
         next_beat = 0.0
         while not self.lost:
             if (now := time.monotonic()) >= next_beat:
-                self._tell(b"\n")
+                self._send(b"\n")
                 next_beat = now + BEAT
             for link in select.select(list(self._links.values()), [], [], BEAT / 5)[0]:
                 number = next(number for number, each in self._links.items() if each is link)
@@ -101,17 +101,17 @@ class Peers:
             for number, heard in self._heard.items():
                 if time.monotonic() - heard > self._timeout and not self.lost:
                     self.lost = f"process {number} has not answered for {self._timeout:g} s"
-        self._tell(f"{self.lost}\n".encode())
+        self._send(f"{self.lost}\n".encode())
 
-    def _tell(self, words: bytes) -> None:
+    def _send(self, words: bytes) -> None:
         for link in self._links.values():
             try:
                 link.sendall(words)
-            except OSError:  # the next `recv` says who that was
+            except OSError:  # the next `recv` finds who is lost
                 continue
 
     def waited_for(self, exchange: Callable[[], Any]) -> Any:
-        """The result of a call that waits for all others; PeerLost as soon as one of them is lost."""
+        """Return the result of a call that waits for all others; raise PeerLost as soon as one of them is lost."""
         found, done = dict[str, Any](), threading.Event()
 
         def run() -> None:
@@ -124,7 +124,7 @@ class Peers:
         threading.Thread(target=run, daemon=True).start()
         while not done.wait(BEAT / 5):
             if self.lost and not done.wait(GRACE):
-                atexit.register(os._exit, 2)  # the call that waits for ever would keep the process
+                atexit.register(os._exit, 2)  # the waiting call would keep the process alive
                 raise PeerLost(self.lost)
         if "error" in found:
             until = time.monotonic() + GRACE
@@ -134,7 +134,7 @@ class Peers:
         return found["result"]
 
 
-_known: list[Peers] = []  # of this run, where the coordinator was given
+_known: list[Peers] = []  # of this run, if the coordinator was given
 
 
 def initialize(
@@ -153,12 +153,12 @@ def initialize(
         coordinator: host:port of process 0.
         processes: the number of processes.
         process: the index of this one, from 0.
-        alike: JSON values by name that must agree between all processes, e.g. options and a digest of the source.
+        alike: JSON values by name that must agree between all processes, for example options.
         timeout: seconds after which a process that does not join or answer counts as lost.
 
     Raises:
-        ValueError: an argument is missing or inconsistent, or the processes differ in `alike`.
-        PeerLost: another process did not join.
+        ValueError: if an argument is missing or inconsistent, or the processes differ in `alike`.
+        PeerLost: if another process did not join.
     """
     jax.config.update("jax_enable_preemption_service", False)  # the host loop handles signals
     try:
@@ -171,10 +171,10 @@ def initialize(
         raise ValueError(f"coordinator, processes, process: {error}") from error
     except RuntimeError as error:
         raise PeerLost(f"the processes could not connect: {error}") from error
-    # XLA's connections are made here; afterwards the service that arranges them is not needed.
+    # This call makes XLA's connections; the coordination service is not needed afterwards.
     _require_alike({"devices": jax.local_device_count()} | dict(alike or {}))
     if jax.default_backend() == "cpu":
-        # The coordination service would abort this process before it can save; `Peers` reports a lost one.
+        # The service would abort this process before it can save; `Peers` reports lost processes instead.
         jax.distributed.shutdown()
 
 
@@ -190,19 +190,19 @@ def _require_alike(values: Mapping[str, Any]) -> None:
 
 
 def is_main_process() -> bool:
-    """Whether this is process 0, the only one that reads, writes and prints."""
+    """Return whether this is process 0, the only one that reads, writes and prints."""
     return jax.process_index() == 0
 
 
 def put(tree: PyTree, sharding: Sharding) -> PyTree:
-    """Global arrays; each process provides the part on its own devices."""
+    """Return global arrays; each process provides the part on its own devices."""
     if jax.process_count() == 1:
         return jax.device_put(tree, sharding)
     return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), tree)
 
 
 def collect(tree: PyTree) -> PyTree:
-    """Global arrays, split along their first axis, as host arrays on every process."""
+    """Return global arrays, split along their first axis, as host arrays on every process."""
     if jax.process_count() == 1:
         return jax.device_get(tree)
 
@@ -214,9 +214,9 @@ def collect(tree: PyTree) -> PyTree:
 
 
 def gather(tree: PyTree) -> PyTree:
-    """Host arrays of all processes, concatenated along the first axis on every process; shapes must agree."""
+    """Concatenate host arrays of all processes along the first axis, on every process; shapes must agree."""
     leaves, structure = jax.tree.flatten(tree)
-    # As one array of bytes: an exchange takes milliseconds whatever its size, and JAX would truncate 64-bit numbers.
+    # As one array of bytes: each exchange takes milliseconds at any size, and JAX would truncate 64-bit numbers.
     rows = [np.ascontiguousarray(leaf).ravel().view(np.uint8) for leaf in leaves]
     found = _exchange(lambda: multihost_utils.process_allgather(np.concatenate(rows)))
     parts = np.split(found, np.cumsum([len(row) for row in rows])[:-1], axis=1)
@@ -227,16 +227,16 @@ def gather(tree: PyTree) -> PyTree:
 
 
 def agreed(number: int) -> int:
-    """Process 0's number, on every process."""
+    """Return process 0's number on every process."""
     return int(gather(np.array([number]))[0]) if jax.process_count() > 1 else number
 
 
 def from_first(make: Callable[[], tuple[Any, Arrays]]) -> tuple[Any, Arrays]:
-    """The result of `make`, JSON values and named arrays, which only process 0 calls, on every process."""
+    """Call `make` on process 0, and return its result, JSON values and named arrays, on every process."""
     if jax.process_count() == 1:
         return make()
     message = np.frombuffer(_pack(*make()), np.uint8) if is_main_process() else np.zeros(0, np.uint8)
-    message = np.resize(message, agreed(len(message)))  # of the same shape everywhere; only that of process 0 counts
+    message = np.resize(message, agreed(len(message)))  # the same shape everywhere
     return _unpack(_exchange(lambda: multihost_utils.broadcast_one_to_all(message)))
 
 
@@ -254,7 +254,7 @@ def _unpack(message: np.ndarray) -> tuple[Any, Arrays]:
 
 
 def _exchange(call: Callable[[], Any]) -> Any:
-    """The result of a call that waits for all processes, or PeerLost."""
+    """Return the result of a call that waits for all processes; raise PeerLost if one is lost."""
     try:
         return _known[0].waited_for(call) if _known else call()
     except (RuntimeError, ValueError) as error:  # of the launch, or of a result that never arrived

@@ -20,7 +20,7 @@ from hybrid_jax.sweep import hosts
 
 Numbers = Sequence[Any] | np.ndarray
 AXIS = "lanes"
-WIDTH = {"cpu": 1}  # one lane fills the cache; on a GPU a chunk holds all lanes of a device
+WIDTH = {"cpu": 1}  # one lane fills the cache; on a GPU, a chunk contains all lanes of a device
 
 
 def stack(lanes: Sequence[PyTree]) -> PyTree:
@@ -47,7 +47,7 @@ def lane(lanes: PyTree, index: int | np.ndarray) -> PyTree:
         lanes: a tree whose arrays have a first axis over the lanes.
         index: the number of a lane, from 0, or an array of indices or booleans.
     """
-    # asarray: an entry of a NumPy vector is a scalar
+    # An entry of a NumPy vector is a scalar, hence asarray.
     return jax.tree.map(lambda leaf: np.asarray(leaf[index]) if eqx.is_array(leaf) else leaf, lanes)
 
 
@@ -56,7 +56,7 @@ def count(lanes: PyTree) -> int:
 
 
 def schedule(costs: Numbers, active: Numbers, devices: int, width: int, capacity: int) -> list[np.ndarray]:
-    """For each device its shard: active lanes, the most expensive chunk first, in at most `capacity` chunks."""
+    """Return the active lanes of each device, the most expensive chunk first, in at most `capacity` chunks."""
     ordered = sorted(active, key=lambda i: -costs[i])  # no lane of a chunk waits long for another
     shards: list[list[int]] = [[] for _ in range(devices)]
     loads = [(0.0, device) for device in range(devices)]  # a heap of the devices that can take more
@@ -69,7 +69,7 @@ def schedule(costs: Numbers, active: Numbers, devices: int, width: int, capacity
 
 
 def load_balance(shards: Sequence[np.ndarray], costs: Numbers, width: int) -> Float[np.ndarray, " n"]:
-    """For each scheduled lane, the work of the busiest device over the work of its own device; 0 for other lanes."""
+    """Return for each lane the work of the busiest device over the work of its own; 0 if it is not scheduled."""
     # A chunk takes as long as its most expensive lane, which is its first.
     loads, ratios = [sum(float(costs[i]) for i in shard[::width]) for shard in shards], np.zeros(len(costs))
     for shard, load in zip(shards, loads, strict=True):
@@ -102,7 +102,7 @@ class LaneMap:
         self._function, self._run = function, jit_with(compiler)(_on_mesh)
 
     def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
-        """The results of the active lanes, in the order of `active`, as host arrays."""
+        """Return the results of the active lanes, in the order of `active`, as host arrays."""
         shards, width, capacity = self.schedule(count(lanes), costs, active)
         places = np.stack([np.resize(np.concatenate([shard, [0]]), capacity * width) for shard in shards])
         chunks = np.array([-(-len(shard) // width) for shard in shards])
@@ -131,7 +131,7 @@ class LaneMap:
 
 
 def _on_mesh(function: Callable, width: int, devices: tuple, rest: PyTree, lanes, chunks, shared) -> PyTree:
-    """The results of each device's lanes on this device; `rest` contains the leaves that are not arrays."""
+    """Return the results of each device's lanes on this device; `rest` contains the leaves that are not arrays."""
     mesh, split, whole = Mesh(np.array(devices), (AXIS,)), PartitionSpec(AXIS), PartitionSpec()
 
     def share(lanes, chunks, shared):
@@ -143,10 +143,10 @@ def _on_mesh(function: Callable, width: int, devices: tuple, rest: PyTree, lanes
 
 
 def _loop(function, width: int, lanes: PyTree, chunks: Int[jax.Array, ""], shared: tuple) -> PyTree:
-    """The results of the first `chunks` chunks of this device's lanes, padded with zeros."""
+    """Return the results of the first `chunks` chunks of this device's lanes, padded with zeros."""
     arrays, rest = eqx.partition(lanes, eqx.is_array)
 
-    # jit: traced once, although eval_shape needs it too.
+    # With jit it is traced only once, although eval_shape needs it too.
     @partial(jax.jit, inline=True)
     def one(arrays, shared):
         return eqx.filter(function(eqx.combine(arrays, rest), *shared), eqx.is_array)

@@ -80,9 +80,9 @@ def sweep(
         on_block: a function that is called after each block with all states and the progress.
 
     Returns:
-        The stacked final states as host arrays. A lane whose loss was not finite has status DIVERGED and the best epoch
-        before it; it affects no other lane. A lane's place in a chunk, which it leaves when others stop, may change
-        its rounding.
+        The stacked final states as host arrays. A lane whose loss was not finite has status DIVERGED and its best epoch
+        before; it does not affect other lanes. Rounding may depend on a lane's place in a chunk, which can change when
+        others stop.
 
     Raises:
         ValueError: if data are invalid, n_train does not fit them, or a BatchNorm has minibatches of one window.
@@ -135,14 +135,14 @@ def evaluate(
 def evaluate_windows(
     fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
 ) -> tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes windows"]]:
-    """`evaluate`, and the error of each window, of which it is the mean."""
+    """Return `evaluate` and the error of each window, whose mean it is."""
     lanes = count(fields := jax.device_get(fields))
     errors = _evaluation(settings, every, max(lanes, min_lanes), _shapes(lane(fields, 0), windows))
     return errors(fields, (windows,), np.ones(lanes), range(lanes))
 
 
 def _padded(plans: RunConfig, shared: tuple[PyTree, PyTree], windows: int) -> tuple[RunConfig, tuple[PyTree, PyTree]]:
-    """Plans and training data, padded to a number of windows; no plan uses the padding."""
+    """Pad plans and training data to a number of windows; no plan uses the padding."""
     train, validation = shared
     subset = np.pad(plans.subset, ((0, 0), (0, max(0, windows - plans.subset.shape[-1]))))
     if len(train) < windows:
@@ -179,7 +179,6 @@ def _errors(
 
 
 def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:
-
     def put(old, new):
         old = np.array(old)
         old[active] = new

@@ -31,7 +31,7 @@ from hybrid_jax.trajectories import Trajectories, check_like, overflows
 
 WEIGHT = 1e-3  # λ, where none is given
 RATE = 1e-2
-BLOCK, BLOCK_SECONDS = 200, 0.5  # most epochs of a block, and how long it should take
+BLOCK, BLOCK_SECONDS = 200, 0.5  # maximum number of epochs of a block, and its duration
 
 Report = Callable[[int, FitState], object]
 Shared = tuple[PyTree, Settings, Optimiser]  # validation data as prepared by the objective, …
@@ -57,14 +57,14 @@ class FitResult(eqx.Module):
         best_mse: the validation loss of the best epoch.
         best_epoch: the best epoch, counted from 1; 0 for the initial field.
         field: the field after the last epoch.
-        epochs: how many were trained.
+        epochs: the number of trained epochs.
         status: how the run ended: OK if it stopped early, STALLED if no epoch was better than the first, RUNNING if you
             interrupted it.
         history: the losses of each epoch.
         state: the final state of the run.
-        discretisation: what half the solver's step would change. Without a network it is by how many standard errors a
-            parameter would move at most, else the change of the predictions over their errors. -1 if it was not
-            compared, as the run did not end well or the objective is not a `TrajectoryLoss`.
+        discretisation: the effect of half the solver's step: without a network, the largest change of a parameter in
+            standard errors, else the change of the predictions over their errors. -1 if it was not computed, because
+            the run diverged or the objective is not a `TrajectoryLoss`.
     """
 
     best: Learner
@@ -82,7 +82,7 @@ class FitInterrupted(KeyboardInterrupt):
     """Raised by Ctrl-C during `fit`; `result` has the run up to the last complete block of epochs."""
 
     def __init__(self, result: FitResult):
-        super().__init__(f"training was interrupted after epoch {result.epochs}; it is in `result` of this exception")
+        super().__init__(f"training was interrupted after epoch {result.epochs}; this exception has it as `result`")
         self.result = result
 
 
@@ -104,9 +104,8 @@ def fit(
 ) -> FitResult:
     """Train a field by gradient descent with early stopping. `result.best` is the field of the best epoch.
 
-    You get a warning if `discretisation` is above 0.5: a network then learns the error of the solver's steps.
-
-    If a network has no scaling of its inputs, the training windows determine one first; see `with_scaling`.
+    You get a warning if `discretisation` is above 0.5: a network then learns the error of the solver's steps. If a
+    network has no scaling of its inputs, it is computed from the training windows; see `with_scaling`.
 
     Args:
         field: the initial field, or another module that the objective in `settings` can evaluate.
@@ -138,7 +137,7 @@ def fit(
     try:
         each = jax.tree.leaves(jax.tree.broadcast(rates, eqx.filter(field, trainable(field))))
     except (TypeError, ValueError) as error:
-        expected = "a number, or a tree of them that begins as the field does"
+        expected = "a number, or a tree of numbers that is a prefix of the field"
         raise ValueError(f"rates must be {expected}, got {checks.short_repr(rates)}") from error
     plan = make_run_config(each, np.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
     field = ready(field, train)  # scaling changes the tree of the field, but not what is learned
@@ -149,7 +148,7 @@ def fit(
 def checked_arguments(
     field: Learner, train: Trajectories, validation: Trajectories, key, settings: Settings | None, optimiser, weight
 ) -> tuple[PyTree, Shared, float]:
-    """The training data, the settings of all stages, and λ: the checked arguments of `fit` with defaults."""
+    """Check the arguments of `fit`; return the training data, what all stages share, and λ."""
     checks.not_traced("fit", field, train, validation, key)
     settings = Settings() if settings is None else settings
     checks.instance("settings", settings, Settings)
@@ -170,7 +169,7 @@ def checked_arguments(
             text = "optimiser must need nothing but gradients and parameters"
             raise ValueError(f"{text}: {checks.first_line(error)}") from error
     if weight is not None and settings.regulariser is None and isinstance(settings.objective, TrajectoryLoss):
-        remedy = "leave it out, or take one of hybrid_jax.training.loss.REGULARISERS"
+        remedy = "leave it out, or use one of hybrid_jax.training.loss.REGULARISERS"
         given = checks.short_repr(weight)
         raise ValueError(f"regulariser_weight is {given} but settings.regulariser is None; {remedy}")
     shared = validated_on, settings, ADAM if optimiser is None else _negated(optimiser)
@@ -199,14 +198,14 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
 
 
 def ready(field: Learner, train: Trajectories) -> Learner:
-    """The field with its scaling and motion set; warns if you will need `like` to load it from a file."""
+    """Set the scaling and motion of a field; warn if you will need `like` to load it from a file."""
     if (reason := check_savable(field)) is not None:
         checks.warn(reason)
     return with_motion(with_scaling(field, train), train) if isinstance(field, AbstractVectorField) else field
 
 
 def compared(result: FitResult, data: PyTree, settings: Settings) -> FitResult:
-    """The result with its `discretisation`, of which it warns the user of an entry."""
+    """Add the `discretisation` to a result, and warn if it is too large."""
     loss = settings.objective
     if result.status == Status.DIVERGED or not (isinstance(loss, TrajectoryLoss) and isinstance(data, Trajectories)):
         return result
@@ -217,12 +216,12 @@ def compared(result: FitResult, data: PyTree, settings: Settings) -> FitResult:
 def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progress: Report | bool | None) -> FitResult:
     """Run to the end in blocks of epochs, with progress reports between them."""
     validated_on, settings, optimiser = shared
-    # Weakly typed numbers would come back typed, and the second block be compiled anew.
+    # Weakly typed numbers would return as typed ones, and the second block would compile again.
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype) if eqx.is_array(leaf) else leaf, state)
     losses, most, empty, interrupt = [np.zeros((0, 2))], 1, jnp.zeros((BLOCK, 2)), None
     if settings.objective == TrajectoryLoss() and any(map(overflows, (data, validated_on))):
-        state = replace(state, status=jnp.full_like(state.status, Status.DIVERGED))  # nothing need be compiled
-    # The default is not an argument: an optimiser holds closures, with which a program is not kept.
+        state = replace(state, status=jnp.full_like(state.status, Status.DIVERGED))  # without compiling
+    # The default is not an argument: programs with an optimiser's closures are not cached.
     chosen = {} if optimiser is fitting.ADAM else {"optimiser": optimiser}
     train = _train_by_kernels if compiler_options(state.field, data, settings) else _train
     with _reporting(progress, int(plan.max_epochs)) as report, solver_errors(settings.solver):
@@ -249,7 +248,7 @@ _train, _train_by_kernels = jit_by_size()(fitting.run), jit_by_size(FAST_COMPILE
 
 @cache  # the same object for the same optimiser, so that its program is compiled once
 def _negated(optimiser: Optimiser) -> Optimiser:
-    """The optimiser with updates to be subtracted, as in `fitting`, rather than added."""
+    """Negate the updates of an optimiser, since `fitting` subtracts them."""
     return optax.chain(optimiser, optax.scale(-1.0))
 
 

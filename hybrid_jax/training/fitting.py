@@ -21,7 +21,7 @@ class RunConfig(eqx.Module):
 
     rates: PyTree  # a tree prefix of the field: one number, or e.g. `Hybrid(1e-2, 1e-4)`
     subset: Int[Array, " n"]  # indices of the training windows that the run may use
-    n_train: Int[Array, ""]  # it uses so many, the first of the subset
+    n_train: Int[Array, ""]  # number of windows that it uses, the first of the subset
     min_epochs: Int[Array, ""]
     patience: Int[Array, ""]
     max_epochs: Int[Array, ""]
@@ -44,7 +44,7 @@ class FitState(eqx.Module):
 
 
 def start(field: Learner, key: PRNGKeyArray, optimiser: Optimiser = ADAM) -> FitState:
-    """A run at epoch 0. The key sets the order of the minibatches."""
+    """Return a run at epoch 0. The key determines the order of the minibatches."""
     zero, infinity = jnp.zeros((), jnp.int32), jnp.array(jnp.inf)
     adam = optimiser.init(eqx.filter(field, trainable(field)))
     key = jax.random.key_data(key)  # an ordinary array: it can be stacked, moved to the host and saved
@@ -63,7 +63,7 @@ def run(
 ) -> tuple[FitState, Float[Array, "e 2"] | None]:
     """Continue until the run has stopped or has completed `until` epochs; `losses` is filled from its start."""
     first = state.epoch
-    # A user's field may hold leaves that are not arrays (an activation function). A loop carries arrays only.
+    # A loop carries only arrays, but a field may have other leaves, for example an activation function.
     arrays, rest = eqx.partition(state, eqx.is_array)
 
     def is_running(carry) -> Bool[Array, ""]:
@@ -85,7 +85,7 @@ def run(
 def _epoch(
     state: FitState, plan: RunConfig, train: PyTree, validation: PyTree, settings: Settings, optimiser: Optimiser
 ) -> tuple[FitState, Float[Array, ""]]:
-    """One pass over the shuffled training windows, then a validation; returns the validation loss too."""
+    """Train once on the shuffled windows, then validate; also return the validation loss."""
     key, order_key = jax.random.split(state.key)
     order, size = _shuffled(plan, order_key), settings.batch_size
     batches = plan.n_train // size
@@ -107,7 +107,7 @@ def _epoch(
 def gradient_step(
     field: Learner, adam: PyTree, plan: RunConfig, picked: PyTree, settings: Settings, optimiser: Optimiser = ADAM
 ) -> tuple[Learner, PyTree, Float[Array, ""]]:
-    """One optimiser step on one minibatch, which also updates the running statistics."""
+    """Take one optimiser step on a minibatch, and update the running statistics."""
     parameters, rest = eqx.partition(field, trainable(field))
     # Gathered once: without the barrier the gather is fused into, and repeated by, everything that reads the minibatch.
     batch = jax.lax.optimization_barrier(settings.objective.batch(picked, settings))
@@ -127,7 +127,7 @@ def gradient_step(
 
 
 def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> RunConfig:
-    """A configuration with every number as an array, as `vmap` needs; ValueError if one is out of range."""
+    """Return a configuration with arrays instead of numbers, as `vmap` needs; ValueError if one is out of range."""
     for rate in jax.tree.leaves(rates):
         checks.not_negative("rates", rate)
     counts = {"n_train": n_train, "min_epochs": min_epochs, "patience": patience, "max_epochs": max_epochs}
@@ -140,7 +140,7 @@ def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, re
 
 
 def _shuffled(plan: RunConfig, key: PRNGKeyArray) -> Int[Array, " n"]:
-    """The first n_train windows of the subset in random order, then the rest."""
+    """Return the first n_train windows of the subset in random order, then the rest."""
     listed, few = plan.subset.shape[0], plan.subset.shape[0] // SHORTCUT
 
     def among(first: int) -> Int[Array, " n"]:

@@ -1,7 +1,7 @@
 """Damped Gauss–Newton for all parameters of a field, network and physics, to a precision that Adam does not reach.
 
-A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the column norms of J, in
-double precision: squaring J in float32 would lose the least sensitive directions.
+A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the column norms of J, in double precision:
+squaring J in float32 would lose the least sensitive directions.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ class GaussNewtonFit(eqx.Module):
         loss: its loss, L_MSE on the windows plus λ times the penalty.
         steps: the number of points that were tried.
         status: how the fit ended: OK if it stopped before `max_steps`, at a finite loss.
-        discretisation: what half the solver's step would change, as in `FitResult`; you get a warning above 0.5.
+        discretisation: the effect of half the solver's step, as in `FitResult`; you get a warning above 0.5.
     """
 
     field: AbstractVectorField
@@ -54,20 +54,20 @@ class GaussNewtonFit(eqx.Module):
 
 
 def residual_norm(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """f_d along the predicted trajectory, whose mean square is `loss.residual_norm` (Yin et al. 2021)."""
+    """Return f_d along the predicted trajectory, whose mean square is `loss.residual_norm` (Yin et al. 2021)."""
     x, u = jnp.concatenate([window.x0[None], predicted[:-1]]), window.u
     parts = jax.vmap(lambda x, u: field.residual(field.read(x), u))(x, jnp.asarray(u))
     return parts.ravel() / len(u) ** 0.5
 
 
 def trajectory_correlation(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """Its square is `loss.trajectory_correlation` (Osaka et al. 2025, Eq. 7)."""
+    """Return a vector whose square is `loss.trajectory_correlation` (Osaka et al. 2025, Eq. 7)."""
     physics = integrate(field.physics, jnp.asarray(window.x0), jnp.asarray(window.u), window.dt, solver)
     return correlation_rows(*(y.ravel()[:, None] for y in (physics, predicted))).ravel()
 
 
 def neighbour_weights(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """The weights of a `GridNetwork` for all points except the centre: zero for a reaction, and not for diffusion."""
+    """Return the weights of a `GridNetwork` for all points except the centre, which are zero for a reaction."""
     networks = (part for part in parts_of(field) if isinstance(part, GridNetwork))
     return jnp.concatenate([jnp.zeros(0), *(network.neighbour_weights().ravel() for network in networks)])
 
@@ -90,15 +90,15 @@ def fit_gauss_newton(
 ) -> GaussNewtonFit:
     """Fit all parameters of a field by Gauss–Newton: minimise L_MSE + λ L_reg. Running statistics do not change.
 
-    You should use it for up to a thousand parameters, and few data with little noise: there is no early stopping.
+    You should use it for up to a thousand parameters, and for few data with little noise: there is no early stopping.
 
     Args:
         field: the initial field.
-        windows: the data, all of which are used in each step. They scale a network without a scaling, as in `fit`.
+        windows: the data, all of which are used in each step. They scale a network that has no scaling, as in `fit`.
         penalty: L_reg of a `Hybrid`: "residual_norm" or "trajectory_correlation" of `training.loss`, or
             "neighbour_weights", the squared weights of a `GridNetwork` for all points except the centre.
         weight: λ, the weight of the penalty.
-        max_steps: the largest number of points to try.
+        max_steps: the maximum number of points to try.
         solver: the integrator, by default `RK4`.
         scale: a divisor for the error of each state, as in `fit_least_squares`.
 
@@ -135,7 +135,7 @@ def fit_gauss_newton(
 
 
 class _Problem(eqx.Module):
-    """r(θ) of one window, such that the loss is the mean over windows of ‖r‖²."""
+    """The residuals r(θ) of one window; the loss is the mean of ‖r‖² over windows."""
 
     source: AbstractVectorField
     weight: Float[Array, ""]
@@ -215,7 +215,7 @@ def _normal_equations(
 def with_sensitivities(
     field: AbstractVectorField, x0: Float[Array, " d"], u: Float[Array, "t m"], dt: float, solver: Solver
 ) -> tuple[Float[Array, "t d"], Float[Array, "t d p"]]:
-    """The states of `integrate`, and their derivatives with respect to each learned number, in the order of leaves.
+    """Return the states of `integrate` and their derivatives with respect to each learned number, in leaf order.
 
     The derivative of an explicit Runge–Kutta method is the same method on ẋ = f(x, θ), Ṡ = ∂f/∂x S + ∂f/∂θ: internal
     numerical differentiation (Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", 1981).

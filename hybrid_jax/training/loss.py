@@ -37,11 +37,11 @@ Regulariser = Callable[[Hybrid, Minibatch, Float[Array, "t d b"]], Float[Array, 
 def rollout_minibatch(
     field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver
 ) -> Float[Array, "t d b"]:
-    """The trajectories of a minibatch in training mode, features first: batch normalisation sees all windows."""
+    """Predict a minibatch in training mode, features first, so that batch normalisation uses all windows."""
     if (states := kernels.trained(field, x0, u, dt, solver)) is not None:
         return states
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    # Implicit and coupled: one system of equations.
+    # With batch normalisation, an implicit solver solves one system of equations for all windows.
     if batch_norms(field) if implicit else as_field(field).features_first:
         return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver)
     alone = training_mode(field)  # samples first: transposing in each evaluation costs up to half the step
@@ -53,43 +53,43 @@ def rollout_minibatch(
 
 
 def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):
-    """The states and inputs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
+    """Return the states and inputs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
     starts = jnp.concatenate([x0[None], x[:-1]])
     return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], a.shape[0] * a.shape[2]) for a in (starts, u))
 
 
 def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
-    """1 − ⟨ŷ_p, ŷ⟩ / (‖ŷ_p‖ ‖ŷ‖), with ŷ_p the trajectory without f_d (paper, Eq. 7); mean over trajectories."""
+    """Return the mean of 1 − ⟨ŷ_p, ŷ⟩ / (‖ŷ_p‖ ‖ŷ‖), with ŷ_p the trajectory without f_d (paper, Eq. 7)."""
     physics = rollout_minibatch(field.physics, batch.x0, batch.u, batch.dt, batch.solver)
     rows = correlation_rows(*(y.reshape(-1, y.shape[-1]) for y in (physics, predicted)))
     return jnp.mean(jnp.sum(jnp.square(rows), axis=0))
 
 
 def correlation_rows(physics: Float[Array, "r b"], predicted: Float[Array, "r b"]) -> Float[Array, "r b"]:
-    """(ŷ_p / ‖ŷ_p‖ − ŷ / ‖ŷ‖) / √2, whose square is 1 − ⟨ŷ_p, ŷ⟩ / (‖ŷ_p‖ ‖ŷ‖), without cancellation in float32."""
+    """Return (ŷ_p/‖ŷ_p‖ − ŷ/‖ŷ‖)/√2, whose square is 1 − ⟨ŷ_p, ŷ⟩/(‖ŷ_p‖ ‖ŷ‖), without cancellation in float32."""
     return (_unit(physics) - _unit(predicted)) / 2**0.5
 
 
 def inner_product(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
-    """⟨f_p, f_d⟩² along the predicted trajectories, mean over samples: zero where they are orthogonal."""
+    """Return the mean of ⟨f_p, f_d⟩² over samples of the predicted trajectories: zero if they are orthogonal."""
     physics, residual = _parts(field, batch, predicted)
     return jnp.mean(jnp.square(jnp.sum(physics * residual, axis=0)))
 
 
 def cosine(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
-    """cos² of the angle between f_p and f_d along the predicted trajectories, mean over samples."""
+    """Return the mean cos² of the angle between f_p and f_d over samples of the predicted trajectories."""
     physics, residual = _parts(field, batch, predicted)
     return jnp.mean(jnp.square(jnp.sum(_unit(physics) * _unit(residual), axis=0)))
 
 
 def pearson(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
-    """Squared Pearson correlation, over samples, of f_p and f_d, mean over the d derivatives."""
+    """Return the squared Pearson correlation of f_p and f_d over samples, averaged over the d derivatives."""
     a, b = (_unit((part - jnp.mean(part, axis=1, keepdims=True)).T) for part in _parts(field, batch, predicted))
     return jnp.mean(jnp.square(jnp.sum(a * b, axis=0)))
 
 
 def residual_norm(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
-    """‖f_d‖² along the predicted trajectories, mean over samples (APHYNITY; Yin et al. 2021)."""
+    """Return the mean of ‖f_d‖² over samples of the predicted trajectories (APHYNITY; Yin et al. 2021)."""
     return jnp.mean(jnp.sum(jnp.square(_parts(field, batch, predicted)[1]), axis=0))
 
 

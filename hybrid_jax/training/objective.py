@@ -19,7 +19,7 @@ from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training.loss import Minibatch, Regulariser, along, rollout_minibatch
 from hybrid_jax.trajectories import Trajectories, check, errors_of, last_measured
 
-FLOOR = 1e-3  # least scale of a state over its size: one that hardly changes must not outweigh the others
+FLOOR = 1e-3  # smallest scale of a state over its size: one that hardly changes must not outweigh the others
 
 Learner = Any  # an Equinox module: a vector field, or anything that the objective can evaluate
 
@@ -83,7 +83,7 @@ class Objective(Protocol):
 
 @dataclass(frozen=True)
 class TrajectoryLoss(Objective):
-    """The default loss (paper, Eq. 6): L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², averaged over windows; λ L_reg in training.
+    """The default loss (paper, Eq. 6): L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², averaged over windows; + λ L_reg in training.
 
     Attributes:
         scale: the error of each state (d) that counts as 1, in its unit, infinite for a state that does not count; by
@@ -104,7 +104,7 @@ class TrajectoryLoss(Objective):
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
         size = check(windows, name, missing=True).x.shape[-1]
         if self.scale is not None and size != len(self.scale):
-            raise ValueError(f"{name}: states of {len(self.scale)} numbers expected, as scale has, got {size}")
+            raise ValueError(f"{name}: states of {len(self.scale)} numbers expected, like scale, got {size}")
         return windows
 
     def batch(self, picked: Trajectories, settings: "Settings") -> Minibatch:
@@ -123,7 +123,7 @@ class TrajectoryLoss(Objective):
 
     def divisor(self) -> Float[Array, " d"] | None:
         """Return `scale` as an array, in the current precision."""
-        # By NumPy first: JAX would compile a program that converts it.
+        # By NumPy first, since JAX would compile a program for the conversion.
         return None if self.scale is None else jnp.asarray(np.asarray(self.scale, jnp.result_type(float)))
 
     def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
@@ -134,7 +134,7 @@ class TrajectoryLoss(Objective):
 
 
 def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> TrajectoryLoss:
-    """A loss relative to the RMS change over a window of each quantity in the field's state space."""
+    """Return a loss relative to the RMS change over a window of each quantity in the field's state space."""
     x0, end = np.asarray(windows.x0, float), last_measured(windows)[:, -1].astype(float)
 
     def rms(vectors: Float[np.ndarray, "n k"]) -> float:
@@ -189,7 +189,7 @@ def check_minibatch(field: Learner, settings: Settings) -> None:
 
 
 def compiler_options(field: Learner, data: PyTree, settings: Settings) -> dict[str, bool | int]:
-    """XLA options of a training program: the fast ones if kernels do most of the work."""
+    """Return XLA options for a training program: faster compilation if kernels do most of the work."""
     if not isinstance(data, Trajectories):
         return {}
     x0, u = (jax.ShapeDtypeStruct((settings.batch_size, *a.shape[1:]), a.dtype) for a in (data.x0, data.u))

@@ -22,8 +22,8 @@ from hybrid_jax.trajectories import Trajectories
 class Stage:
     """One training run, with the learning rate of each group of parameters.
 
-    A group has the beginning of its path in the field as its name, for example "physics", "residual/weight_out" or
-    "physics/deviations/drag"; "" is the whole field. The longest name that matches counts. Other parameters are frozen.
+    The name of a group is the beginning of its path in the field, for example "physics", "residual/weight_out" or
+    "physics/deviations/drag"; "" is the whole field. The longest matching name counts. Other parameters are frozen.
 
     Attributes:
         rates: the learning rate of each group, by its name.
@@ -69,7 +69,7 @@ def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
 
 
 def cut(windows: Trajectories, steps: int | None) -> Trajectories:
-    """The first `steps` intervals of each window, or all; ValueError if there are fewer."""
+    """Return the first `steps` intervals of each window, or all; ValueError if there are fewer."""
     if steps is None:
         return windows
     if steps > windows.horizon:
@@ -77,13 +77,11 @@ def cut(windows: Trajectories, steps: int | None) -> Trajectories:
     return Trajectories(windows.x0, windows.u[..., :steps, :], windows.x[..., :steps, :], windows.dt)
 
 
-def judged(state: FitState, validation: PyTree, settings: Settings) -> FitState:
-    """The initial run with the validation loss of its field, which is `best` until an epoch is better."""
+@eqx.filter_jit
+def _judged(state: FitState, validation: PyTree, settings: Settings) -> FitState:
+    """Return the initial run with the validation loss of its field, which is `best` until an epoch is better."""
     error = settings.objective.validate(state.field, validation, settings)
     return replace(state, best_mse=jnp.asarray(error, state.best_mse.dtype))
-
-
-_judged = eqx.filter_jit(judged)
 
 
 @entry
@@ -99,16 +97,16 @@ def fit_in_stages(
     settings: Settings | None = None,
     progress: Report | bool | None = None,
 ) -> list[FitResult]:
-    """Train a field in stages, each from the best field of the stage before. `results[-1].best` is the trained field.
+    """Train a field in stages, each from the best field of the previous one. `results[-1].best` is the trained field.
 
-    Each stage is validated on whole windows, and kept only if it made the field better there.
+    Each stage is validated on whole windows, and kept only if it improved the field.
 
     Args:
         field: the initial field.
-        train: the training windows, of which each stage may use a shorter beginning.
+        train: the training windows; a stage may use only the beginning of each.
         validation: windows that determine the best epoch and the early stopping of each stage.
         key: random key for shuffling minibatches.
-        stages: the stages, in their order.
+        stages: the stages, in order.
         optimiser: any Optax optimiser instead of Adam. The rates of a stage then multiply its updates.
         regulariser_weight: λ, by default 1e-3.
         settings: settings of all stages, with defaults as in `fit`.

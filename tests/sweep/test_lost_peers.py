@@ -56,7 +56,7 @@ def test_who_never_comes_is_named_by_all():
 def test_who_is_killed_or_stopped_is_named_by_the_others(victim, killed, how):
     all_of_them = meet(0, 1, 2)
     lost = all_of_them.pop(victim)
-    lost._tell = lambda words: None  # of a process that was stopped, nothing is heard
+    lost._send = lambda words: None  # of a process that was stopped, nothing is heard
     for link in lost._links.values() if killed else ():
         link.shutdown(socket.SHUT_RDWR)
     for other in all_of_them:
