@@ -63,11 +63,7 @@ def discretisation(
 
 
 def compare_steps(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    solver: Solver,
-    scale: Scale,
-    named: bool | None = None,
+    field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, named: bool | None = None
 ) -> float:
     """Return the `discretisation` of a field, by default of all that it learns, and warn if the step is too long."""
     named = is_named(field) if named is None else named
