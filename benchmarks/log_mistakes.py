@@ -10,13 +10,15 @@ slowest signal and while it flies, against the nearest vehicle.toml above the lo
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import jax
 import numpy as np
 import tyro
 
-from hybrid_jax.cli.command import exit_codes
+from hybrid_jax.cli.command import exit_codes, parsed
 from hybrid_jax.flights import FlightLog, Recording, check_recording, find_logs, read_recording
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
 from hybrid_jax.flights.checks.cleaning import in_flight
@@ -228,13 +230,12 @@ def count_alarms(folder: Path) -> int:
     return alarms
 
 
-def main(folders: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
-    """Count the checks that fail on sound logs; without a folder, plant mistakes in simulated flights and name them.
+@dataclass(frozen=True)
+class Options:
+    """Count the checks that fail on sound logs; without a folder, plant mistakes in simulated flights and name them."""
 
-    Args:
-        folders: logs, also in folders below, in which nothing is wrong.
-    """
-    return int(sum(map(count_alarms, folders)) > 0) if folders else matrix()
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Logs, also in folders below, in which nothing is wrong."""
 
 
 def matrix() -> int:
@@ -260,4 +261,5 @@ def matrix() -> int:
 
 if __name__ == "__main__":
     with exit_codes("benchmarks.log_mistakes", "", "interrupted"):
-        raise SystemExit(tyro.cli(main, prog="python -m benchmarks.log_mistakes"))
+        given = parsed(Options, "python -m benchmarks.log_mistakes", None).folders
+        sys.exit(int(sum(map(count_alarms, given)) > 0) if given else matrix())

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
@@ -25,12 +25,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from hybrid_jax import checks
+from hybrid_jax.cli.command import exit_codes, parsed
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import json_text, write_atomic
 from hybrid_jax.runtime import PROGRAMS, configure, cores, hardware
 
 Call = Callable[[], Any]
-DISAGREEMENT, BAD_INPUT = 1, 2  # exit codes
+DISAGREEMENT = 1  # exit code
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax")
 
 
@@ -42,9 +43,9 @@ class Disagreement(RuntimeError):
 class Options:
     """Measure one benchmark."""
 
-    preset: str = "full"
-    """full: the reported numbers. smoke: a functional check in seconds; its numbers mean nothing."""
-    out: Path | None = None
+    preset: Literal["full", "smoke"] = "full"
+    """The reported numbers, or a functional check in seconds whose numbers mean nothing."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Also write the numbers to this file as JSON."""
 
 
@@ -147,27 +148,27 @@ def run(
 
     Options of a kind beyond `Options` go to `measure` by name.
     """
-    options = tyro.cli(kind, prog=f"python -m benchmarks.{name}", description=about)
-    try:
-        if options.preset not in presets:
-            raise ValueError(f"--preset must be one of {', '.join(presets)}, got {options.preset!r}")
-        check_file("--out", options.out)
-    except ValueError as error:
-        _end(name, error, BAD_INPUT)
+    with exit_codes(name, name, "interrupted, nothing was written"):
+        _run(name, parsed(kind, f"python -m benchmarks.{name}", None, description=about or ""), presets, measure)
+
+
+def _run(name: str, options: Any, presets: Mapping[str, Any], measure: Callable[..., Findings]) -> None:
+    check_file("--output", options.output)
     began = time.perf_counter()
     # An empty cache, so that timed compilations are real.
     os.environ.pop(PROGRAMS, None)
     with TemporaryDirectory() as cache:
         configure(Path(cache))
         try:
-            more = {key: value for key, value in vars(options).items() if key not in ("preset", "out")}
+            more = {key: value for key, value in vars(options).items() if key not in ("preset", "output")}
             findings = measure(presets[options.preset], **more)
         except Disagreement as error:
-            _end(name, error, DISAGREEMENT)
+            print(f"{name}: {error}", file=sys.stderr)
+            sys.exit(DISAGREEMENT)
     seconds, console = time.perf_counter() - began, Console()
     for printed in [*findings.tables, *([ratio_table(findings.ratios)] if findings.ratios else [])]:
         console.print(printed)
-    if options.out is None:
+    if options.output is None:
         return
     report = {
         "benchmark": name,
@@ -182,7 +183,7 @@ def run(
         "rows": findings.rows,
         "ratios": [asdict(ratio) | {"holds": ratio.holds} for ratio in findings.ratios],
     }
-    write_atomic(options.out, json_text(report))
+    write_atomic(options.output, json_text(report))
 
 
 def check_file(option: str, file: Path | None) -> None:
@@ -193,11 +194,6 @@ def check_file(option: str, file: Path | None) -> None:
     if file.is_dir():
         raise ValueError(f"{option} {file}: is a folder, a file is needed")
     checks.writable_folder(option, file.parent)
-
-
-def _end(name: str, error: Exception, code: int):
-    print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
-    sys.exit(code)
 
 
 def table(title: str, rows: Sequence[Any], columns: Mapping[str, Callable[[Any], str]]) -> Table:

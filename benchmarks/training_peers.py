@@ -62,7 +62,8 @@ class PeerOptions(Options):
     """Measure a gradient step of one model."""
 
     model: Literal["paper", "vehicle", "pendulum", "car", "pde"] = "paper"
-    """paper: rigid body, 64 units, batch norm. vehicle: with drag, 32 tanh units, no norm. Others: JAX alone."""
+    """Model to train. paper: rigid body, 64 units, batch norm. vehicle: with drag, 32 tanh units, no norm. Others: JAX
+    only."""
     most_seconds: int = 900
     """A rival that takes more processor time to compile is skipped."""
 

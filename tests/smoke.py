@@ -59,7 +59,7 @@ def experiments(group: str, *names: str, folder: Path, options: Sequence[str] = 
 def benchmark(name: str, folder: Path) -> tuple[Run, dict[str, Any]]:
     """A benchmark's output and its report: run now in the folder, or copied there from .ci/run."""
     if LEFT is None:
-        run = python(f"benchmarks.{name}", "--preset", "smoke", "--out", str(folder / f"{name}.json"))
+        run = python(f"benchmarks.{name}", "--preset", "smoke", "--output", str(folder / f"{name}.json"))
         assert run.returncode == 0, run.stderr
     else:
         shutil.copytree(Path(LEFT) / "benchmarks", folder, dirs_exist_ok=True)

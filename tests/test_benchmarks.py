@@ -14,7 +14,10 @@ from benchmarks.training_peers import BY_HAND, COMPILED, TORCHDIFFEQ
 
 @pytest.mark.parametrize(
     ("options", "complaint"),
-    [(["--out", "file/a.json"], "--out file: cannot be written"), (["--preset", "huge"], "--preset must be one of")],
+    [
+        (["--output", "file/a.json"], "--output file: cannot be written"),
+        (["--preset", "huge"], "--preset must be one of"),
+    ],
 )
 def test_bad_input_is_refused_in_one_line_before_measuring(options, complaint, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("kept")

@@ -16,8 +16,8 @@ THREE: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
 class ClosedLoopConfig(AllModels):
     """Fly a model predictive controller with each model, before and after adaptation.
 
-    Training is that of param_shift and external_force (their stages in --cache are reused). Models that adapt use the
-    smallest and the largest of --n-target; models that do not adapt also fly the unchanged vehicle.
+    Models are trained as in param_shift and external_force, whose stages in --cache are reused. Models that adapt use
+    the smallest and the largest of --n-target; models that do not adapt also fly the unchanged vehicle.
     """
 
     seconds: Positive = 10.0

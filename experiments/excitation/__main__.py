@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -51,6 +51,11 @@ NAME = "excitation"
 DT, STEPS = random_flight.DT, 10  # s, and samples of a window of 0.1 s
 BLOCKS = 10  # clusters of the covariance: a second each, as windows of one flight are correlated
 Parameter = Literal["Ix", "Iy", "k"]
+CASES = {"nothing": SOURCE} | {domain.name: domain for domain in CHANGES}
+if TYPE_CHECKING:
+    Change = str
+else:
+    Change = Literal[tuple(CASES)]
 HEAD = """\
 Which ten seconds of flight determine the parameters best? `hj.excitation` designs a reference for the vehicle of the
 data sheet, inside a box, D-optimal for Ix, Iy and k while an unknown constant force and torque are fitted too. The
@@ -70,13 +75,13 @@ class ExcitationConfig(Run):
 
     seconds: Positive = 10.0
     """Length of each flight [s]."""
-    change: str = "parameter_shift"
-    """The change before the flight: source (nothing) or a change of `experiments.changes`."""
+    change: Change = "parameter_shift"
+    """The change before the flight."""
     parameters: Annotated[tuple[Parameter, ...], Named(name="learn")] = get_args(Parameter)
     """Parameters to identify."""
     noise: NotNegative = 1.0
     """Sensor noise; 1 is typical."""
-    bounds: FlightBounds = field(default_factory=FlightBounds)
+    bounds: Annotated[FlightBounds, Named(name="")] = field(default_factory=FlightBounds)
     """The box of the designed flight."""
     speed: Annotated[Positive, Named(name="figure-eight-speed")] = 3.5
     """Top speed of the figure-8 [m/s]."""
@@ -90,15 +95,12 @@ class ExcitationConfig(Run):
     def __post_init__(self):
         Run.__post_init__(self)
         distinct("--learn", self.parameters)
-        if self.change not in CASES:
-            raise ValueError(f"--change must be one of {', '.join(CASES)}, got {self.change}")
         if not self.noise:
             raise ValueError("--noise must be above 0: without noise there are no intervals to compare")
         if not 3 <= self.seconds <= random_flight.SECONDS:
             raise ValueError(f"--seconds must be from 3 to {random_flight.SECONDS:g}, got {self.seconds}")
 
 
-CASES = {domain.name: domain for domain in (SOURCE, *CHANGES)}
 PRESETS = {
     "paper": ExcitationConfig(),
     "quick": ExcitationConfig(preset="quick", seeds=5, starts=2, steps=100),

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, get_args
 
-from experiments.runner.options import Count, Run, Target, distinct
+from experiments.runner.options import Count, Named, Run, Target, distinct
 
 
 class Case(NamedTuple):
@@ -50,7 +50,7 @@ class Config(Run):
     Flows."""
     cases: tuple[CaseName, ...] = tuple(case.name for case in CASES)
     """Lines of the table of forecasts."""
-    shifts: tuple[Shift, ...] = get_args(Shift)
+    shifts: Annotated[tuple[Shift, ...], Named(name="changes")] = get_args(Shift)
     """parameter_shift: a × 2, b ÷ 2, k × 2. new_term: u_t has a term that is not in the source."""
     sizes: Annotated[tuple[Count, ...], Target] = (1, 2, 4, 8)
     """Trajectories to adapt to."""
@@ -73,8 +73,9 @@ class Config(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        for option in ("parts", "cases", "shifts", "sizes"):
-            distinct(f"--{option}", getattr(self, option))
+        for option, chosen in (("parts", self.parts), ("cases", self.cases), ("changes", self.shifts)):
+            distinct(f"--{option}", chosen)
+        distinct("--n-target", self.sizes)
         if self.sizes != tuple(sorted(self.sizes)):
             raise ValueError(f"--n-target must be in ascending order, got {self.sizes}")
         if self.points < 8:

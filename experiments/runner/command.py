@@ -103,9 +103,7 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
     if chosen not in presets:
         raise ValueError(f"--preset must be one of {', '.join(presets)}, got {chosen!r}")
     kind = type(presets[chosen])
-    description = "\n\n".join(
-        [about, *(cleandoc(each.__doc__ or "") for each in kind.__mro__ if issubclass(each, Run))]
-    )
+    description = "\n\n".join([about, *(cleandoc(each.__doc__ or "") for each in (kind, Run))])
     return parsed(kind, _program(name), arguments, presets[chosen], description, COMMON)
 
 

@@ -51,7 +51,7 @@ class Run:
     """Results are written to --out. Flights and finished stages are kept in --cache and reused by later runs."""
 
     preset: Literal["paper", "quick", "smoke"] = "paper"
-    """Protocol: of the paper, with less of everything, or only to show that it works."""
+    """How much to run. paper: all. quick: less. smoke: a check that the program works; its numbers mean nothing."""
     out: Path = Path("runs")
     """Folder of reports, in which one named after the experiment is created."""
     cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))

@@ -4,10 +4,11 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
+import tyro
 from jaxtyping import PRNGKeyArray
 
 import hybrid_jax as hj
@@ -83,6 +84,9 @@ class WorldsConfig(OneFlight):
     without these terms and the network at once, as in the paper."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
     """How a log samples them: means over each interval, or values at its start."""
+    test: Annotated[int, tyro.conf.Suppress] = 1000  # this and the next two have no effect here: a world flies itself
+    pool: Annotated[int | None, tyro.conf.Suppress] = None
+    draw: Annotated[Literal["random", "contiguous"], tyro.conf.Suppress] = "contiguous"
     rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
     """Changes after which other methods are compared with `hj.adapt`, on the first flight of six sources."""
     test_flights: int = 20

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from functools import partial
 from importlib import import_module
 from itertools import takewhile
-from typing import Any, TypeVar, cast, get_type_hints
+from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import tyro
 
@@ -98,8 +98,7 @@ def parsed(
     if {"-h", "--help"} & {*given}:
         print(short_help(kind, program, description, default, common))
         sys.exit(0)
-    hints = get_type_hints(kind, include_extras=True).items()
-    known = {f"--{option_of(name, getattr(hint, '__metadata__', ()))}": values(hint) for name, hint in hints}
+    known = dict(_options(kind))
     given = ["--help"] if "--help-all" in given else split_lists(given, known)
     try:
         with contextlib.redirect_stderr(output):
@@ -109,6 +108,16 @@ def parsed(
             raise  # --help
         usage = short_help(kind, program, "", default, common).partition("\n")[0]
         raise ValueError(f"{_complaint(known, given, output.getvalue(), usage)}; see --help") from None
+
+
+def _options(kind: type) -> Iterator[tuple[str, str]]:
+    """Return each option of a dataclass, with what a user types after it."""
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        marks = getattr(hint, "__metadata__", ())
+        if option := option_of(name, marks):
+            yield f"--{option}", values(hint)
+        else:  # a dataclass whose fields are options
+            yield from _options(get_args(hint)[0])
 
 
 def _complaint(known: Mapping[str, str], given: Sequence[str], box: str, usage: str) -> str:
@@ -126,6 +135,9 @@ def _complaint(known: Mapping[str, str], given: Sequence[str], box: str, usage: 
         at = max(i for i, word in enumerate(given) if word.partition("=")[0] == found[1])
         typed = [given[at].partition("=")[2], *takewhile(lambda word: not word.startswith("--"), given[at + 1 :])]
         return f"{found[1]} must be {expected(known[found[1]])}, got {' '.join(filter(None, typed))}"
+    if found := re.match(r"invalid choice '(.*)' for argument '(--[\w-]+)'. Expected one of \((.*)\)", text):
+        choices = found[3].replace("'", "").removesuffix(",")
+        return f"{found[2]} must be one of {choices}, got {found[1]}{_meant(found[1], choices.split(', '))}"
     return re.sub(r"^Error parsing \w+: ", "", text).removesuffix(".")
 
 

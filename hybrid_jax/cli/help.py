@@ -25,10 +25,10 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
     Of descriptions, it has the first paragraph of the program's, and the first sentence of each option's.
     """
     said, hints = _documented(kind), get_type_hints(kind, include_extras=True)
-    every = fields(cast(Any, kind))
+    every = [each for each in fields(cast(Any, kind)) if tyro.conf.Suppress not in _marks(hints[each.name])]
     options: list[tuple[int, str, str]] = []
     for each in every:
-        marks = getattr(hints[each.name], "__metadata__", ())
+        marks = _marks(hints[each.name])
         if RARE in marks if common is None else each.name not in common:
             continue
         value = each.default if default is None else getattr(default, each.name)
@@ -63,9 +63,13 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
     return "\n".join([*text, "", f"--help-all explains more{lists}."])
 
 
+def _marks(hint: Any) -> tuple[Any, ...]:
+    return getattr(hint, "__metadata__", ())
+
+
 def option_of(name: str, marks: Collection[Any]) -> str:
     """Return the name of a field's option without dashes, which an annotation may set."""
-    return next(filter(None, (getattr(mark, "name", None) for mark in marks)), name.replace("_", "-"))
+    return next((mark.name for mark in marks if getattr(mark, "name", None) is not None), name.replace("_", "-"))
 
 
 def _documented(kind: type) -> dict[str, str]:

@@ -65,8 +65,8 @@ class Options:
     """Folder of the page."""
     rotor_speed: Annotated[tuple[float, float], RARE] = BOX.rotor_speed
     """Lowest and highest rotor speed, as shares of the vehicle's highest speed."""
-    noise: Annotated[tuple[float, ...], RARE] = ()
-    """Noise standard deviation of each of the 13 states, by default typical of motion capture."""
+    noise: Annotated[tuple[float, ...], RARE, tyro.conf.arg(name="noise-std")] = ()
+    """Standard deviation of the noise of each of the 13 states, by default typical of motion capture."""
     starts: Annotated[int, RARE] = 4
     """Number of random initial flights of the search."""
     steps: Annotated[int, RARE] = 200

@@ -92,9 +92,9 @@ REFUSED = {
     "coverage": [(("--seeds", "2"), "--seeds must be at least 3, got 2")],
     "changes": [(("--n-target", "100", "300"), "--n-target must be one number")],
     "excitation": [
-        (("--change", "rain"), "--change must be one of source, parameter_shift"),
+        (("--change", "rain"), "--change must be one of nothing, parameter_shift"),
         (("--seconds", "30"), "--seconds must be from 3 to 11"),
-        (("--bounds.low", "0", "0", "5"), "low must be below high, else the box is empty"),
+        (("--low", "0", "0", "5"), "low must be below high, else the box is empty"),
     ],
     "online": [(("--latency", "0.015"), "latency must be a multiple")],
     "reaction_diffusion": [
