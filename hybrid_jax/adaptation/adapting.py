@@ -192,8 +192,8 @@ def _chosen(choice: Choice, windows: Trajectories, space: StateSpace, flights) -
     return {
         "candidates": dict(zip(choice.names, np.asarray(choice.probability).tolist(), strict=True)),
         "chosen": choice.names[int(choice.taken)],
-        "alone": bool(choice.alone),
-        "refused": tuple(name for name, one in zip(choice.names, np.asarray(choice.refused), strict=True) if one),
+        "physics_only": bool(choice.alone),
+        "rejected": tuple(name for name, one in zip(choice.names, np.asarray(choice.rejected), strict=True) if one),
         "expected": expected_errors(ends, horizons, space, flights is not None),
         "units": {one.name: one.unit for one in space.quantities},
     }
@@ -202,10 +202,10 @@ def _chosen(choice: Choice, windows: Trajectories, space: StateSpace, flights) -
 def _named(method: str | Method) -> tuple[str, Method]:
     if isinstance(method, str):
         if method not in METHODS:
-            raise ValueError(f"method must be one of {', '.join(METHODS)}, or a value, got {method!r}")
+            raise ValueError(f"method must be one of {', '.join(METHODS)}, or a Method, got {method!r}")
         return method, METHODS[method]
     if isinstance(method, type) or not callable(getattr(method, "solve", None)):
-        raise ValueError(f"method must have a method solve, see Method, got {checks.short_repr(method)}")
+        raise ValueError(f"method must be a Method with a function solve, got {checks.short_repr(method)}")
     return type(method).__name__, method
 
 
@@ -214,7 +214,7 @@ def _split(windows: Trajectories, validation: Trajectories | None, needed: bool)
     if validation is not None or not needed:
         return windows, windows if validation is None else validation
     if len(windows) < 2:
-        raise ValueError("windows must be at least two to hold one out, got 1; pass validation=")
+        raise ValueError("windows must be at least two, to hold one out for validation; else pass validation=")
     last = len(windows) - max(1, len(windows) // HELD_OUT)
     return windows[:last], windows[last:]
 

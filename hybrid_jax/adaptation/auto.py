@@ -39,7 +39,7 @@ class Choice(NamedTuple):
 
     names: tuple[str, ...]  # of the candidates
     probability: Float[Array, " c"]  # of each change; the network's is relative to the one chosen before it
-    refused: Bool[Array, " c"]  # which would be more probable than the chosen one if the source had no errors
+    rejected: Bool[Array, " c"]  # which would be more probable than the chosen one if the source had no errors
     taken: Int[Array, ""]  # index of the chosen candidate
     alone: Bool[Array, ""]  # whether physics without the network replaced the source
     parameters: tuple[str, ...]  # names of the parameters
@@ -215,7 +215,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
     theta, blocks = chosen.theta.at[taken].set(found.theta), selection.blocks_of(len(train), method.blocks)
-    probability, refused = chosen.probability, chosen.naive > chosen.naive[taken]
+    probability, rejected = chosen.probability, chosen.naive > chosen.naive[taken]
     equations = masked(found.equations, free[taken] & found.seen)
     alone, of_source, degrees = jnp.array(False), jnp.diag(nothing.apparent), jnp.inf
     if source is not None:
@@ -232,7 +232,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
         changes, change = jnp.where(better, step.left_out, 0.0), jnp.tile(removed, (len(names) + 1, 1))
         change = change.at[-1].add(step.change)
         probability = jnp.append(probability, odds / (1 + odds))
-        refused = jnp.append(refused, (naive > selection.STRONG) & ~better)
+        rejected = jnp.append(rejected, (naive > selection.STRONG) & ~better)
         free, theta = (jnp.concatenate([each, each[taken][None]]) for each in (free, theta))
         names, taken = (*names, NETWORK), jnp.where(better, len(names), taken)
 
@@ -251,7 +251,7 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
         absorbed = jnp.where(alone, absorbed, most)
     # Only rigid bodies: other systems' sizes are relative to the source's value and depend on the parametrisation.
     vague = jnp.sqrt(absorbed) > VAGUE * (sizes if "drag" in groups_of(names_of(larger)) else jnp.inf)
-    first = names, probability, refused, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
+    first = names, probability, rejected, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
     choice = Choice(*first, inherited, jnp.asarray(degrees), absorbed, vague)
     adapted = candidate(extended(field, train.x0.shape[1]), choice, taken)
     status = jnp.where(jnp.any(found.seen), found.status, Status.STALLED)  # no parameter has an effect

@@ -138,7 +138,7 @@ class FineTune(Method):
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         if self.frozen and not isinstance(field, Hybrid):
-            raise ValueError(f"field must be a Hybrid where its {self.frozen} is frozen, got {type(field).__name__}")
+            raise ValueError(f"field must be a Hybrid to freeze its {self.frozen}, got {type(field).__name__}")
         kept = {self.frozen: getattr(field, self.frozen)} if self.frozen else {}
         marked = replace(field, **{name: Frozen(part) for name, part in kept.items()})
         if not any(jax.tree.leaves(trainable(marked))):

@@ -88,8 +88,8 @@ class Adaptation:
         not_measured: share of the states of the windows, 0 to 1, that are NaN, which counts as not measured.
         candidates: "auto" only: probability of each change by name, 0 to 1; the network's is relative to `chosen`.
         chosen: "auto" only: name of the chosen candidate.
-        refused: "auto" only: candidates that would be more probable than the chosen one if the source had no errors.
-        alone: "auto" only: whether physics, fitted to the source's own motion, replaced physics and network.
+        rejected: "auto" only: candidates that would be more probable than the chosen one if the source had no errors.
+        physics_only: "auto" only: whether physics, fitted to the source's own motion, replaced physics and network.
         expected: "auto" only: errors on an unseen flight, by horizon and quantity: value, low, high.
         units: units of the quantities in `expected`.
         outside: share of samples, 0 to 1, outside the range of the source's training data, by quantity.
@@ -114,8 +114,8 @@ class Adaptation:
     not_measured: float = 0.0
     candidates: dict[str, float] = attribute(default_factory=dict)
     chosen: str | None = None
-    refused: tuple[str, ...] = ()
-    alone: bool = False
+    rejected: tuple[str, ...] = ()
+    physics_only: bool = False
     expected: Expected = attribute(default_factory=dict)
     units: dict[str, str] = attribute(default_factory=dict)
     outside: dict[str, float] = attribute(default_factory=dict)
@@ -148,9 +148,9 @@ class Adaptation:
             likely = next(iter(known))
             strong = known[likely] > STRONG * known.get("source", 1.0)
             for reason, sure in ((NOT_CONFIRMED, True), (AS_LARGE, False)):
-                if names := [name for name in self.refused if (strong and name == likely) == sure]:
+                if names := [name for name in self.rejected if (strong and name == likely) == sure]:
                     yield f"Rejected: {', '.join(names)}: {reason}."
-        if self.alone:
+        if self.physics_only:
             yield "Physics without the network predicts the source's own motion better and replaces the source."
         if self.expected:
             yield "RMSE to expect on a new recording (80% intervals, from blocks of windows that were left out):"

@@ -60,7 +60,7 @@ def run(options: Options) -> int:
     with step("adapting") as told:
         field, found = adapted(known.field, flights.logs, Trajectories(x0, u, x, known.dt))
         told(f"{found.windows} windows, chose {found.chosen}")
-    different = bool(found.changed) or found.alone or found.candidates["source"] < UNLIKELY
+    different = bool(found.changed) or found.physics_only or found.candidates["source"] < UNLIKELY
     if different:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
@@ -106,7 +106,7 @@ def _page(
         [
             f"{error} was {old}; it is now {new[0]}." if new else f"{error} is {old}{expected}.",
             *[f"On flights not seen expect {v:.3g} m/s ({low:.3g} to {high:.3g})." for v, low, high in unseen],
-            *([f"Of the model before, {ALONE}"] if found.alone else []),
+            *([f"Of the model before, {ALONE}"] if found.physics_only else []),
             *[WITHIN] * any(one.contains_before for *_, one in own),
             *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
             *errors.unknown(found),

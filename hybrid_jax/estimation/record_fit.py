@@ -138,7 +138,7 @@ def fit_records(
         record_search.check_rates(model, records)
         y = {name: np.concatenate([each.y[name] for each in gridded]) for name in gridded[0].y}
         for name in (name for name, each in y.items() if not len(each)):
-            raise ValueError(f"records: none has a sample of {name}")
+            raise ValueError(f"records: no record has a sample of {name}")
         deviation = {name: np.maximum(each.std(axis=0), TINY) for name, each in y.items()}
         known = {name: np.full_like(deviation[name], size) for name, size in (noise or {}).items()}
         scale = {name: jnp.asarray(each) for name, each in (deviation | known).items()}

@@ -270,7 +270,7 @@ def _moving(field, free: Sequence[str] | None, recordings: Sequence[Recording]) 
     own = _names(field)
     for name in free or ():
         if name.partition("[")[0] not in dict(own):
-            raise ValueError(f"free must be of {', '.join(dict(own))}, got {name!r}")
+            raise ValueError(f"free must be among {', '.join(dict(own))}, got {name!r}")
     known = measure_velocity(recordings)
     moves = [free is None or not {*names}.isdisjoint(free) for names in own]
     return np.array(moves, bool), np.array([known or name not in OF_VELOCITY for name, _ in own], bool)

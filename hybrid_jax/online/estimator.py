@@ -167,7 +167,7 @@ class OnlineAdaptation(AbstractEstimator):
         checks.not_negative("elapsed", elapsed)
         x, u = jnp.asarray(x, state.x.dtype), jnp.asarray(u, state.x.dtype)
         if x.shape != state.x.shape:
-            raise ValueError(f"x must be one sample {state.x.shape}, as the state is, got shape {x.shape}")
+            raise ValueError(f"x must be one sample of shape {state.x.shape}, like the state, got shape {x.shape}")
         check_field(self.field, x, u)
         x = state_space(self.field, len(x)).nearest(x, state.x)
         sample, history = classify(x, u, elapsed, state.history, self.dt, self.tuning.gap)

@@ -131,7 +131,7 @@ def named_priors(
     groups = [name.partition("[")[0] for name in names]
     own = prior if isinstance(prior, Mapping) else dict.fromkeys(groups, prior)
     if unknown := sorted(own.keys() - {*names, *groups}):
-        raise ValueError(f"prior: {', '.join(unknown)}: must be among {', '.join(dict.fromkeys(groups))}")
+        raise ValueError(f"prior: {', '.join(unknown)} must be among {', '.join(dict.fromkeys(groups))}")
     size, sizes = groups.count(DISTURBANCE), np.ravel(disturbance)
     if len(sizes) not in (1, size):
         raise ValueError(f"disturbance must be one number, or {size}, one for each disturbed state, got {len(sizes)}")

@@ -184,9 +184,9 @@ def _require_alike(values: Mapping[str, Any]) -> None:
     names = sorted(name for name in own.keys() | first.keys() if own.get(name) != first.get(name))
     others = np.flatnonzero(gather(np.array([len(names)]))).tolist()
     if names:
-        raise ValueError(f"processes of one run must be started alike, this one differs from 0 in {', '.join(names)}")
+        raise ValueError(f"all processes must be started alike, but this one differs from 0 in {', '.join(names)}")
     if others:
-        raise ValueError(f"processes of one run must be started alike, {others} differ from this one")
+        raise ValueError(f"all processes must be started alike, but {others} differ from this one")
 
 
 def is_main_process() -> bool:

@@ -115,7 +115,7 @@ def fit_gauss_newton(
         not isinstance(penalty, str) or penalty not in PENALTIES or not isinstance(field, Hybrid)
     ):
         known = ", ".join(PENALTIES)
-        raise ValueError(f"penalty must be one of {known}, of a Hybrid, got {penalty!r} of {type(field).__name__}")
+        raise ValueError(f"penalty must be one of {known}, for a Hybrid, got {penalty!r} for {type(field).__name__}")
     size = ravel_learned(field)[0].size
     if not 0 < size <= MOST:
         raise ValueError(f"field: 1 to {MOST} parameters expected for Gauss-Newton, got {size}; use fit")

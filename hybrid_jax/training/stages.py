@@ -63,7 +63,7 @@ def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
     groups_of = [[group for group in groups if not group or f"{path}/".startswith(f"{group}/")] for path in paths]
     for group in groups:
         if not any(group in found for found in groups_of):
-            raise ValueError(f"rates: no learned array begins with {group!r}, only {', '.join(paths)}")
+            raise ValueError(f"rates: no learned array begins with {group!r}; the paths are {', '.join(paths)}")
     rates = [groups[max(found, key=len)] if found else 0.0 for found in groups_of]
     return jax.tree.structure(learned).unflatten(jnp.asarray(rate, float) for rate in rates)
 

@@ -174,12 +174,12 @@ WIDE = replace(swings(40), u=np.zeros((40, 8, 2), np.float32))
 @pytest.mark.parametrize(
     ("field", "options", "said"),
     [
-        (pendulum(), {"method": "magic"}, "method must be one of auto, .*source, or a value, got 'magic'"),
-        (pendulum(), {"method": 3}, "method must have a method solve, see Method, got 3"),
+        (pendulum(), {"method": "magic"}, "method must be one of auto, .*source, or a Method, got 'magic'"),
+        (pendulum(), {"method": 3}, "method must be a Method with a function solve, got 3"),
         (pendulum(), {"settings": hj.Settings(4, objective=Own())}, "^settings.objective must be .* got Own; .*fine_t"),
         (pendulum(), {"method": LeastSquares(indices=(9,))}, "indices must be different .* and at most 1, got"),
         (pendulum(), {"level": 95}, "level must be between 0 and 1, got 95"),
-        (pendulum(), {"method": "theta_only"}, "field must be a Hybrid where its residual is frozen, got Pendulum"),
+        (pendulum(), {"method": "theta_only"}, "field must be a Hybrid to freeze its residual, got Pendulum"),
         (pendulum(), {"learned_from": WIDE}, "^learned_from: inputs of 1 numbers expected, as in the other .* got 2"),
         (Nothing(), {}, "field: its physics, Nothing, has no parameter to fit"),
         (Weights(jnp.zeros(60)), {}, "field: Weights has 60 unnamed parameters, too many to fit; use"),

@@ -74,7 +74,7 @@ def test_physics_that_needs_no_network_takes_the_sources_place():
     network = jax.tree.map(lambda leaf: 0.3 * leaf, hj.residual_network(2, 1, jax.random.key(1), hidden=4, norm="none"))
     source = hj.Hybrid(pendulum(0.68), network)
     found = adapt(source, flown(pendulum(LENGTH)), learned_from=flown(pendulum(0.7), seed=1))
-    assert (found.alone, found.chosen) == (True, "theta")
+    assert (found.physics_only, found.chosen) == (True, "theta")
     assert found.parameters["log_length"].low < np.log(LENGTH) < found.parameters["log_length"].high
     x, u = jnp.array([0.3, 0.1]), jnp.zeros(1)
     np.testing.assert_allclose(found.field(x, u), found.field.physics(x, u), atol=1e-6)

@@ -63,17 +63,17 @@ def test_hover_still_or_lively_and_slow_flight_with_more_noise_make_no_model_wor
 def test_hover_changes_what_the_source_does_not_err_on_its_own_motion(force, taken):
     hover, moving = flown(0, 0.003, 0.3, force=force), flown(98, 1.0)
     found = hj.adapt(SOURCE, hover, learned_from=moving)
-    assert "force" in found.refused or taken
+    assert "force" in found.rejected or taken
     assert (found.chosen == "source") != taken
     assert "hj.excitation plans an experiment" in found.report()
 
 
 @pytest.mark.parametrize(("share", "reason"), [(0.99, "left out of the fit"), (0.9, "the source's own errors")])
 def test_the_report_says_why_a_change_was_refused(share, reason):
-    """Evidence that was strong enough was refused by left-out windows."""
+    """Evidence that was strong enough was rejected by left-out windows."""
     found = hj.adapt(SOURCE, flown(0, 0.003, 0.3), method="source")
     shares = {"source": 1 - share, "theta": share, "network": 0.5}
-    found = replace(found, candidates=shares, chosen="source", refused=("theta",))
+    found = replace(found, candidates=shares, chosen="source", rejected=("theta",))
     assert next(line for line in found.report().splitlines() if reason in line).startswith("Rejected: theta: ")
 
 

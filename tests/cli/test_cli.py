@@ -109,7 +109,7 @@ def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_chang
     flown = FlightLog(0.01 * np.arange(n), x, np.full((n, 4), 500.0))
     none = dict.fromkeys(("disturbance", "without_intervals"))
     numbers = {"mse_before": 1.0, "mse_after": 1.0, "windows": 2, "steps": 0, "level": 0.95}
-    taken = {"chosen": "source", "candidates": {"source": 1.0}, "alone": True}
+    taken = {"chosen": "source", "candidates": {"source": 1.0}, "physics_only": True}
     found = Adaptation(body, "auto", {}, status=Status.OK, **none, **numbers, **taken)
     monkeypatch.setattr("hybrid_jax.cli.adapt.flights_for", lambda *_, **__: Flights([flown], {}, []))
     monkeypatch.setattr("hybrid_jax.cli.adapt.adapted", lambda *_: (body, found))

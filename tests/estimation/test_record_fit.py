@@ -286,7 +286,7 @@ def test_records_may_have_different_sensors(records):
     assert y.keys() == {"acceleration"} != fit.errors.keys()
     assert np.abs(fit.starts - [[0.5, 0.0], [-0.4, 1.0]]).max() < 0.05
     assert float(fit.intervals["log_length"].value) == pytest.approx(np.log(0.8), abs=0.01)
-    with pytest.raises(ValueError, match="records: none has a sample of angle"):
+    with pytest.raises(ValueError, match="records: no record has a sample of angle"):
         fit_records(model, [felt], dt=0.02)
 
 

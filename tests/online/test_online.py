@@ -171,7 +171,7 @@ def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"prior": {"frition": 0.1}}, "prior: frition: must be among friction, idle"),
+        ({"prior": {"frition": 0.1}}, "prior: frition must be among friction, idle"),
         ({"prior": {"friction": 0.1}}, "prior: idle must be given, 0 if it should stay constant"),
         ({"prior": 0.0}, "prior must be positive for at least one parameter, got 0 for all"),
         ({"disturbance": 1.0}, "indices must say"),
@@ -192,7 +192,7 @@ def test_a_sample_is_a_list_or_an_array_of_the_size_of_the_first():
     assert eqx.tree_equal(adaptation().update(state, [0.1], [1]), adaptation().update(state, np.array([0.1]), [1.0]))
     with pytest.raises(ValueError, match=r"^noise must be one number, or 1, one for each state, got 2"):
         OnlineAdaptation(SLIDE, DT, (NOISE, NOISE)).begin([0.0])
-    with pytest.raises(ValueError, match=r"^x must be one sample \(1,\), as the state is, got shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"^x must be one sample of shape \(1,\), like the state, got shape \(2,\)"):
         adaptation().update(state, [0.0, 0.0], [0.0])
     with pytest.raises(ValueError, match=r"^elapsed must be a finite number of at least 0, got -1"):
         adaptation().update(state, [0.0], [0.0], elapsed=-1)

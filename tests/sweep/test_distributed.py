@@ -182,5 +182,5 @@ def test_processes_of_one_run_are_started_alike(tmp_path):
     both = [experiment(tmp_path / f"out{i}", tmp_path / "cache", *common, i, "--max-epochs", f"4{i}") for i in "01"]
     texts = [process.communicate(timeout=120)[1] for process in both]
     assert [process.returncode for process in both] == [2, 2]
-    assert texts[0].strip().endswith("processes of one run must be started alike, [1] differ from this one")
+    assert texts[0].strip().endswith("all processes must be started alike, but [1] differ from this one")
     assert texts[1].strip().endswith("this one differs from 0 in max_epochs")

@@ -45,7 +45,7 @@ def test_the_longest_group_that_fits_counts():
     assert rates.residual.weight_in == np.float32(1e-2)
     assert rates.residual.norm.shift == 0
     assert eqx.tree_equal(make_run_config(rates, jnp.arange(3), 3, 0, 1, 1, 0.0).rates, rates)  # what a sweep takes
-    with pytest.raises(ValueError, match="no learned array begins with 'resid', only physics/log_length, residual"):
+    with pytest.raises(ValueError, match="no learned array begins with 'resid'; the paths are physics/log_length"):
         rates_by_group(hybrid(), {"resid": 1.0})
 
 
