@@ -72,7 +72,7 @@ class RK4(diffrax.AbstractSolver):
 
 
 def compact(solver: Solver | None) -> Solver:
-    """Return the solver, by default RK4, with its stages in a loop. It compiles faster, but runs slower."""
+    """Return the solver, by default RK4, with its stages in a loop. It compiles faster; use it for what runs rarely."""
     if solver is None or isinstance(solver, RK4):
         return RK4(scanned=True, substeps=1 if solver is None else solver.substeps)
     return solver

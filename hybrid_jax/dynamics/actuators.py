@@ -27,8 +27,8 @@ NAMES = ("curve", "time_constant", "time_constants", "voltage_exponent", "delay"
 GIVES = ("speed", "thrust")
 UNITS = {"time_constant": "s", "time_constants": "s", "delay": "s"}
 EXCLUSIVE = {"curve": ("mass", "k", "k_rotors"), "time_constants": ("time_constant",)}
-SLOWEST_SHARE = 1e-3  # of the speed of hover: below, the root of a thrust has no slope
-QUICKEST = 1e-3  # s, least time constant that is learned
+SLOWEST_SHARE = 1e-3  # of the speed of hover; without this limit, the root of a thrust has no slope at zero
+QUICKEST = 1e-3  # s, shortest time constant that is learned
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Actuator:
         time_constants: τ_up and τ_down, for speeding up and slowing down [s]; you can give one number for both.
         nominal_voltage: V₀, the battery voltage at which the curve is valid [V]; 0 if the voltage does not matter.
         voltage_exponent: γ, for example 0 if the vehicle compensates for its voltage.
-        delay: the time from when a command is logged to when it acts [s], constant over a log.
+        delay: the time between logging a command and its effect [s], constant over a log.
 
     Raises:
         ValueError: if a field is invalid.
@@ -81,8 +81,8 @@ class Actuated(AbstractVectorField):
     u has one command for each rotor, followed by the battery voltage if `nominal_voltage` is given.
 
     Parameters are deviations from the nominal actuator that start at zero: `curve` in units of its value at full
-    command, time constants as logarithms, and the others in their own unit. `delay` shifts a log (`delayed`), and the
-    equations do not use it.
+    command, time constants as logarithms, and the others in their own unit. `delay` shifts the log instead of changing
+    the equations.
 
     Attributes:
         body: the field driven by rotor speeds.
@@ -142,23 +142,19 @@ class Actuated(AbstractVectorField):
         at, known = self.deviations.get(name, 0.0), self.actuator
         if name == "curve":
             return jnp.asarray(known.curve) + abs(sum(known.curve) or 1.0) * jnp.asarray(at)
-        if name == "time_constant":
-            return max(known.time_constants[0], QUICKEST) * jnp.exp(at)
-        if name == "time_constants":
-            return jnp.maximum(jnp.asarray(known.time_constants), QUICKEST) * jnp.exp(jnp.asarray(at))
+        if name in ("time_constant", "time_constants"):
+            return self.time_constants()[0 if name == "time_constant" else slice(None)]
         return getattr(known, name) + jnp.asarray(at)
 
     @property
     def delay(self) -> Array:
-        """The time from when a command is logged to when it acts [s]."""
+        """The time between logging a command and its effect [s]."""
         return self._value("delay")
 
     def time_constants(self) -> Float[Array, "2"]:
         """Return τ_up and τ_down [s]."""
-        if "time_constant" in self.deviations:
-            nominal = np.maximum(self.actuator.time_constants, QUICKEST)
-            return jnp.asarray(nominal) * jnp.exp(self.deviations["time_constant"])
-        return self._value("time_constants")
+        at = self.deviations.get("time_constant", self.deviations.get("time_constants", 0.0))
+        return jnp.maximum(jnp.asarray(self.actuator.time_constants), QUICKEST) * jnp.exp(jnp.asarray(at))
 
     def steady_speeds(self, u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
         """Return w∞, the rotor speeds [rad/s] once they have settled under commands and voltage."""
@@ -208,10 +204,8 @@ def actuated(body: RigidBody, actuator: Actuator, learn: tuple[str, ...] = ()) -
     Args:
         body: the field driven by rotor speeds.
         actuator: the nominal map from command to rotor speed.
-        learn: names of the actuator parameters to learn, from `actuators.NAMES`; by default none.
-
-    Raises:
-        ValueError: see `check_actuator_names`.
+        learn: names of the actuator parameters to learn, from `actuators.NAMES`; by default none. ValueError if they
+            are unknown, or not identifiable together.
     """
     check_actuator_names(learn, actuator, tuple(body.deviations))
     shapes = {"curve": (len(actuator.curve),), "time_constants": (2,)}
@@ -254,7 +248,7 @@ def rotor_speeds(
 
 
 def held_means(t: Numbers, values: Numbers, edges: Numbers, delay: Array | float = 0.0) -> Float[Array, "k-1 m"]:
-    """The mean between `edges` (k) [s] of values (n, m) held from times t (n) + `delay` [s], the first also before."""
+    """Average values (n, m), held from times t (n) + `delay` [s] (the first also before), between `edges` (k) [s]."""
     area = jnp.concatenate([jnp.zeros((1, values.shape[1])), jnp.cumsum(values[:-1] * jnp.diff(t)[:, None], axis=0)])
     at = edges - delay
     i = jnp.clip(jnp.searchsorted(t, at, side="right") - 1, 0, len(t) - 1)

@@ -33,7 +33,7 @@ class AbstractVectorField(eqx.Module):
 
     @abstractmethod
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        """ẋ of one sample, in inference mode."""
+        """Return ẋ of one sample, in inference mode."""
 
     def train_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
         """Evaluate ẋ on a minibatch in training mode: batch normalisation uses the moments of this minibatch."""
@@ -76,12 +76,12 @@ class AbstractVectorField(eqx.Module):
 
     @property
     def features_first(self) -> bool:
-        """Whether a part of the field has a batched form, so that a batch is best kept on the last axis."""
+        """Whether a part of the field evaluates batches, so that the batch should be the last axis."""
         return self.accepts_batch
 
     @property
     def hidden(self) -> int:
-        """The number of states, behind all others, that are not measured; by default none."""
+        """The number of states that are not measured, which follow all others; by default 0."""
         return 0
 
     @property
@@ -118,7 +118,7 @@ class AbstractEstimator(eqx.Module):
         """Return the state of the estimator after one period with mean input u and the sample x at its end.
 
         Args:
-            state: of the estimator, as returned by `begin` and `update`.
+            state: as returned by `begin` and `update`.
         """
 
     @abstractmethod
@@ -126,14 +126,14 @@ class AbstractEstimator(eqx.Module):
         """Return the prediction model for the controller.
 
         Args:
-            state: of the estimator, as returned by `begin` and `update`.
+            state: as returned by `begin` and `update`.
         """
 
     def start(self, state: Any, x: Float[Array, " d"]) -> Float[Array, " d+h"]:
         """Return the model's state at the last sample x; by default x, for a model without hidden states.
 
         Args:
-            state: of the estimator, as returned by `begin` and `update`.
+            state: as returned by `begin` and `update`.
         """
         return x
 
@@ -141,7 +141,7 @@ class AbstractEstimator(eqx.Module):
         """Return the input to command if the controller requests u in the state x; by default u.
 
         Args:
-            state: of the estimator, as returned by `begin` and `update`.
+            state: as returned by `begin` and `update`.
         """
         return u
 
@@ -149,13 +149,13 @@ class AbstractEstimator(eqx.Module):
         """Return the model input with the same effect as the system input u, the inverse of `command`; by default u.
 
         Args:
-            state: of the estimator, as returned by `begin` and `update`.
+            state: as returned by `begin` and `update`.
         """
         return u
 
 
 def parts_of(tree: Any) -> Iterator[Any]:
-    """The tree, and all modules, containers and leaves inside it."""
+    """Iterate over the tree, and all modules, containers and leaves inside it."""
     yield tree
     for child in jax.tree.leaves(tree, is_leaf=lambda node: node is not tree):
         if child is not tree:
@@ -163,7 +163,6 @@ def parts_of(tree: Any) -> Iterator[Any]:
 
 
 def _fields_inside(tree) -> list[AbstractVectorField]:
-
     def is_inside(node) -> bool:
         return node is not tree and isinstance(node, AbstractVectorField)
 
@@ -171,13 +170,13 @@ def _fields_inside(tree) -> list[AbstractVectorField]:
 
 
 def state_space(field: AbstractVectorField, d: int | None = None) -> StateSpace:
-    """The state space of a field, or of the first field inside another callable, padded to d numbers."""
+    """Return the state space of a field, or of the first field inside another callable, padded to d numbers."""
     own = as_field(field).state_space
     return own if d is None else own.padded(d)
 
 
 class _Function(AbstractVectorField):
-    """A function, or a module of another class, with the default methods of a field."""
+    """A function or another module as a field, with default methods."""
 
     function: Callable
 
@@ -196,12 +195,12 @@ class _Function(AbstractVectorField):
 
 
 def as_field(field: Callable) -> AbstractVectorField:
-    """The field itself, or a function of x and u wrapped as a field."""
+    """Return the field itself, or a function of x and u wrapped as a field."""
     return field if isinstance(field, AbstractVectorField) else _Function(field)
 
 
 def jvp_columns(function, values: tuple, columns: tuple) -> tuple[Float[Array, " e"], Columns]:
-    """`function(*values)` and its derivatives along the columns of `columns`: shapes (e,) and (e, c)."""
+    """Return `function(*values)` (e,), and its derivatives (e, c) along the columns of `columns`."""
     value, slope = jax.linearize(function, *values)
     return value, jax.vmap(slope, in_axes=-1, out_axes=-1)(*columns)
 
@@ -220,7 +219,7 @@ def trainable(field: Any) -> Any:
 
 
 def ravel_learned(field: Any) -> tuple[Float[Array, " p"], Callable[[Float[Array, " p"]], Any]]:
-    """The learned numbers of a field as a vector, in the order of its leaves, and the field as a function of them."""
+    """Return the learned numbers of a field as a vector, in the order of its leaves, and a function back to a field."""
     learned, rest = eqx.partition(field, trainable(field))
     theta, unravel = ravel_pytree(learned)
     return theta, lambda theta: eqx.combine(unravel(theta), rest)

@@ -15,7 +15,7 @@ Moments = Float[Array, "3 h"]  # number of evaluations, sum of their means, sum 
 
 
 class RunningStats(eqx.Module):
-    """Running mean and variance of hidden units. Training moves them; the optimiser does not."""
+    """Running mean and variance of hidden units. They are updated in training, but not by the optimiser."""
 
     mean: Float[Array, " h"]
     variance: Float[Array, " h"]
@@ -29,10 +29,10 @@ class AbstractBatchNorm(eqx.Module):
 
     @abstractmethod
     def training_mode(self, seen: Moments) -> eqx.Module:
-        """The layer for one sample of a minibatch, which calls `record_moments(_, seen)`."""
+        """Return the layer for one sample of a minibatch, which calls `record_moments(_, seen)`."""
 
     def moved(self, batch: RunningStats) -> Self:
-        """This layer with running statistics moved towards the minibatch's by the momentum."""
+        """Return this layer with running statistics moved towards the minibatch's by the momentum."""
         move = self.momentum
         running = jax.tree.map(lambda old, new: (old + move * (new - old)).astype(old.dtype), self.running, batch)
         return eqx.tree_at(lambda norm: norm.running, self, running)
@@ -43,22 +43,22 @@ class AbstractInferenceOnly(eqx.Module):
 
 
 def over_samples(function):
-    """`function` on all samples of a minibatch, which lie along the last axis of its arguments and its result."""
+    """Apply `function` to all samples of a minibatch, along the last axis of its arguments and its result."""
     return jax.vmap(function, in_axes=-1, out_axes=-1, axis_name=SAMPLES)
 
 
 def expand_trailing(values: Float[Array, " r"], rows: Float[Array, " _ *b"]) -> Float[Array, " r *b"]:
-    """The values with a trailing axis of length 1 for each batch axis of `rows`."""
+    """Add a trailing axis of length 1 to the values for each batch axis of `rows`."""
     return jnp.reshape(values, values.shape + (1,) * (rows.ndim - 1))
 
 
 def batch_norms(tree: PyTree) -> list[AbstractBatchNorm]:
-    """All layers of batch normalisation that training evaluates."""
+    """Return all layers of batch normalisation that are evaluated in training."""
     return [node for node in jax.tree.leaves(tree, is_leaf=_stops) if isinstance(node, AbstractBatchNorm)]
 
 
 def like(tree: PyTree, leader: Float[Array, "..."]) -> PyTree:
-    """The tree, batched under `vmap` if the leader is: with such an initial carry, JAX traces a scan's body once."""
+    """Return the tree, batched under `vmap` if the leader is. With such an initial carry, JAX traces a scan once."""
     number = jnp.ravel(leader)[0]
     return jax.tree.map(lambda leaf: jnp.where(number > 0, leaf, leaf), tree)
 
@@ -74,17 +74,17 @@ def training_mode(tree: PyTree, seen: list[Moments] | None = None) -> PyTree:
 
 
 def moments_of(field, x, u) -> list[Moments]:
-    """The moments that each `AbstractBatchNorm` records on a minibatch, x (d, b) and u (m, b).
+    """Return the moments that each `AbstractBatchNorm` records on a minibatch, x (d, b) and u (m, b).
 
-    They are the derivative with respect to an input without effect (`_record`): they add up through any jit, scan or
-    vmap around the layer, where values stored during tracing would leak.
+    They are the derivative with respect to an input without effect (`_record`). Derivatives add up through any jit,
+    scan or vmap around the layer, whereas values stored during tracing would leak.
     """
     slope, pullback = jax.vjp(lambda seen: over_samples(training_mode(field, seen))(x, u), _unseen(field))
     return pullback(jnp.zeros_like(slope))[0]
 
 
 def with_moved_stats(field, x: Batch, u: Float[Array, "m b"]):
-    """The field with running statistics moved by a minibatch, or by the mean of several evaluations of a layer."""
+    """Return the field with running statistics moved by a minibatch; several evaluations of a layer are averaged."""
     if not (norms := batch_norms(field)):
         return field
 
@@ -96,7 +96,7 @@ def with_moved_stats(field, x: Batch, u: Float[Array, "m b"]):
 
 
 def record_moments(hidden: Float[Array, " h *a"], seen: Moments):
-    """Mean (over the minibatch and all axes but the first), centred values and variance; adds the moments to `seen`."""
+    """Return mean, centred values and variance over all axes but the first and the minibatch; record them in `seen`."""
 
     def centre(hidden):
         mean = jax.lax.pmean(jnp.mean(hidden, axis=tuple(range(1, hidden.ndim))), SAMPLES)
@@ -110,7 +110,7 @@ def record_moments(hidden: Float[Array, " h *a"], seen: Moments):
 
 @jax.custom_vjp
 def _record(hidden: Float[Array, " h *a"], seen: Moments, moments: Moments) -> Float[Array, " h *a"]:
-    """The identity; in reverse mode the moments are added to the derivative with respect to `seen`."""
+    """Return `hidden`; in reverse mode, add the moments to the derivative with respect to `seen`."""
     return hidden
 
 

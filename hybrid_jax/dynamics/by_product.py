@@ -1,4 +1,4 @@
-"""Residuals of physics whose derivatives in many directions are one product with the network's Jacobian."""
+"""Differentiate the residuals of a hybrid in many directions by one product with the network's Jacobian."""
 
 from dataclasses import replace
 from typing import TypeVar
@@ -37,7 +37,7 @@ def _evaluate_jvp(primals, tangents):
 
 
 def fixed_residual(field: Field) -> Field:
-    """The field with `ByProduct` around its residuals, for derivatives by θ_p or by the state."""
+    """Return the field with `ByProduct` around its residuals, for derivatives by θ_p or by the state."""
     if not isinstance(field, Hybrid) or physics_of(field) is field:
         return field
     fused = as_field(field.residual).fuse_for_inference()

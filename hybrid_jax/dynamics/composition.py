@@ -23,12 +23,12 @@ class AbstractComposite(AbstractVectorField):
         """The fields inside, f₁, f₂, …"""
 
     def read(self, x: Float[Array, " d *b"]) -> Float[Array, " n *b"]:
-        """The features of the state that the fields inside read; by default all."""
+        """Return the features of the state that the fields inside read; by default all."""
         return x
 
     @abstractmethod
     def write(self, x: Float[Array, " d *b"], *inside: Float[Array, " n *b"]) -> Float[Array, " d *b"]:
-        """ẋ from the outputs of the fields inside.
+        """Return ẋ from the outputs of the fields inside.
 
         Args:
             inside: output of each field inside (n).
@@ -73,7 +73,7 @@ class AbstractComposite(AbstractVectorField):
 class Hybrid(AbstractComposite):
     """A hybrid model ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus a residual for what it lacks (paper, Eq. 4).
 
-    Quaternions q and −q are one attitude, and the model is the same for both: the residual reads the one with w ≥ 0.
+    Quaternions q and −q are the same attitude, so the residual always reads the one with w ≥ 0.
 
     Attributes:
         physics: f_p, any field.
@@ -110,7 +110,7 @@ class Hybrid(AbstractComposite):
 
 
 class AbstractWrapper(AbstractComposite):
-    """ẋ = write(x, f(read(x), u)) for one field f inside; each is the identity by default.
+    """ẋ = write(x, f(read(x), u)) for one field f inside; `read` and `write` are the identity by default.
 
     Attributes:
         field: the field inside.
@@ -130,7 +130,7 @@ class AbstractWrapper(AbstractComposite):
 
 
 class Frozen(AbstractWrapper, AbstractInferenceOnly):
-    """A field that training does not change. It is in inference mode, and keeps its running statistics."""
+    """A field that does not change in training. It is in inference mode, and keeps its running statistics."""
 
     def train_batch(self, x, u):
         return self.infer_batch(x, u)
@@ -155,7 +155,7 @@ def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
 def check_batch_norm(
     field: AbstractVectorField, x: Float[Array | np.ndarray, "d b"], u: Float[Array | np.ndarray, "m b"]
 ) -> None:
-    """Raise ValueError for a BatchNorm that is not evaluated at x and u, or is hidden from differentiation."""
+    """Raise ValueError for a BatchNorm that is not evaluated at x and u, or cannot be differentiated."""
     if _is_wrapped(field) and not all(all(count.tolist()) for count, *_ in moments_of(field, x, u)):
         raise ValueError(
             f"field: {type(field).__name__} contains a BatchNorm whose minibatch statistics cannot be recorded, "

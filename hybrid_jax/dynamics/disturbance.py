@@ -94,7 +94,7 @@ def without_disturbance(field: AbstractVectorField) -> AbstractVectorField:
 
 
 def sized(field: AbstractVectorField, d: int) -> AbstractVectorField:
-    """The field with one number for each of d states where the disturbance of its physics is a scalar."""
+    """Replace a scalar disturbance of the field's physics by one number for each of d states."""
     found = disturbance_of(field)
     if found is None or found.value.ndim > 0:
         return field
@@ -102,7 +102,7 @@ def sized(field: AbstractVectorField, d: int) -> AbstractVectorField:
 
 
 def physics_of(field: AbstractVectorField) -> AbstractVectorField:
-    """f_p with its constant disturbance, if any: the physics of a hybrid, or the field itself."""
+    """Return the physics of a hybrid, with its constant disturbance if it has one; else the field itself."""
     while isinstance(field, Hybrid) and not isinstance(field.residual, ConstantDisturbance):
         field = field.physics
     return field
@@ -113,13 +113,13 @@ def with_physics(field: AbstractVectorField, physics: AbstractVectorField) -> Ab
 
 
 def disturbance_of(field: AbstractVectorField) -> ConstantDisturbance | None:
-    """The constant disturbance of the field's physics, or None."""
+    """Return the constant disturbance of the field's physics, or None."""
     physics = physics_of(field)
     return physics.residual if isinstance(physics, Hybrid) else None  # pyright: ignore[reportReturnType]
 
 
 def disturbance_units(field: AbstractVectorField) -> dict[str, str]:
-    """The name of each number of the field's disturbance, disturbance[vx] or disturbance[0], and its unit, or ""."""
+    """Return name → unit (or "") of each number of the disturbance, for example disturbance[vx] or disturbance[0]."""
     if (found := disturbance_of(field)) is None:
         return {}
     space = state_space(field)
@@ -131,7 +131,7 @@ def disturbance_units(field: AbstractVectorField) -> dict[str, str]:
 
 
 def _indices(field: AbstractVectorField, found: ConstantDisturbance) -> Sequence[int]:
-    """Indices of the disturbed states; for a grid, of the disturbed components."""
+    """Return the indices of the disturbed states; for a grid, of the disturbed components."""
     if found.indices is not None:
         return found.indices
     k = jnp.size(found.value)
@@ -139,7 +139,7 @@ def _indices(field: AbstractVectorField, found: ConstantDisturbance) -> Sequence
 
 
 def without_zeros(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with its constant disturbance restricted to nonzero entries; outside of compiled code."""
+    """Return the field with its constant disturbance restricted to nonzero entries; outside of compiled code."""
     found = disturbance_of(field)
     if found is None or np.asarray(found.value).all():
         return field

@@ -16,7 +16,7 @@ Constants = dict[str, Rows | tuple[float, ...]]  # name → entries: numbers if 
 
 
 def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
-    """ẋ of a multirotor with learned parameters θ_p. Terms that are neither learned nor present cost nothing."""
+    """Return ẋ of a multirotor with learned parameters θ_p. Terms that are neither learned nor present cost nothing."""
     constants = nominal_values(vehicle, terms) | theta
     q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
     thrust, torque = _wrench(vehicle, constants, u)
@@ -41,7 +41,7 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
 
 
 def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
-    """Total thrust [N] and torque [N m] of the rotors about the centre of mass."""
+    """Return the total thrust [N] and torque [N m] of the rotors about the centre of mass."""
     squares, efficiency = [speed * speed for speed in u], constants["efficiency"]
     if is_present(efficiency, absent=1.0):
         squares = [share * square for share, square in zip(efficiency, squares, strict=True)]
@@ -64,7 +64,7 @@ def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
 
 
 def _specific_force(constants: Constants, velocity, torque):
-    """Specific force without thrust [m/s², body frame]: drag, and a cable that the rotors' torque balances."""
+    """Return the specific force without thrust [m/s², body]: drag, and a cable that the rotors' torque balances."""
     drag, pull, (mass,) = constants["drag"], constants["cable_pull"], constants["mass"]
     x, y, z = 0.0, 0.0, 0.0
     if is_present(drag):
@@ -77,7 +77,7 @@ def _specific_force(constants: Constants, velocity, torque):
 
 
 def _velocity_error(constants: Constants, velocity, force):
-    """ṗ minus the estimated velocity [m/s, body frame]."""
+    """Return ṗ minus the estimated velocity [m/s, body frame]."""
     gain, lag = constants["velocity_gain"], constants["velocity_lag"]
     x, y, z = 0.0, 0.0, 0.0
     if is_present(gain, absent=1.0):
@@ -88,7 +88,7 @@ def _velocity_error(constants: Constants, velocity, force):
 
 
 def _euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
-    """ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
+    """Return ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
     (ix, iy, iz), (tx, ty, tz), (wx, wy, wz) = inertia, torque, omega
     return jnp.stack(
         [(tx - (iz - iy) * wy * wz) / ix, (ty - (ix - iz) * wz * wx) / iy, (tz - (iy - ix) * wx * wy) / iz]
@@ -96,7 +96,7 @@ def _euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
 
 
 def in_world(attitude, parts) -> Float[Array, " 3 *b"]:
-    """A body vector in the world frame; entries that are not given are zero."""
+    """Rotate a body vector into the world frame; entries that are not given are zero."""
     return jnp.stack([dot(row[: len(parts)], parts) for row in attitude])
 
 
@@ -112,7 +112,7 @@ def is_present(term, absent: float = 0.0) -> bool:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def evaluate_columns(of_rows: Callable, theta: PyTree, x: Float[Array, "13 b"], u: Float[Array, "rotors b"]):
-    """`of_rows(theta, x, u)` on a minibatch for scalar parameters; its derivative sums over it once per parameter."""
+    """Evaluate `of_rows(theta, x, u)` on a minibatch; the derivative sums over it once per scalar parameter."""
     return of_rows(theta, tuple(x), tuple(u))
 
 

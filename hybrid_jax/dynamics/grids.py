@@ -17,14 +17,14 @@ from hybrid_jax.state_space import Quantity, StateSpace
 from hybrid_jax.trajectories import Trajectories, check
 
 REAL_AXIS = 2.785  # RK4 is stable for z = λ dt from −2.785 to 0 (Hairer and Wanner, Solving ODEs II, Sec. IV.2)
-SEAM = 3.0  # times the usual step between neighbours that one across the edge may be; 1 in periodic data
+SEAM = 3.0  # largest step across the edge over the usual step between neighbours; 1 in periodic data
 
 
 @dataclass(frozen=True)
 class Grid:
     """A periodic grid of equal spacing with one or more quantities at each point.
 
-    A state has one quantity after the other, each in row-major order; further axes are samples. Methods take and
+    A state lists one quantity after the other, each in row-major order. Further axes are samples. Methods take and
     return arrays of shape (components, *shape, *b), as `fields` does.
 
     Attributes:
@@ -105,7 +105,7 @@ class Grid:
         return [padded[(slice(None), *shift)] for shift in shifts]
 
     def _padded(self, fields: Float[Array, " c *cells"], reach: int) -> Float[Array, " c *cells"]:
-        """The fields with `reach` more points at each edge, copied from the opposite edge."""
+        """Add `reach` points at each edge, copied from the opposite edge."""
         return jnp.pad(fields, [(reach * (i in self.axes),) * 2 for i in range(fields.ndim)], mode="wrap")
 
     def largest_step(self, diffusivity: float | Sequence[float] | np.ndarray | Array) -> float:
@@ -140,7 +140,7 @@ def check_grid(
         name: name of the windows in messages.
 
     Raises:
-        ValueError: if one of these is true. The message has the bound and the number of substeps that you need.
+        ValueError: if one of these is true. For slow samples, the message contains the substeps that you need.
     """
     size = check(windows, name).x0.shape[-1]
     if size != grid.size:

@@ -29,25 +29,22 @@ class AbstractHidden(eqx.Module):
 
     @abstractmethod
     def derivative(self, z: Float[Array, " k"], x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " k"]:
-        """ż.
+        """Return ż (k,), for the states x of the field and the inputs u that the part before passes on.
 
         Args:
             z: its states (k,).
-            x: the states of the field (d,).
-            u: the inputs, after the parts before this one (m,).
         """
 
     def inputs(self, z: Float[Array, " k"], u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The inputs that act on the field; by default unchanged.
+        """Return the inputs (m,) that this part passes on; by default u.
 
         Args:
             z: its states (k,).
-            u: the inputs, after the parts before this one (m,).
         """
         return u
 
     def added(self, z: Float[Array, " k"], d: int) -> Float[Array, " d"]:
-        """The contribution to ẋ of the field; by default zero.
+        """Return the contribution (d,) to ẋ of the field; by default zero.
 
         Args:
             z: its states (k,).
@@ -57,9 +54,9 @@ class AbstractHidden(eqx.Module):
 
 
 class Lag(AbstractHidden):
-    """Inputs with a lag, ż = (u − z) / τ, or a chain of equal lags, which delays them; the field receives z.
+    """A lag of inputs, ż = (u − z) / τ, or a chain of equal lags, which delays them. The field receives z.
 
-    The response to a chain spreads by τ / √order about a delay of τ (MacDonald, Time Lags in Biological Models, 1978).
+    The delay of a chain is spread about τ by τ / √order (MacDonald, Time Lags in Biological Models, 1978).
 
     Attributes:
         log_time_constant: ln τ of each lagged input (k,), with τ in seconds: the sum over the chain.
@@ -200,15 +197,15 @@ class DisturbanceModel(AbstractVectorField):
     """A disturbance predicted from its past: ẋ = f(x, u) + D e, żᵢ = (e − zᵢ) / τᵢ, e = W (z₁ − z₂, …, z_k, x, 1).
 
     The state is (x, z₁, …, z_k). e is the disturbance in the tangent space of x, D its effect on ẋ, and zᵢ is e after a
-    filter. W reads what a filter passes and the next, slower one does not, since the filters themselves are alike.
-    While x is measured, e is the measured disturbance instead: see `after`, and `hybrid_jax.estimation.observe` for
-    many samples. This is an innovations form of linear hidden dynamics (Ljung, System Identification, 1999, 4.3) with
-    fixed poles.
+    low-pass filter. W reads differences of adjacent filters, because the filters themselves are nearly equal. While x
+    is measured, e is the measured disturbance instead: see `after`, and `hybrid_jax.estimation.observe` for many
+    samples. This is an innovations form of linear hidden dynamics (Ljung, System Identification, 1999, 4.3) with fixed
+    poles.
 
     Attributes:
         field: f, with d states and e numbers in their tangent space.
         weights: W (e, k e + n + 1), in the units of ẋ, z and x.
-        sizes: by how much z₁ (k times) and x varied in the data of the first fit, and 1 (k e + n + 1), in their units;
+        sizes: the variation of z₁ (k times) and of x in the data of the first fit, in their units, and 1 (k e + n + 1);
             infinite for a state that did not vary.
         time_constants: time constants τ₁ < … < τ_k of the filters [s].
         states: indices of the n states that W reads.
@@ -243,13 +240,13 @@ class DisturbanceModel(AbstractVectorField):
     def after(
         self, x: Float[Array, " d+f"], predicted: Float[Array, " d"], measured: Float[Array, " d"], dt: float
     ) -> Float[Array, " d+f"]:
-        """Return the state after a sample, which you carry to the next one; before the first, the filters are zero.
+        """Return the state after a sample, which you pass to the next call. At first, the filters should be zero.
 
         Args:
-            x: the state at the sample before.
-            predicted: what the field predicts for this sample from there (d,).
+            x: the state at the previous sample.
+            predicted: the field's prediction of this sample from there (d,).
             measured: the sample (d,).
-            dt: time between the two [s].
+            dt: time between the two samples [s].
         """
         e = state_space(self.field, len(measured)).difference(measured, predicted) / dt
         filtered = x[len(measured) :].reshape(-1, len(e))
@@ -271,7 +268,7 @@ class DisturbanceModel(AbstractVectorField):
         return eqx.tree_at(lambda model: model.field, self, as_field(self.field).fuse_for_inference())
 
     def _beyond(self, x: Float[Array, " d+f"]) -> Float[Array, " d+f"]:
-        """ẋ without the field's part."""
+        """Return ẋ without the contribution of the field."""
         own, filtered = x[: len(x) - self.hidden], x[len(x) - self.hidden :]
         e = self.disturbance(x)
         retract = partial(state_space(self.field, len(own)).retract, own)

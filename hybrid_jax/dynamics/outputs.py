@@ -26,9 +26,9 @@ class StateSpaceModel(eqx.Module):
     Attributes:
         field: the vector field f.
         inputs: the names of the signals that make up u, in order.
-        outputs: the functions h by name. Each takes the state (d,) and the input (m,), and returns a scalar or (k,). If
-            it has a third argument, this is the field with its present numbers: an accelerometer measures ẋ. A field
-            that it takes from elsewhere keeps the numbers that it has.
+        outputs: the functions h by name. Each takes the state (d,) and the input (m,), and returns a scalar or (k,). A
+            function with a third argument also gets the field, for example for an accelerometer, which measures ẋ. You
+            should not use a field from elsewhere, because its parameters would not follow the fitted ones.
         start: the expected initial state (d,).
         spread: the standard deviation of the initial state about `start` (d,): 0 if you know it, infinite if you know
             nothing about it. An attitude has three numbers here, its rotation [rad].
@@ -64,7 +64,7 @@ class StateSpaceModel(eqx.Module):
 
     @property
     def space(self) -> StateSpace:
-        """The state space of the field; states that it does not describe are quantities of their own."""
+        """The state space of the field, with a quantity for each state that it does not describe."""
         return state_space(self.field, self.size)
 
     def begin(self, x0: Float[Array, " d"], u: Float[Array, "t m"], dt: float):
@@ -78,12 +78,10 @@ class StateSpaceModel(eqx.Module):
         return x0, u
 
     def output(self, name: str, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " k"]:
-        """Compute an output in a state, in the unit of its measurement.
+        """Compute an output (k,) in the state x under the input u, in the unit of its measurement.
 
         Args:
-            name: of the output.
-            x: the state (d,).
-            u: the input (m,).
+            name: name of the output.
         """
         h = self.outputs[name]
         own = (self.field,) if len(inspect.signature(h).parameters) > 2 else ()
@@ -96,7 +94,7 @@ class StateSpaceModel(eqx.Module):
         """Subtract the measurement from the prediction.
 
         Args:
-            name: of the output.
+            name: name of the output.
             predicted: as returned by `output` (k,).
             y: the measurement (k,).
         """

@@ -54,31 +54,32 @@ class RigidBody(AbstractVectorField):
         ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
         m f = C (τ_y, −τ_x, 0) − D Rᵀv − m c Rᵀv,   E = diag(1, 1, 0)
 
-    T and τ are thrust and torque of the rotors about the centre of mass; a rotor's thrust is k_i u_i², with one k or
-    one for each, and G scales the torque where the speeds do not determine it. Rotor drag D, the moment A and the
-    damping B: Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag for
-    accurate tracking of high-speed trajectories", 2018 (A there has the other sign). C is a cable that pulls at 1/C
-    below the centre of mass: the state lacks the load's position, but the torque that balances its moment reveals it.
+    T and τ are thrust and torque of the rotors about the centre of mass. A rotor's thrust is k_i u_i², with the same or
+    different k_i, and G scales the torque where the speeds do not determine it. For rotor drag D, the moment A and the
+    damping B see Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag
+    for accurate tracking of high-speed trajectories", 2018 (A has the other sign there). C is a cable that pulls at 1/C
+    below the centre of mass. The state lacks the load's position, but the torque that balances its moment reveals it.
 
-    S and λ describe a state estimator that takes all force but gravity to be along the body's z axis, and corrects its
-    velocity v̂ for other forces only by the position: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the thrust.
+    S and λ describe a state estimator that assumes that all force but gravity is along the body's z axis, and corrects
+    its velocity v̂ for other forces only by the position: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the thrust.
     Then v − v̂ is λ times the force in the log: f plus the residual. S models the same for drag only.
 
     Three corrections describe a change of the body (`corrected`): `efficiency` e, a rotor's thrust and reaction torque
-    relative to a sound one at the same speed; `reaction_torque`, a factor of all reaction torques, for example of other
-    propellers; and `added_drag` c [1/s] along the body's axes.
+    relative to an intact rotor at the same speed; `reaction_torque`, a factor of all reaction torques, for example for
+    other propellers; and `added_drag` c [1/s] along the body's axes.
 
     Parameters are deviations from nominal that start at zero, so that one learning rate fits all: positive ones as
-    log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The rotors' lag
-    is applied to the log (`hybrid_jax.flights.checks.cleaning`): four more states would be unknown in each window.
+    log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The lag of the
+    rotors is applied to the log instead (`hybrid_jax.flights.checks.cleaning`), because their speeds as states would
+    be unknown at the start of each window.
 
     Attributes:
         deviations: the deviation of each learned parameter from nominal, by name; for shapes see `shape_of`.
         vehicle: the constants of the vehicle, which are the nominal values.
         terms: nominal values of further terms; those that are zero and not learned cost nothing.
-        wrench: whether a residual is a force and a torque rather than an acceleration. Its v̇ and ω̇ are then given at
-            nominal mass and inertia and scaled by nominal / m and nominal / I, so that a learned aerodynamic torque
-            remains valid when the inertia changes.
+        wrench: whether a residual is a force and a torque instead of an acceleration. Its v̇ and ω̇ are then valid at
+            nominal mass and inertia, and scaled by nominal / m and nominal / I. For example, a learned aerodynamic
+            torque remains valid when the inertia changes.
 
     Raises:
         ValueError: if a name is unknown, only a ratio or product of two parameters is identifiable, or a type is wrong.
@@ -171,7 +172,7 @@ def rigid_body(
         wrench: whether its residual is a force and a torque, see `RigidBody`.
 
     Raises:
-        ValueError: see `check_names`.
+        ValueError: if names are unknown, given twice, or not identifiable together.
     """
     check_names(tuple(learn))
     deviations = {name: jnp.zeros(shape_of(vehicle, name)) for name in learn}
@@ -179,7 +180,7 @@ def rigid_body(
 
 
 def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
-    """The rigid body with each of θ_p at nominal times a random factor, log-uniform from low to high."""
+    """Return a rigid body with each of θ_p at nominal times a random factor, log-uniform from low to high."""
     if not 0 < low <= high < np.inf:
         raise ValueError(f"low and high must be two factors, 0 < low <= high, got {low} and {high}")
     factors = jax.random.uniform(key, (len(LEARNED),), minval=np.log(low), maxval=np.log(high))
@@ -187,7 +188,7 @@ def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: fl
 
 
 def corrected(field: AbstractVectorField, names: Iterable[str] = CORRECTIONS) -> AbstractVectorField:
-    """The field with corrections of its rigid bodies, initially without effect, unless it has any already."""
+    """Return the field with corrections of its rigid bodies, initially without effect, unless it has any already."""
 
     def larger(body: RigidBody) -> RigidBody:
         dtype = jnp.result_type(*jax.tree.leaves(body) or [float])
@@ -198,7 +199,7 @@ def corrected(field: AbstractVectorField, names: Iterable[str] = CORRECTIONS) ->
 
 
 def uncorrected(field: AbstractVectorField) -> AbstractVectorField:
-    """The field without the corrections that are zero; outside of compiled code."""
+    """Return the field without corrections if all are zero; outside of compiled code."""
 
     def smaller(body: RigidBody) -> RigidBody:
         kept = {name: value for name, value in body.deviations.items() if name not in CORRECTIONS}
@@ -209,7 +210,7 @@ def uncorrected(field: AbstractVectorField) -> AbstractVectorField:
 
 
 def hold_corrections(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with its corrections as constants, which are no parameters; outside of compiled code."""
+    """Return the field with its corrections as constants instead of parameters; outside of compiled code."""
 
     def held(body: RigidBody) -> RigidBody:
         given = {name: body.deviations[name] for name in CORRECTIONS if name in body.deviations}
@@ -229,7 +230,7 @@ def _with_bodies(field: AbstractVectorField, change: Callable[[RigidBody], Rigid
 
 
 def nominal(vehicle: Vehicle) -> dict[str, float]:
-    """The vehicle's own Ix, Iy [kg m²] and k [N/(rad/s)²]."""
+    """Return the vehicle's own Ix, Iy [kg m²] and k [N/(rad/s)²]."""
     return {"Ix": vehicle.inertia[0], "Iy": vehicle.inertia[1], "k": vehicle.thrust_coefficient}
 
 

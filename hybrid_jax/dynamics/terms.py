@@ -13,7 +13,7 @@ POSITIVE = {"mass": (), "Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,),
 SIGNED = {"torque_gain": (3,), "centre_of_mass": (2,), "drag": (3,), "cable_pull": (2,), "aerodynamic_moment": (3, 3)}
 SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": ()}
 SHAPES = POSITIVE | SIGNED  # of all learnable parameters, for four rotors; see `shape_of`
-OF_VELOCITY = {"drag", "aerodynamic_moment", "velocity_lag", "velocity_gain"}  # no effect where it is not known
+OF_VELOCITY = {"drag", "aerodynamic_moment", "velocity_lag", "velocity_gain"}  # not identifiable without a velocity
 # Of a body that has changed; see `rigid_body.corrected`.
 CORRECTIONS = {"efficiency": (4,), "reaction_torque": (), "added_drag": (3,)}
 LOGARITHMIC = (*POSITIVE, "efficiency", "reaction_torque")
@@ -32,7 +32,7 @@ class Terms:
         cable_pull: C along x and y, the inverse of the distance below the centre of mass where a cable pulls [1/m].
         aerodynamic_moment: A, one row for each of the moments [N s].
         rate_damping: B about x, y and z [N m s].
-        velocity_gain: S, the position's derivative over the logged velocity.
+        velocity_gain: S, the ratio of the position's derivative to the logged velocity.
         velocity_lag: λ, time constant of the estimated velocity for forces across the thrust [s].
         motor_time_constant: lag of the rotors behind logged motor values [s]; applied to logs, not by the field.
 
@@ -75,12 +75,12 @@ def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
 
 
 def shape_of(vehicle: Vehicle, name: str) -> tuple[int, ...]:
-    """The shape of a learnable parameter or correction of this vehicle."""
+    """Return the shape of a learnable parameter or correction of this vehicle."""
     return (vehicle.rotors,) if name in ("k_rotors", "efficiency") else (SHAPES | CORRECTIONS)[name]
 
 
 def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...]]:
-    """The nominal value of everything in `SHAPES` and `CORRECTIONS`, number by number; SI units."""
+    """Return the nominal values [SI units] of everything in `SHAPES` and `CORRECTIONS`, number by number."""
     k, (ix, iy, iz) = vehicle.thrust_coefficient, vehicle.inertia
     own = {"Ix": (ix,), "Iy": (iy,), "Iz": (iz,), "k": (k,), "k_rotors": (k,) * vehicle.rotors}
     own |= {"mass": (vehicle.mass,), "torque_coefficient": (vehicle.torque_coefficient,)}
@@ -89,7 +89,7 @@ def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...
 
 
 def units_of(vehicle: Vehicle) -> dict[str, float]:
-    """The SI value of a deviation of 1: forces and moments in the vehicle's weight and weight × arm."""
+    """Return the SI value of a deviation of 1: forces and moments in the vehicle's weight and weight × arm."""
     weight = vehicle.mass * vehicle.gravity
     arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / vehicle.rotors
     forces = {"drag": weight / SPEED, "aerodynamic_moment": weight * arm / SPEED, "rate_damping": weight * arm / RATE}

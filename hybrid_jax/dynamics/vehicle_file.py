@@ -15,7 +15,7 @@ from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import Terms, check_names
 from hybrid_jax.vehicle import TABLES, Vehicle, from_table, read_tables, require_known, vehicle_of
 
-# Learned if a file does not say what: without the aerodynamics, inertia would take a part of them.
+# The default of `learn`. Without the aerodynamics, inertia would absorb a part of them.
 LEARN = ("Ix", "Iy", "Iz", "k_rotors", "rate_damping", "drag", "aerodynamic_moment")
 LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.checks.cleaning`
 

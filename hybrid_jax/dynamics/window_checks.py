@@ -1,4 +1,4 @@
-"""Checks of windows against the field that they are for."""
+"""Check windows against the field that predicts them."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.state_space import Attitude, Quantity, StateSpace
 from hybrid_jax.trajectories import Trajectories, check, last_measured
 
-ALIKE, FAR = 0.9, 3.0  # correlation of a rate with what it is the rate of, and a factor between them that is a unit
+ALIKE, FAR = 0.9, 3.0  # correlation of changes and integrated rates; factor beyond which their units differ
 TINY = 1e-12  # added to the size of a change
 SOME, FASTEST = 200, 8  # windows, and samples of them, whose rates are compared
 
@@ -23,7 +23,7 @@ SOME, FASTEST = 200, 8  # windows, and samples of them, whose rates are compared
 def check_windows(
     field: AbstractVectorField, windows: Trajectories, name: str = "windows", missing: bool = False
 ) -> Trajectories:
-    """The checked windows, without jumps between representations of a state, in the parameters' precision if double.
+    """Return checked windows without jumps between representations of a state, in double precision if the field is.
 
     If `missing`, x may contain NaN where a state was not measured.
     """
@@ -39,7 +39,7 @@ def check_windows(
 
 
 def _warn_of_turns(space: StateSpace, x0, x, name: str) -> None:
-    """Warn of numbers that jump by 2π, as an angle does where it is wrapped, and otherwise change little."""
+    """Warn about numbers that jump by 2π, like a wrapped angle, and otherwise change little."""
     if checks.is_traced(x0) or checks.is_traced(x):
         return
     path = np.concatenate([np.asarray(x0)[:, None], x], axis=1)
@@ -51,14 +51,14 @@ def _warn_of_turns(space: StateSpace, x0, x, name: str) -> None:
 
 
 def turns(path: Float[np.ndarray, "n t k"], turn: float = 2 * np.pi) -> Int[np.ndarray, " k"]:
-    """In how many windows each number changes at once by about a turn; zero if it also has other large changes."""
+    """Count the windows in which each number changes at once by about a turn; zero if it has other large changes."""
     moved = np.abs(np.diff(path, axis=1)).max(axis=1, initial=0.0)
     large = moved > turn / 4
     return np.where((~large | (np.abs(moved - turn) < turn / 6)).all(axis=0), large.sum(axis=0), 0)
 
 
 def _warn_of_units(field: AbstractVectorField, space: StateSpace, windows: Trajectories, name: str) -> None:
-    """Warn of a state that is the rate of another one in the physics, but of another unit in the windows."""
+    """Warn about a state that is the rate of another one in the physics, but has another unit in the windows."""
     if any(map(checks.is_traced, jax.tree.leaves((field, windows)))):
         return
     windows = jax.tree.map(np.asarray, windows[:: -(-len(windows) // SOME)])
@@ -73,7 +73,7 @@ def _warn_of_units(field: AbstractVectorField, space: StateSpace, windows: Traje
         fast = np.argsort(-np.abs(x[:, j]))[:FASTEST]
         try:
             slopes = np.asarray(_slopes(physics_of(as_field(field)), jnp.asarray(x[fast]), jnp.asarray(u[fast])))
-        except Exception:  # a field that does not take these windows is refused where it is first integrated
+        except Exception:  # a field that does not accept these windows raises an error when it is first integrated
             return
         rates = _steps(space, np.stack([x[fast] + 0 * slopes, x[fast] + slopes], axis=-2).astype(float))[..., 0, i]
         if np.abs(rates - x[fast, j]).max() < 0.05 * np.abs(x[fast, j]).max():
@@ -83,7 +83,7 @@ def _warn_of_units(field: AbstractVectorField, space: StateSpace, windows: Traje
 
 @jit_by_size(UNOPTIMISED)
 def _slopes(field: AbstractVectorField, x: Float[Array, "n d"], u: Float[Array, "n m"]):
-    """Return ẋ with these and with other parameters: what is a rate for both is one by its meaning."""
+    """Return ẋ with these and with other parameters; a state that is a rate for both is one by definition."""
     theta, at = ravel_learned(field)
     return jax.lax.map(lambda theta: jax.vmap(at(theta))(x, u), jnp.stack([theta, 1.3 * theta + 0.1]))
 
@@ -101,14 +101,14 @@ def _steps(space: StateSpace, path: Float[np.ndarray, "*n t d"]) -> Float[np.nda
 
 
 def foreign_units(moved: Float[np.ndarray, "s e"], integrated: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "e d"]:
-    """How many times the changes the integrals are, where both are alike but for a factor that is a unit; else 0."""
+    """Return the ratio of integrals to changes where they are proportional and the ratio is another unit; else 0."""
     sizes = np.linalg.norm(moved, axis=0)[:, None] + TINY, np.linalg.norm(integrated, axis=0)
     alike, gains = moved.T @ integrated > ALIKE * sizes[0] * sizes[1], sizes[1] / sizes[0]
     return np.where(alike & ~((gains > 1 / FAR) & (gains < FAR)), gains, 0.0)
 
 
 def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectories:
-    """`check_windows` without the check of the states."""
+    """Convert windows as `check_windows` does, without checking the states."""
     double = any(eqx.is_inexact_array(leaf) and leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(field))
     if double and windows.x0.dtype != jnp.float64:  # a step of the solver keeps a type
         windows = replace(windows, **{part: getattr(windows, part).astype(jnp.float64) for part in ("x0", "u", "x")})

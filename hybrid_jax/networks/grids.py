@@ -21,7 +21,7 @@ class GridNetwork(AbstractVectorField):
     A kernel of 1 is a pointwise reaction. A kernel of 3 is a convolution of 3 × 3, then one of 1 × 1; unlike a kernel
     of 1, it can express derivatives in space, for example the Laplacian.
 
-    The neighbours are gathered, and one product serves all points: on a CPU the derivative of a convolution of XLA
+    The neighbours are gathered for one product over all points, because on a CPU the derivative of XLA's convolution
     takes ten times as long. In training mode the hidden units are recomputed for the gradient (`jax.checkpoint`), which
     takes half the time and a twentieth of the memory.
 
@@ -51,13 +51,11 @@ class GridNetwork(AbstractVectorField):
         return self(x, u), columns.reshape(-1, dx.shape[1])
 
     def parameter_columns(self, x, u):
-        found = jax.vmap(lambda near, held: as_field(self.network).parameter_columns(near, held), 1, 1)(
-            *self.points(x, u)
-        )
+        found = jax.vmap(as_field(self.network).parameter_columns, 1, 1)(*self.points(x, u))
         return found.reshape(-1, found.shape[-1])
 
     def points(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> tuple[Array, Array]:
-        """Return the network's input, with a column for each point of each sample: neighbours (k, n), input (m, n)."""
+        """Return the network's inputs, with a column for each point of each sample: neighbours (k, n) and u (m, n)."""
         near = jnp.concatenate(self.grid.moved(self.grid.fields(x), self.kernel))
         u = u[: self.network.weight_in.shape[1] - len(near)]
         held = jnp.broadcast_to(jnp.expand_dims(u, (*self.grid.axes,)), (len(u), *near.shape[1:]))

@@ -1,4 +1,4 @@
-"""f_d: a fully connected network with one hidden layer and batch normalisation (paper, App. A.1), and linear maps."""
+"""Networks f_d with one hidden layer and batch normalisation (paper, App. A.1), and linear maps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ ACTIVATIONS: dict[str, Activation] = {
 
 @dataclass(frozen=True)
 class SmoothRelu:
-    """½ (z + √(z² + 1/β²)): ReLU with all derivatives, at most 1/(2β) above it, at zero. ValueError unless β > 0."""
+    """A smooth ReLU, ½ (z + √(z² + 1/β²)), which is at most 1/(2β) larger, at zero. ValueError unless β > 0."""
 
     beta: float
 
@@ -50,14 +50,14 @@ class SmoothRelu:
 
 
 def function_of(activation: str | SmoothRelu) -> Activation:
-    """The activation function of a network, which stores only its name so that it can be sent to another process."""
+    """Return an activation function. Networks store only its name, so that they can be sent to another process."""
     return ACTIVATIONS[activation] if isinstance(activation, str) else activation
 
 
 class FusedNetwork(AbstractVectorField):
     """ẋ = W₂ σ(W₁ z + c) + A z + b, z = [x, scaled u]: a network with its normalisation folded in, and a linear map.
 
-    The same map as `ResidualNetwork`, or `LinearSkip` around one, in a layout for few samples at a time, for example in
+    It is equal to a `ResidualNetwork`, or `LinearSkip` around one, but faster for few samples at a time, for example in
     a controller: one product serves W₁ and A, and the weights of an input are contiguous.
     """
 
@@ -78,7 +78,7 @@ class FusedNetwork(AbstractVectorField):
         return jnp.split(both + expand_trailing(self.bias, both), [len(self.weight_out)])  # pyright: ignore[reportReturnType]
 
     def linearize(self, x, u, dx, du):
-        """The Jacobian by z is one product over the hidden units, whatever the number of directions."""
+        """Differentiate by one product over the hidden units for any number of directions."""
         z, dz = jvp_columns(self.scaling.concatenate, (x, u), (dx, du))
         hidden, linear = self.layer(z)
         weight, skip = self.weight_in[:, : len(hidden)], self.weight_in[:, len(hidden) :]
@@ -90,7 +90,7 @@ class FusedNetwork(AbstractVectorField):
 class ResidualNetwork(AbstractVectorField):
     """A network with one hidden layer, ẋ = W₂ σ(norm(W₁ z)) + b₂ with z = [x, scaled u] (paper: 17 → 64 → 13).
 
-    W₁ has no bias, because the normalisation has a shift or would remove it.
+    W₁ has no bias, because the normalisation has one or would remove it.
 
     Attributes:
         weight_in: W₁ (h, m), for h hidden units and the m numbers of z.
@@ -110,8 +110,8 @@ class ResidualNetwork(AbstractVectorField):
     scaling: AbstractScaling = eqx.field(default_factory=InputScaling)
     activation: str | SmoothRelu = eqx.field(static=True, default="relu")
 
-    state_size = property(lambda self: len(self.bias_out), doc="d, where the network is a field by itself.")
-    input_size = property(lambda self: self.weight_in.shape[1] - len(self.bias_out), doc="m, likewise.")
+    state_size = property(lambda self: len(self.bias_out), doc="The size d of x, if the network is a whole field.")
+    input_size = property(lambda self: self.weight_in.shape[1] - len(self.bias_out), doc="The size m of u, likewise.")
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         return self.scaling.outputs(affine(self.weight_out, self.bias_out, self.activations(x, u)))
@@ -176,7 +176,7 @@ class LinearResidual(AbstractVectorField):
 class LinearSkip(AbstractVectorField):
     """ẋ = A z + f_d(x, u), z = [x, scaled u]: a linear skip connection around a network.
 
-    It represents, for example, linear drag exactly and extrapolates it beyond the data; hidden units do not.
+    For example, it represents linear drag exactly and extrapolates it beyond the data, unlike hidden units.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -274,7 +274,7 @@ def zero_output(field: AbstractVectorField) -> AbstractVectorField:
 
 
 def smoothed(field: AbstractVectorField, beta: float) -> AbstractVectorField:
-    """Replace each ReLU of a field by `SmoothRelu`; other activations stay. ValueError unless β > 0.
+    """Replace each ReLU of a field by `SmoothRelu`, but not other activations. ValueError unless β > 0.
 
     You should use this for solvers with second derivatives, which are zero for ReLU except at its kink. It changes the
     networks of this library, and modules with `jax.nn.relu` as a field, for example Equinox' MLP.

@@ -14,26 +14,26 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import AbstractBatchNorm, Moments, RunningStats, expand_trailing, record_moments
 from hybrid_jax.trajectories import Trajectories
 
-UNROLLED_INPUTS = 2  # up to this many, W z is a sum: on a CPU, to call a matrix product costs more
+UNROLLED_INPUTS = 2  # up to this many inputs, W z is a sum, because on a CPU a call of a matrix product costs more
 Channels = tuple[float, ...]
 Activation = Callable[[Float[Array, " h *b"]], Float[Array, " h *b"]]
 
 
 class AbstractScaling(eqx.Module):
-    """Scaling of a network's input [x, u] and output, which training does not change.
+    """Scaling of a network's input [x, u] and output, which is not trained.
 
     Attributes:
-        learned_from: some of the windows that the network was trained on, see `standardise.with_motion`.
+        learned_from: some of the training windows of the network, see `standardise.with_motion`.
     """
 
     learned_from: Trajectories | None = eqx.field(default=None, kw_only=True)
 
     @abstractmethod
     def concatenate(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
-        """z, the scaled [x, u]."""
+        """Return z, the scaled [x, u]."""
 
     def outputs(self, y: Float[Array, " d *b"]) -> Float[Array, " d *b"]:
-        """The network's output y in units of ẋ."""
+        """Return the network's output y in units of ẋ."""
         return y
 
 
@@ -82,16 +82,16 @@ class AbstractNorm(eqx.Module):
 
     @abstractmethod
     def infer(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
-        """The normalised W z of each sample in inference mode."""
+        """Return the normalised W z of each sample in inference mode."""
 
     def train_layers(
         self, activation: Activation, weight_in, weight_out, bias_out, z: Float[Array, "m b"]
     ) -> Float[Array, "d b"]:
-        """W₂ σ(normalised W₁ z) + b₂ on a minibatch z, a column for each sample, in training mode."""
+        """Return W₂ σ(normalised W₁ z) + b₂ on a minibatch z, a column for each sample, in training mode."""
         return affine(weight_out, bias_out, activation(self.infer(weight_in, z)))
 
     def observed(self, weight: Float[Array, "h m"], z: Float[Array, "m b"]) -> Self:
-        """The normalisation with running statistics updated by a training batch z."""
+        """Return the normalisation with running statistics updated by a training batch z."""
         return self
 
 
@@ -100,7 +100,7 @@ class AbstractAffineNorm(AbstractNorm):
 
     @abstractmethod
     def fold(self, weight: Float[Array, "h m"]) -> tuple[Float[Array, "h m"], Float[Array, " h"]]:
-        """(W', c) such that W' z + c is the normalised W z in inference mode."""
+        """Return (W', c) such that W' z + c is the normalised W z in inference mode."""
 
     def infer(self, weight, z):
         weight, bias = self.fold(weight)
@@ -111,7 +111,7 @@ class AbstractAffineNorm(AbstractNorm):
 class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
     """Batch normalisation of the hidden pre-activations h = W z, with gain γ and shift β (Ioffe and Szegedy 2015).
 
-    Training uses the minibatch's mean and variance, inference running ones, which can be folded into the weights.
+    Training uses the minibatch's mean and variance; inference uses running ones instead, folded into the weights.
     """
 
     gain: Float[Array, " h"]
@@ -128,7 +128,7 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
         return normalised_layer(self.epsilon, activation, weight_in, self.gain, self.shift, weight_out, bias_out, z)
 
     def observed(self, weight, z):
-        # By those of z, a tenth of the time: h is larger than m.
+        # The moments of h = W z follow from the moments of z, which is smaller. This takes a tenth of the time.
         mean = row_means(z)
         centred = z - mean[:, None]
         covariance = centred @ centred.T / z.shape[1]
@@ -189,11 +189,11 @@ def product(weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Arra
 def normalised_layer(
     epsilon: float, activation: Activation, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]
 ) -> Float[Array, "d b"]:
-    """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
+    """Return W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
 
-    The derivative is explicit because XLA compiles the minibatch sums of autodiff to slow loops: as products with a
-    vector of ones they take a fifth off a training step on a CPU without kernels. Together with the explicit derivative
-    by parameters (dynamics/equations.py), sweeps on a GPU take a third less. A test compares it with autodiff.
+    The derivative is explicit because XLA compiles autodiff's sums over the minibatch to slow loops. As products with
+    ones, they make a training step a fifth faster on a CPU without kernels. Together with the explicit derivative by
+    parameters (dynamics/equations.py), sweeps on a GPU take a third less. A test compares it with autodiff.
     """
     arrays = weight_in, gain, shift, weight_out, bias_out, z
     precision = jnp.result_type(*arrays)  # each derivative is returned in the precision of its array
@@ -206,12 +206,12 @@ def _layer(*arguments):
 
 
 def _forward(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z):
-    # W₁ (z − z̄) is W₁ z less its mean, and needs no subtraction of two large numbers for its variance.
+    # W₁ (z − z̄) is W₁ z minus its mean, without subtracting two large numbers.
     centred = z - row_means(z)[:, None]
     hidden = weight_in @ centred
     inverse_deviation = jax.lax.rsqrt(row_means(jnp.square(hidden)) + epsilon)
     active = activation((gain * inverse_deviation)[:, None] * hidden + shift[:, None])
-    # The active units are computed again in `_backward`: that takes less than to keep them for forty evaluations.
+    # The active units are computed again in `_backward`, which is faster than keeping them for forty evaluations.
     saved = (weight_in, gain, shift, weight_out, centred, hidden, inverse_deviation)
     return weight_out @ active + bias_out[:, None], saved
 
@@ -238,10 +238,10 @@ _layer.defvjp(_forward, _backward)
 
 
 def _transposed(matrix: Float[Array, "r c"]) -> Float[Array, "c r"]:
-    # As a matrix of its own: a small product that reads its left factor by columns takes half as long again on a CPU.
+    # On a CPU, a small product that reads its left factor by columns takes half as long again.
     return jax.lax.optimization_barrier(matrix.T)
 
 
 def row_means(rows: Float[Array, "r b"]) -> Float[Array, " r"]:
-    # A row times the transposed: on a CPU less than half of what the matrix times a column takes.
+    # On a CPU, a row times the transposed matrix takes less than half as long as the matrix times a column.
     return (jnp.full((1, rows.shape[1]), 1 / rows.shape[1], rows.dtype) @ rows.T)[0]

@@ -18,8 +18,8 @@ from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import AbstractScaling, Channels, ChannelScaling
 from hybrid_jax.trajectories import Trajectories, last_measured
 
-SAMPLES, SMALL = 10_000, 64  # intervals that are looked at, at most, of a state of so many numbers; fewer of a larger
-KEPT, MOST = 50_000, 100  # numbers and windows of its motion that a network keeps, at most
+SAMPLES, SMALL = 10_000, 64  # most intervals used, for states of up to 64 numbers; fewer for larger states
+KEPT, MOST = 50_000, 100  # most numbers and windows that a network stores
 FLOOR = 0.01  # least scale of an input over the size of its mean, and of an output over the size of ẋ
 
 
@@ -45,7 +45,7 @@ class _Probe(AbstractBatchNorm, AbstractScaling):
 
 
 def with_motion(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
-    """The field with some of its training windows stored in the scaling of each network, for `hj.adapt`."""
+    """Store some of the training windows in the scaling of each network, for `hj.adapt`."""
     places = np.linspace(0, len(windows) - 1, min(len(windows), max(1, KEPT // windows[0].x.size), MOST)).astype(int)
     if not (networks := _networks(field)):
         return field
@@ -55,7 +55,7 @@ def with_motion(field: AbstractVectorField, windows: Trajectories) -> AbstractVe
 
 
 def motion_of(field: AbstractVectorField) -> Trajectories | None:
-    """The training windows stored by `with_motion`, or None."""
+    """Return the training windows stored by `with_motion`, or None."""
     return next((one.learned_from for one in _scalings(field) if one.learned_from is not None), None)
 
 
@@ -63,8 +63,7 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     """Set each `ChannelScaling` of a field that is not set yet (see `residual_network`) from windows.
 
     Inputs are scaled to mean 0 and standard deviation 1. Outputs are scaled to the RMS of the derivative that the rest
-    of the field lacks, if there is one for each state or, in a `GridNetwork`, for each component. Scalings that are
-    already set do not change.
+    of the field lacks, if there is an output for each state or, in a `GridNetwork`, for each component.
 
     Args:
         field: a field that contains networks. A field without networks is returned unchanged.
@@ -80,9 +79,8 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     every = -(-samples // max(1, SAMPLES * SMALL // max(SMALL, before.shape[2])))
     x, u, after = (rows.reshape(samples, rows.shape[-1])[::every] for rows in (before, u, after))  # u may be empty
     zeros = (jnp.zeros(network.weight_in.shape[1], jnp.result_type(x)) for network in networks)
-    probes = [
-        _Probe(RunningStats(z, z)) if new else n.scaling for n, z, new in zip(networks, zeros, unset, strict=True)
-    ]
+    pairs = zip(networks, zeros, unset, strict=True)
+    probes = [_Probe(RunningStats(zero, zero)) if new else network.scaling for network, zero, new in pairs]
     probed = unfreeze(eqx.tree_at(_scalings, field, probes))
 
     predicted = np.asarray(rollout_batch(probed, x, u[:, None], windows.dt))[:, 0]
@@ -104,13 +102,13 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
 def _seen(
     probed: AbstractVectorField, x: Float[Array | np.ndarray, "d b"], u: Float[Array | np.ndarray, "m b"]
 ) -> list[batching.Moments]:
-    """The moments of each probe's input, in the order of the networks."""
+    """Return the moments of each probe's input, in the order of the networks."""
     seen = zip(batching.batch_norms(probed), batching.moments_of(probed, x, u), strict=True)
     return [moments for norm, moments in seen if isinstance(norm, _Probe)]
 
 
 def _output(network: ResidualNetwork, grids: list[GridNetwork], lacking, rate) -> Channels | None:
-    """The scale of the outputs of a network with one for each state, or for each component of a grid; else None."""
+    """Return the scale of a network's outputs if it has one for each state or component of a grid; else None."""
     if len(network.bias_out) == len(rate):
         return _positive(lacking, FLOOR * rate)
     if not any(grid.network is network and grid.grid.size == len(rate) for grid in grids):
@@ -121,7 +119,7 @@ def _output(network: ResidualNetwork, grids: list[GridNetwork], lacking, rate) -
 
 
 def _positive(scale: Float[np.ndarray, " d"], floor: Float[np.ndarray, " d"]) -> Channels:
-    """The scale of each channel, at least its floor; 1 where both are zero or the scale is not finite."""
+    """Return the scale of each channel, at least its floor; 1 where both are zero or the scale is not finite."""
     scale = np.maximum(scale, floor)
     return tuple(np.where(np.isfinite(scale) & (scale > 0), scale, 1.0).tolist())
 

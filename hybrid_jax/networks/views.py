@@ -31,11 +31,10 @@ def _check(inputs: str, outputs: str, vehicle: Vehicle) -> None:
 
 
 class View(AbstractWrapper):
-    """The field inside reads some features of a multirotor's state and returns some derivatives.
+    """A field that reads some features of a multirotor's state and returns some derivatives.
 
-    Other derivatives are zero: the physics ṗ = v and q̇ = ½ q ⊗ [0, ω] is exact.
-    In the body frame it returns ṗ, v̇ and the quaternion r of q̇ = q ⊗ r, which makes it equivariant to yaw and to
-    translation in x and y.
+    Other derivatives are zero, because the physics ṗ = v and q̇ = ½ q ⊗ [0, ω] is exact. In the body frame it returns
+    ṗ, v̇ and the quaternion r of q̇ = q ⊗ r, which makes it equivariant to yaw and to translation in x and y.
     """
 
     inputs: str = eqx.field(static=True, default="all")
@@ -119,7 +118,7 @@ class RotorThrust(AbstractVectorField):
 
     By dimensional analysis, the ground effect on a rotor in hover is a function of its radius R over its altitude h
     (Cheeseman and Bennett 1955). One network learns it from the data of all rotors; force and torque follow from the
-    vehicle's geometry. The other derivatives are exactly zero. f must have no batch normalisation.
+    vehicle's geometry. The other derivatives are zero. The network must not have batch normalisation.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -137,7 +136,7 @@ class RotorThrust(AbstractVectorField):
         return RotorThrust(as_field(self.field).fuse_for_inference(), self.vehicle)
 
     def linearize(self, x, u, dx, du):
-        """Two derivatives of the network for each rotor, whatever the number of directions."""
+        """Differentiate the network twice for each rotor, for any number of directions."""
         near, d_near = jvp_columns(lambda x: _nearness(x, self.vehicle), (x,), (dx,))
         share, pullback = jax.vjp(self.share, near, u)
         by_near, by_u = pullback(jnp.ones_like(share))
@@ -145,11 +144,11 @@ class RotorThrust(AbstractVectorField):
         return jvp_columns(self.write, (x, u, share), (dx, du, d_share))
 
     def share(self, near: Float[Array, " rotors *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " rotors *b"]:
-        """f of each rotor, for its R / h and its speed [rad/s]."""
+        """Return f of each rotor, for its R / h and its speed [rad/s]."""
         return jax.vmap(self.field)(near[:, None], u[:, None])[:, 0]
 
     def write(self, x, u, share: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
-        """ẋ from the additional thrust of each rotor as a fraction of k u²."""
+        """Return ẋ from the additional thrust of each rotor as a fraction of k u²."""
         vehicle = self.vehicle
         thrust = vehicle.thrust_coefficient * u * u * share
         x_moment, y_moment = (dot(arms, thrust) for arms in zip(*vehicle.rotor_positions, strict=True))
@@ -161,12 +160,12 @@ class RotorThrust(AbstractVectorField):
 
 
 def _up(x: Float[Array, " 13 *b"]) -> Float[Array, " 3 *b"]:
-    """The world's up in the body frame, Rᵀe_z."""
+    """Return the up direction in the body frame, Rᵀe_z."""
     return rotation.body_z(rotation.conjugate(x[QUATERNION]))
 
 
 def _nearness(x: Float[Array, " 13 *b"], vehicle: Vehicle) -> Float[Array, " rotors *b"]:
-    """R / h of each rotor, its altitude h at least R / 2."""
+    """Return R / h of each rotor, with its altitude h at least R / 2."""
     up = _up(x)
     heights = jnp.stack([x[2] + along * up[0] + across * up[1] for along, across in vehicle.rotor_positions])
     return vehicle.rotor_radius / jnp.maximum(heights, vehicle.rotor_radius / 2)
