@@ -65,7 +65,7 @@ def interpolate(t: Float[np.ndarray, "*m"], at: Float[np.ndarray, " n"], values:
 
 
 def mean_of_held(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values: Float[np.ndarray, "n d"]):
-    """Average zero-order-held values over each interval of t, and return the last value; slower ones are unchanged."""
+    """Average zero-order-held values over each interval of t, and append the last value; slow signals do not change."""
     area = integral(Signal(at, values), t, "held")
     held = values[np.searchsorted(at, t[-1:], side="right") - 1]
     return np.concatenate([np.diff(area, axis=0) / np.diff(t)[:, None], held])

@@ -14,9 +14,9 @@ from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import GAP, ROTOR_UNITS, Recording, Signal
 from hybrid_jax.vehicle import MOST_ROTORS
 
-DT = 0.01  # s, of logs whose signals have times of their own
+DT = 0.01  # s, for logs whose signals have different times
 STATES = ("position", "velocity", "attitude", "rates")
-WHOLE = 0.9  # share of complete rows in a CSV file above which the flight has their times
+WHOLE = 0.9  # share of complete rows of a CSV file above which their times are used
 # What to log, by format, ready to paste.
 CRAZYFLIE = (
     *(f"stateEstimate.{each}" for each in ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz")),
@@ -30,7 +30,7 @@ ADVICE = {
     "Betaflight blackbox": "blackbox has no fields for them; use it to identify thrust, inertia and lag",
     "CSV": 'name the columns in a column map: columns="MAP.toml"',
 }
-# Topics of PX4 with the interval to log them at [ms], 0 for all; and since when those are that came later [version].
+# Topics of PX4 with their logging interval [ms], 0 for every sample; and the version that introduced a topic.
 PX4_TOPICS = {"vehicle_local_position": 0, "vehicle_attitude": 0, "sensor_combined": 5, "battery_status": 100}
 PX4_TOPICS |= {"vehicle_angular_velocity": 5, "vehicle_acceleration": 5, "actuator_motors": 5, "actuator_outputs": 5}
 PX4_TOPICS |= {"esc_status": 5, "vehicle_status": 100}
@@ -38,15 +38,15 @@ SINCE = {"vehicle_angular_velocity": (1, 10), "vehicle_acceleration": (1, 11), "
 
 
 def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] = ()) -> FlightLog:
-    """Resample a recording at intervals of dt [s] while all its signals exist; a gap in one is a gap in all.
+    """Resample a recording at intervals of dt [s] while all its signals exist. A gap in one signal is a gap in all.
 
     States are interpolated linearly and attitudes spherically; rotor speeds are averaged over each interval.
 
     Args:
         recording: the log as it was read.
         dt: interval between samples [s].
-        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, of commands as shares from 0 to 1; not needed where
-            speeds were measured, but then preferred to speeds that are slower than commands.
+        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for commands from 0 to 1. You do not need it if
+            speeds were measured, but it is used instead of them if they were sampled more slowly than the commands.
 
     Raises:
         ValueError: if a quantity is missing, or the signals have no time in common.
@@ -87,7 +87,7 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
 
 
 def flight_at(recording: Recording, dt: float | None = None, polynomial: Sequence[float] = ()) -> FlightLog:
-    """Return the flight at the times of its rows if it has such rows, else at intervals of dt [s]: see `to_flight`."""
+    """Return the flight at the times of complete CSV rows, or else at intervals of dt [s]; see `to_flight`."""
     rows = own_rows(recording)
     return to_flight(recording, dt or DT, polynomial) if rows is None else rows
 
@@ -115,7 +115,7 @@ def missing_states(recording: Recording) -> list[str]:
 
 
 def what_to_log(recording: Recording) -> str:
-    """Advise what to log, or say why a logged quantity was left out; for PX4, its topics file lists all topics."""
+    """Advise what to log, or explain why a logged quantity was left out. For PX4, its topics file lists all topics."""
     kind, program = (recording.facts.get(name, "") for name in ("format", "program"))
     for note in (note for note in recording.notes if "is not valid" in note):
         return f"{note}; wait for the estimator"
@@ -128,7 +128,7 @@ def what_to_log(recording: Recording) -> str:
 
 
 def without_common_time(recording: Recording) -> str:
-    """Describe two signals without a common time, for example from two clocks; empty if there are none."""
+    """Describe two signals without a common time, for example from two clocks; "" if all have one."""
     signals = [signal for name, signal in recording.signals.items() if len(signal) and name != "voltage"]
     if not signals:
         return ""
@@ -155,6 +155,6 @@ def _speeds(recording: Recording, motors: Signal, polynomial: Sequence[float]) -
     if not len(polynomial):
         need = "polynomial=(c0, c1, …) maps them to rad/s = c0 + c1 command + …"
         raise ValueError(f"{recording.name}: has only motor commands from 0 to 1 ({motors.source}); {need}")
-    # A motor at command 0 stands still, whatever the polynomial says.
+    # A motor at command 0 stands still, even if c0 is not 0.
     speeds = np.polynomial.polynomial.polyval(motors.values, polynomial)
     return np.where(motors.values > 0, np.maximum(speeds, 0.0), 0.0)

@@ -28,7 +28,7 @@ SUFFIXES = {".csv": CSV, ".csv.gz": CSV, ".ulg": ULOG, ".mcap": ROSBAG, ".db3": 
 SUFFIXES |= {".bbl": BLACKBOX, ".bfl": BLACKBOX}
 MAGICS = {b"ULog": ULOG, b"\x89MCAP": ROSBAG, b"SQLite format 3": ROSBAG, b"#ROSBAG": ROSBAG}
 MAGICS |= {b"H Product:Blackbox": BLACKBOX}
-# Formats that are known and not read, by their first bytes or suffix: what they are, and the way out.
+# Unsupported formats, by their first bytes or suffix, with what to do instead.
 CONVERT = (
     "an ArduPilot DataFlash log, not read: mavlogdump.py --format csv --types TYPE FILE > TYPE.csv for TYPE ATT, "
     "IMU, XKF1 and RCOU; join them to one table by TimeUS, with empty cells, and say what it contains: "
@@ -38,7 +38,7 @@ PX4LOG = "a log of PX4's sdlog2, not read: log .ulg, as PX4 does from 1.4 on"
 UNREAD = {".px4log": PX4LOG, b"\xa3\x95\x80": CONVERT, b"FMT, 128": CONVERT}
 UNREAD |= {b"PK\x03\x04": "a zip archive: unpack it and give its logs"}
 UNREAD |= {".tlog": "MAVLink telemetry, not read: it is too slow; give the log of the vehicle's own card"}
-OTHER = "no format that is read"
+OTHER = "not a supported format"
 BAG = "metadata.yaml"  # makes a folder one recording of ROS 2
 Failed = Literal["refuse", "warn"]
 
@@ -130,12 +130,12 @@ def report(found: Sequence[tuple[str, Check]], failed: Failed) -> None:
 
 
 def format_of(path: str | Path) -> tuple[str, str]:
-    """Return the format of a file or folder, or "" and why it cannot be read."""
+    """Return the format of a file or folder; or "" and why it cannot be read."""
     path = Path(path)
     if path.is_dir():
         return (ROSBAG, "") if (path / BAG).is_file() else ("", "a folder; give it by itself")
     if not path.is_file():
-        return "", "no regular file"
+        return "", "not a regular file"
     head, name = _head(path), path.name.lower()
     if is_crazyflie(head):
         return CRAZYFLIE, ""
@@ -199,7 +199,7 @@ def read_recording(
     elif kind == ROSBAG and Path(path).is_file() and _head(path, unpack=False).startswith(GZIP):
         kind, why = "", f"a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}"
     elif why == OTHER:
-        why = f"is none of {', '.join(dict.fromkeys(SUFFIXES.values()))}, {CRAZYFLIE}"
+        why = f"is not a log of {', '.join(dict.fromkeys(SUFFIXES.values()))} or {CRAZYFLIE}"
     try:
         if why:
             raise ValueError(why)

@@ -8,16 +8,16 @@ from jaxtyping import Bool, Float
 
 from hybrid_jax.vehicle import FEWEST_ROTORS, INPUT_NAMES, MOST_ROTORS, QUATERNION, STATE_NAMES, STATE_SIZE, input_names
 
-NORM_TOLERANCE = 0.02  # allows |q| of two printed digits; wrong columns are hardly ever within it
+NORM_TOLERANCE = 0.02  # allows quaternions of two printed digits, but hardly ever wrong columns
 COLUMNS = ("t", *STATE_NAMES, *INPUT_NAMES)  # of a quadrotor
-LARGEST = 1e9  # of any state or motor, in SI units; more is no measurement
+LARGEST = 1e9  # largest plausible state or motor value, in SI units
 GAP = 1.5  # intervals longer than this many times the median are gaps
 JITTER = 0.1  # relative deviation from the median interval that still counts as evenly spaced
 
 
 @dataclass(frozen=True)
 class FlightLog:
-    """n samples of one flight. Quaternions become unit length and continuous in sign, with w ≥ 0 in the first.
+    """The n samples of one flight. Quaternions are normalised, and continuous in sign, with w ≥ 0 in the first.
 
     Attributes:
         t: time of each sample [s], strictly increasing.
@@ -57,7 +57,7 @@ class FlightLog:
 
     @property
     def dt(self) -> float:
-        """The median interval between samples [s], rounded to nanoseconds so that logs of one rate agree.
+        """The median interval between samples [s], rounded to nanoseconds so that logs of equal rate agree.
 
         Raises:
             ValueError: if the log has fewer than two samples.
@@ -68,13 +68,13 @@ class FlightLog:
 
 
 def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
-    """Yield impossible values: index of the sample, field and what to do."""
+    """Iterate over impossible values: index of the sample, field and what to do."""
     rotors = input_names(u.shape[1])
     for names, block in ((("t",), t[:, None]), (STATE_NAMES, x), (rotors, u)):
         sound = np.isfinite(block) if names == ("t",) else np.abs(block) < LARGEST
         for row, column in np.argwhere(~sound)[:1].tolist():
             yield row, names[column], f"is {block[row, column]:.6g}; cut the sample out (it becomes a gap) or repair it"
-    # Compare, as a difference of finite times may overflow.
+    # Times are compared, because the difference of finite times may overflow.
     for row in np.flatnonzero(t[1:] <= t[:-1])[:1] + 1:
         times = f"{t[row]:.6g} {'repeats' if t[row] == t[row - 1] else 'goes back from'} {t[row - 1]:.6g}"
         yield row, "t", f"time {times}; sort the samples, drop doubles, split restarted clocks"
@@ -106,7 +106,7 @@ def gaps(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
 
 
 def repeats(log: FlightLog) -> Bool[np.ndarray, " n"]:
-    """Whether a state equals its predecessor in every digit, which noise rules out for fresh samples."""
+    """Whether a state equals its predecessor in every digit, which noise makes impossible for fresh samples."""
     return np.concatenate([[False], (np.diff(log.x, axis=0) == 0).all(axis=1)])
 
 
@@ -131,10 +131,8 @@ def even_segments(log: FlightLog) -> list[slice]:
     """Return the segments; raise ValueError if samples are not evenly spaced within one."""
     uneven = unevenness(log)
     if uneven.any():
-        row = int(uneven.argmax())
-        found = (
-            f"the interval at {log.t[row]:.6g} s is {log.t[row + 1] - log.t[row]:.6g} s, the median is {log.dt:.6g} s"
-        )
+        at, after = log.t[int(uneven.argmax()) :][:2]
+        found = f"the interval at {at:.6g} s is {after - at:.6g} s, the median is {log.dt:.6g} s"
         raise ValueError(f"{log.name}: {found}; put the samples on even times first: dt={log.dt:.6g}")
     return segments(log)
 

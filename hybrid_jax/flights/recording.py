@@ -25,13 +25,13 @@ def unit_of(quantity: str) -> str:
 
 
 def axes_of(quantity: str, count: int) -> tuple[str, ...]:
-    """Name the axes of `count` columns of a quantity; a single column of three axes is the last."""
+    """Name the axes of `count` columns of a quantity. If it has fewer columns than axes, they are the last axes."""
     return AXES[quantity][0][-count:] if quantity in AXES else tuple(map(str, range(count)))
 
 
 @dataclass(frozen=True)
 class Recording(Record):
-    """The signals of one log, named by `QUANTITIES`. For the attributes see `hybrid_jax.records.Record`.
+    """The signals of one log, named as in `QUANTITIES`. For the attributes see `hybrid_jax.records.Record`.
 
     Raises:
         ValueError: if a quantity or axis is unknown.

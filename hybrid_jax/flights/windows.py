@@ -1,4 +1,4 @@
-"""Split logs by flight, cut them into windows, which overlap and share wind and load, and score predictions of them."""
+"""Split logs by flight, cut them into windows, and score predictions of these."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -46,19 +46,18 @@ def load_windows(
 ) -> Trajectories:
     """Read all logs of a folder, check them against the vehicle and cut them into windows.
 
-    Windows never cross a gap or a repeated sample. You get a warning of one line for each check that warns. Motors are
-    constant in each interval of a window, so faster motor signals are averaged, and you get a warning if they were
-    sampled too slowly.
+    Windows never cross a gap or a repeated sample. Motors are constant in each interval of a window, so faster motor
+    signals are averaged. You get a warning of one line for each check that warns, for example for slow motor signals.
 
     Args:
         folder: folder with one log per flight, in any format that `read_recording` reads; other files are ignored.
         vehicle: the vehicle to check the logs against.
-        dt: interval [s] to which logs of other intervals are resampled; by default all logs must share one, and those
-            whose signals have times of their own get 0.01.
+        dt: interval [s] to which logs are resampled if they have another one. By default all logs must share one, and
+            logs whose signals have different times get 0.01.
         steps: number of intervals in each window.
         stride: number of samples between the starts of two windows.
-        columns: TOML file that names the columns of CSV logs, see `hybrid_jax.flights.formats.column_map`; by default
-            the library's columns and units.
+        columns: TOML file that describes the columns of CSV logs, see `hybrid_jax.flights.formats.column_map`; by
+            default the library's columns and units.
         polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for logs with commands (0 to 1) but no speeds.
         topics: topics of a ROS bag by quantity: see `hybrid_jax.flights.formats.rosbag`.
         motor_order: index in the log of each rotor's motor, from 0.
@@ -95,7 +94,7 @@ def manoeuvre_of(log: FlightLog) -> str:
 
 
 def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[FlightLog], str] = flight_of) -> Split:
-    """Split flights into those for training and those that are held out.
+    """Split flights into flights for training and held-out flights.
 
     Args:
         logs: the flights.
@@ -119,7 +118,7 @@ def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[Flig
 def folds(
     logs: Sequence[FlightLog], count: int | None = None, of: Callable[[FlightLog], str] = flight_of, seed: int = 0
 ) -> list[Split]:
-    """Split flights several times, so that each is held out once, together with all flights of its name.
+    """Split flights several times, so that each is held out once, together with all flights of the same name.
 
     Args:
         logs: the flights.
@@ -144,14 +143,14 @@ def require_common_interval(logs: Sequence[FlightLog]) -> float:
         even_segments(log)
         if log.dt != logs[0].dt:
             raise ValueError(
-                f"{log.name}: samples are {log.dt:g} s apart, those of {logs[0].name} {logs[0].dt:g} s; "
+                f"{log.name}: samples are {log.dt:g} s apart, but {logs[0].dt:g} s in {logs[0].name}; "
                 f"resample all logs with dt={max(log.dt, logs[0].dt):g}"
             )
     return logs[0].dt
 
 
 def sequences(logs: Sequence[FlightLog], steps: int) -> list[Trajectories]:
-    """Return each part of evenly sampled logs without gaps as one window, if it has more than `steps` intervals."""
+    """Return each part without gaps of evenly sampled logs as one window, if it has more than `steps` intervals."""
     parts = [(log, part) for log in logs for part in even_segments(log) if part.stop - part.start > steps]
     found = [windows_of(log.x[p], log.u[p][:-1], log.dt, steps=p.stop - p.start - 1) for log, p in parts]
     return [jax.tree.map(lambda leaf: leaf.astype(np.float32), each) for each in found]
@@ -176,7 +175,7 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: in
 
 
 def cut_each(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: int | None = None) -> list[Trajectories]:
-    """Return the windows of each flight that has one, otherwise as `cut_windows`."""
+    """Return the windows of each flight that has any, as separate batches; see `cut_windows`."""
     parts = []
     for log in require_length(logs, steps):
         long = [part for part in even_segments(log) if part.stop - part.start > steps]
@@ -191,7 +190,7 @@ def cut_each(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: int |
 
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
-    """Return the logs with at least one window of `steps` intervals; raise ValueError if there are none."""
+    """Return the logs with at least one window of `steps` intervals; ValueError if no log has one."""
     longest = [max((part.stop - part.start - 1 for part in segments(log)), default=0) for log in logs]
     if not (long := [log for log, length in zip(logs, longest, strict=True) if length >= steps]):
         names = ", ".join(map(flight_of, logs))
@@ -240,7 +239,7 @@ def flight_errors(field: AbstractVectorField, windows: Trajectories) -> FlightEr
         raise ValueError(f"windows: states of {STATE_SIZE} expected, as in vehicle.py, got {windows.x.shape[-1]}")
     RIGID_BODY_SPACE.check("windows: x0", windows.x0)
     RIGID_BODY_SPACE.check("windows: x", windows.x)
-    # The last part is padded, so that all flights share one program.
+    # The last part is padded to full length, so that all parts share one program.
     parts = (np.arange(start, start + CHUNK) % len(windows) for start in range(0, len(windows), CHUNK))
     found = [jax.device_get(_errors(field, windows[part])) for part in parts]
     return FlightErrors(*(np.concatenate(arrays)[: len(windows)] for arrays in zip(*found, strict=True)))

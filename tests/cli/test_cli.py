@@ -56,7 +56,7 @@ def test_help_of_a_verb_has_at_most_twenty_lines_and_a_dozen_options(called, ver
         (["inspect", "flights", "--dt", "0"], "inspect: --dt must be a positive"),
         (["inspect", "flights", "--columns", "v.toml"], "'vehicle': must be one of frames"),
         (["inspect", "flights", "--vehicle", "v.toml"], "v.toml: learn must be names of"),
-        (["inspect", "flights"], "flights: contains no logs, only notes.txt: no format that is read"),
+        (["inspect", "flights"], "flights: contains no logs, only notes.txt: not a supported format"),
     ],
 )
 def test_bad_input_ends_in_one_line(tmp_path, monkeypatch, called, arguments, words):

@@ -104,7 +104,7 @@ def test_a_folder_is_described_whatever_is_in_it(tmp_path, odd, called):
     assert r"broken\udcff.csv: not read: row 1, field py" in said
     assert "cost\xa0$5_or_$^6\\x1b[31m.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
     assert "2 of 3 logs are ready for a model" in said
-    assert "notes.txt: no format that is read" in (tmp_path / "report.html").read_text()
+    assert "notes.txt: not a supported format" in (tmp_path / "report.html").read_text()
     results = json.loads((tmp_path / "report.json").read_text())["rows"]
     assert [row["result"].split(":")[0] for row in results] == ["not read", "ready", "ready"]
 

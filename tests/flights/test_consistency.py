@@ -45,7 +45,7 @@ def test_a_velocity_that_never_climbs_is_found(flight):
     """Beside the mistakes of benchmarks/log_mistakes, which are planted below."""
     log = noisy(flight, np.random.default_rng(1))
     log = with_parts(log, v=log.x[:, 7:10] * [1, 1, 0])
-    for name, words in ((VELOCITY, "z alone"), (COLUMNS, "vz never changes")):
+    for name, words in ((VELOCITY, "only z"), (COLUMNS, "vz never changes")):
         assert (table(log)[name].verdict, words in table(log)[name].suggestion) == (FAILS, True)
     alone = [check for check in check_log(log, IRIS) if check.name not in NEED_VEHICLE]
     assert list(map(repr, check_log(log))) == list(map(repr, alone))  # a NaN is no equal of itself

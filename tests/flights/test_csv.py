@@ -102,7 +102,7 @@ def test_rows_that_tell_nothing_are_gaps(flight, written, cell):
     kept = np.delete(np.arange(len(flight)), [*range(300, 310), *range(500, 505), 40])
     np.testing.assert_allclose(log.x, flight.x[kept], atol=1e-12)
     assert len(raw.signals["rates"]) >= len(flight) - 6
-    assert any("velocity stands in 1190 of 1200 rows" in note for note in raw.notes)
+    assert any("1190 of 1200 rows contain velocity" in note for note in raw.notes)
 
 
 def test_joined_tables_of_several_rates_have_the_times_of_each(flight, written):

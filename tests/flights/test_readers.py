@@ -196,7 +196,7 @@ def test_numbers_beyond_any_flight_are_named(flight, tmp_path, many):
     else:
         recording = read_recording(path)
         assert len(recording.signals["position"]) == 59
-        assert any("position is no number in 1 samples, the first at 0.2 s" in note for note in recording.notes)
+        assert any("position is not a number in 1 samples, the first at 0.2 s" in note for note in recording.notes)
 
 
 @pytest.mark.parametrize("stray", [0, 600, -1])
@@ -212,7 +212,7 @@ def test_a_sample_that_tells_nothing_is_left_out_and_said(flight, written, stray
     assert len(recording.signals["rates"]) == len(ticks) - 1
     assert len(recording.signals["attitude"]) == len(ticks) - lost.sum() - (not lost[stray])
     assert len(recording.signals["attitude"].gaps()) == 2
-    for words in ("1 samples with a time far", "attitude is no rotation in"):
+    for words in ("1 samples with a time far", "attitude is not a rotation in"):
         assert any(words in note for note in recording.notes)
     nothing = names | {name: 0 * flight.t for name in STATES if name.startswith("stateEstimate.q")}
     refusal(lambda: read_recording(written(usd(nothing, ticks))), "norm 0, must be 1")
@@ -257,6 +257,6 @@ def test_a_folder_of_all_kinds_says_what_it_reads(flight, written, tmp_path):
     bag(tmp_path / "run", flight[:20], "MCAP")
     logs, left = find_logs(tmp_path)
     assert [path.name for path in logs] == ["log00", "run"]
-    said = {"firmware.bin": "no format that is read", "more": "a folder; give it by itself", "notes.txt": "empty"}
+    said = {"firmware.bin": "not a supported format", "more": "a folder; give it by itself", "notes.txt": "empty"}
     assert {path.name: why for path, why in left.items()} == said
     refusal(lambda: load_logs(tmp_path / "more"), "contains no flights")

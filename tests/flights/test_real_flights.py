@@ -66,7 +66,7 @@ def test_all_crazyflie_logs_are_whole():
         assert "damage" not in recording.facts
         assert recording.rotors == 4
         assert not [line for line in failures(check_recording(recording), "log") if "quantities" not in line]
-    assert set(find_logs(RAW / "sysid_tools")[1].values()) == {"no format that is read"}
+    assert set(find_logs(RAW / "sysid_tools")[1].values()) == {"not a supported format"}
 
 
 @needs_logs

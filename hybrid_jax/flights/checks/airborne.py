@@ -1,4 +1,4 @@
-"""Detect when a vehicle is in the air; on the ground, and near it, accelerations do not show the thrust."""
+"""Detect when a vehicle is in the air. On the ground, and near it, accelerations do not show the thrust."""
 
 from collections.abc import Iterable
 
@@ -9,9 +9,9 @@ from hybrid_jax.flights.log import FlightLog, runs_of, sound_intervals
 from hybrid_jax.flights.recording import Recording
 
 IDLE = 0.3  # share of the power in flight below which motors idle
-RESTING = 0.5  # s of idle motors, and more, end a flight
+RESTING = 0.5  # s of idle motors that end a flight
 CLEAR = 0.2  # m above where the vehicle stood before its motors turned
-MARGIN = 0.5  # s left out beside time with idle motors where the height is not known
+MARGIN = 0.5  # s left out before and after idle motors if the height is unknown
 
 
 def airborne(recording: Recording, told: str = "command") -> list[tuple[float, float]]:

@@ -19,7 +19,7 @@ class Cleaning:
     """The changes to make to each log, in this order; by default none.
 
     Attributes:
-        in_flight: cut out the time on the ground: half a second or longer with hardly any thrust.
+        in_flight: cut out time on the ground, where the motors idle for at least half a second.
         resample: new interval between samples [s]: states are interpolated, motors averaged.
         longest_gap: with resample, interpolate across gaps and repeated samples up to this long [s].
         delay: delay [s] to add to the motors: the gyro's lag that `check_log` reports.
@@ -79,7 +79,7 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
             parts.append((t, x, mean_of_held(t, piece.t, piece.u)))
     if not parts:
         raise ValueError(f"no segment without gaps is as long as dt = {dt} s; use a smaller dt or a longest_gap")
-    # Without last samples of segments that would make a gap too short to be recognised as one.
+    # Drop last samples of a segment that would make the gap after it too short to be detected.
     ends = [following[0][0] - GAP * dt for following in parts[1:]] + [np.inf]
     parts = [[each[part[0] < end] for each in part] for part, end in zip(parts, ends, strict=True)]
     t, x, u = map(np.concatenate, zip(*parts, strict=True))
@@ -111,7 +111,7 @@ def delay(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
 
 
 def lag_motors(log: FlightLog, time_constant: float) -> FlightLog:
-    """Replace motors u by the mean over each interval of w with τ ẇ = u − w; segments start in equilibrium."""
+    """Replace motors u by the mean over each interval of w, with τ ẇ = u − w; segments start in equilibrium."""
     if not time_constant:
         return log
     u, step = log.u.copy(), log.dt / time_constant

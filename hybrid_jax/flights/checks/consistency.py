@@ -34,7 +34,8 @@ KINEMATICS_LIMIT = 0.5
 THRUST_LIMIT = 0.6
 AXIS_LIMIT = 0.8  # of a single axis, where noise is a larger share
 FEWEST = 20  # intervals to compare
-# s of moving average on both sides of an equation; a longer one if nothing explains what noise alone may do
+# s of moving average on both sides of an equation. A longer one is tried if no mistake explains a difference: it may be
+# noise.
 SPANS = (0.05, 0.2, 0.8)
 GAIN_LIMIT = 1.25  # of one record regressed on the other
 THRUST_RATIO_LIMIT = 1.25
@@ -42,12 +43,12 @@ ORDER_LIMIT = 0.4  # correlation
 YAW_LIMIT = 0.3  # correlation: rotor torque about z is small, and two wrong signs of four leave half of it
 OPPOSED = -0.1  # correlation
 IMPROVES = 0.7  # share of the difference of two records that may remain when a mistake is undone
-POSSIBLE = 2.5  # factor of thrust per mass, either way, that a load or damage may make
+POSSIBLE = 2.5  # factor by which a load or damage may change thrust per mass, either way
 NOISE = 0.2  # share of the least motion below which two records count as equal
 CLEAR = 1.0  # multiple of the least motion needed to check a single axis
-AT_LIMIT = 10  # samples, and times as often as a value usually stands, from which on it is a limit
+AT_LIMIT = 10  # an extreme value of at least so many samples, and times as frequent as usual, is saturation
 FATAL_LAG = 40.0  # ms
-SAMPLED = (-1.0, -0.4)  # intervals by which the gyro precedes motors sampled at the start of each: half of one
+SAMPLED = (-1.0, -0.4)  # intervals by which the gyro leads motors sampled at the start of each: half of one
 LAG = "motor_time_constant"  # its name in the vehicle file
 LEAST_MOTION = {"velocity": 0.05, "rates": 0.03, "acceleration": 0.2}  # RMS in m/s, rad/s, m/s²
 
@@ -173,7 +174,7 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     shift = f"shift the motors {abs(lag):.1f} ms {'later' if late else 'earlier'}: delay={found.lag:.4f}"
     shift += f', or learn "{LAG}" if they are commands' if late else ""
     lagging = _at_most(GYRO, abs(lag), "ms", limit, shift)
-    # Models bear a lag of some samples: they predict worse, but what they learn is not wrong.
+    # A lag of some samples makes predictions worse, but learned parameters are still right.
     lagging = replace(lagging, verdict=WARNS) if limit < abs(lag) <= FATAL_LAG else lagging
     if SAMPLED[0] < found.lag / log.dt < SAMPLED[1]:
         told = f"motors are samples, not held or means over the interval, and change by {100 * found.change:.0f} %"
@@ -203,7 +204,7 @@ def _spin(log: FlightLog, vehicle: Vehicle, yaw: float) -> Check:
 
 
 def _compare(log: FlightLog, name: str, pairs: Pairs, least: float) -> Check:
-    """Compare two records in flight over growing spans; return the shortest's result if nothing explains any."""
+    """Compare two records in flight over growing spans; return the result of the shortest if nothing explains any."""
     check = shortest = _compare_means(log, name, pairs, least, SPANS[0])
     for span in SPANS[1:]:
         check = _compare_means(log, name, pairs, least, span) if UNUSUAL in check.suggestion else check
@@ -221,7 +222,7 @@ def _compare_means(log: FlightLog, name: str, pairs: Pairs, least: float, span: 
         return Check(name, math.nan, "relative error", limit, UNKNOWN, MORE_FLIGHT)
     value, advice = _relative_error(a, b), _nearer(pairs, limit, least)
     doubtful = (not advice and name == THRUST) or ((" s late" in advice or " s early" in advice) and value <= limit)
-    # An attitude turned about z, or a mirrored world, is all that this check sees of it.
+    # A wrong heading or a mirrored world shows in no other check, so these only warn.
     doubtful |= mistakes.HEADING in advice or mistakes.HANDED in advice
     advice = advice or (UNUSUAL if value > limit else "")
     if name == THRUST and advice == UNUSUAL:
@@ -233,7 +234,7 @@ def _compare_means(log: FlightLog, name: str, pairs: Pairs, least: float, span: 
 
 
 def _nearer(pairs: Pairs, limit: float, least: float) -> str:
-    """Return the mistake that best reconciles the records once undone; empty if none does."""
+    """Return the mistake that, if undone, makes the records agree best; "" if no mistake does."""
     left = {mistake: a - b for mistake, (a, b) in pairs.items()}
     own = left[NOTHING]
     # Any improvement counts if two differ by more than noise: an axis with little motion contributes little.
@@ -244,11 +245,11 @@ def _nearer(pairs: Pairs, limit: float, least: float) -> str:
 
 
 def _apart(a: Vectors, b: Vectors, least: float) -> str:
-    """Return what is wrong with one axis, or with the scale of all; empty if nothing is."""
+    """Return what is wrong with one axis, or with the scale of all; "" if nothing is."""
     pairs = {axis: (a[:, [i]], b[:, [i]]) for i, axis in enumerate("xyz")}
     moving = {axis: pair for axis, pair in pairs.items() if max(map(_size, pair)) > CLEAR * least}
     if apart := [axis for axis, pair in moving.items() if _relative_error(*pair) > AXIS_LIMIT]:
-        return f"{' and '.join(apart)} alone: {UNUSUAL}"
+        return f"only {' and '.join(apart)}: {UNUSUAL}"
     gain = float((a * b).sum() / (b * b).sum())
     if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT:
         return ""

@@ -10,7 +10,7 @@ from hybrid_jax.flights.checks.airborne import flying_intervals
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
-NOTHING = "nothing to correct"  # the log as it is
+NOTHING = "nothing to correct"
 LATE = (0.1, 0.2)  # delays and advances that are tried [s]
 WORLD = 'velocity is in the world, read as the body\'s: velocity = "world", or for a bag topics={"velocity": "TOPIC"}'
 HANDED = "the world is left-handed: "
@@ -49,7 +49,7 @@ def velocities(log: FlightLog) -> Pairs:
 
 
 def _shifted(log: FlightLog) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield a description of each time shift and the rows that undo it."""
+    """Iterate over time shifts, with a description of each and the rows that undo it."""
     now = np.arange(len(log))
     for seconds in LATE:
         late = round(seconds / log.dt)
@@ -70,9 +70,8 @@ def rates(log: FlightLog) -> Pairs:
         "x and y of the body rates are exchanged: name their columns so": (turned, omega[:, [1, 0, 2]]),
         "body rates have the opposite sign": (turned, -omega),
     }
-    found |= {
-        f"body rates are about {words}": (turned, middle(log.x[rows, BODY_RATES])) for words, rows in _shifted(log)
-    }
+    for words, rows in _shifted(log):
+        found[f"body rates are about {words}"] = turned, middle(log.x[rows, BODY_RATES])
     for mistake, attitude in _attitudes(q).items():
         found[mistake] = rates_between(log.t, attitude), omega
     w, x, y, z = q.T

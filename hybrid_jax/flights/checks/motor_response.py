@@ -11,14 +11,15 @@ from hybrid_jax.flights.checks.mistakes import band_passed, middle, moving_mean
 from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.vehicle import BODY_RATES, Vehicle
 
-LONGEST_LAG, SHORT_LAG = 0.25, 0.1  # s, either way; of logs of less than 2 s
+LONGEST_LAG, SHORT_LAG = 0.25, 0.1  # s, either way; the second for short logs
 # Moving means of torque and motors: the short one removes noise. Subtracting the long one removes aerodynamic moments
 # and offsets of the centre of mass, which motors counteract and would appear to cause.
 FAST, SLOW = 0.03, 0.2  # s
 YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
-# Of more than four motors the pilot mixes four numbers: several orders explain roll and pitch. One that does is kept.
+# With more than four motors, several orders explain roll and pitch, because the pilot commands only four numbers. The
+# recorded order is kept if it is one of them.
 AMBIGUOUS = 0.1  # of the sum of two correlations
-PERMUTED = 6  # rotors at most of which all orders are tried: 720; of more, those with two exchanged
+PERMUTED = 6  # rotors up to which all orders are tried (720); with more, only exchanges of two
 
 
 class Response(NamedTuple):

@@ -7,21 +7,21 @@ from hybrid_jax.flights.conversion import missing_states, motors_of, what_to_log
 from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
 from hybrid_jax.vehicle import MOST_ROTORS, Vehicle
 
-SLOWER = 1.5  # times the interval asked for
-REST_SHARE = 0.05  # of the largest command or speed below which a motor does not carry
-REST_SPEED = 20.0  # rad/s, where the largest is not known
+SLOWER = 1.5  # times the requested interval
+REST_SHARE = 0.05  # of the largest command or speed, below which a motor does not carry
+REST_SPEED = 20.0  # rad/s, if the largest is unknown
 SLOW_ROTOR = 100.0  # rad/s; the rotors of every multirotor turn faster than 955 rpm in flight
 STILL = 5.0  # rad/s, below which a rotor stands
 MOVED = 0.5  # m of height that only flight explains
 BEYOND = 0.02  # share by which a motor may exceed the largest
-MOSTLY = 0.5  # share of samples beyond a limit from which on their unit is wrong
+MOSTLY = 0.5  # share of samples beyond a limit above which their unit is wrong
 JUMP = 0.5  # share of the whole time that one gap may last
 ROTORS = "number of motors"
 USED = ("position", "velocity", "body_velocity", "attitude", "rates")
 
 
 def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: float | None = None) -> list[Check]:
-    """Check the signals of a recording before they are interpolated.
+    """Check the signals of a recording. You should do this before they are interpolated.
 
     Args:
         recording: the log as it was read.
@@ -122,7 +122,7 @@ def _flown(recording: Recording, motors: Signal | None, vehicle: Vehicle | None)
     speeds = motors is recording.signals.get("rotor_speed")
     most = vehicle.max_rotor_speed if vehicle is not None else REST_SPEED / REST_SHARE
     limit = REST_SHARE * (most if speeds else 1.0)
-    # Of the fastest three: some channels may be none of a motor.
+    # Of the fastest three, because some channels may not belong to a motor.
     value = float(np.sort(motors.values, axis=1)[:, -3:].mean(axis=1).max())
     position = recording.signals.get("position")
     climbed = float(np.ptp(position.values[:, -1])) if position is not None and position.axes[-1] == "z" else 0.0

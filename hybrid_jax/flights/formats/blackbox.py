@@ -34,7 +34,7 @@ def read_blackbox(content: bytes) -> Parts:
     flights, why = [], []
     begins = [found.start() for found in re.finditer(re.escape(MAGIC), content)]
     for begin, end in zip(begins, [*begins[1:], len(content)], strict=True):
-        try:  # each by itself, as orangebox goes through the whole file for each
+        try:  # each separately, because orangebox would read the whole file for each
             flights.append(_frames(content[begin:end]))
         except Exception as error:  # orangebox raises any exception for a damaged header, or for no frames
             why.append(type(error).__name__)
@@ -61,7 +61,7 @@ def read_blackbox(content: bytes) -> Parts:
 
 @cache
 def _parser() -> Any:
-    """Extend orangebox's parser by the events of later firmware, which it takes for damage."""
+    """Extend orangebox's parser by the events of later firmware, which it would count as damage."""
     import orangebox
     from orangebox.decoders import _signed_vb, _unsigned_vb
 
@@ -103,9 +103,9 @@ def _frames(content: bytes) -> tuple[Any, np.ndarray, str]:
     try:
         for frame in parser.frames():
             junk = junk if rows else parser._ctx.invalid_frame_count
-            if rows or frame.type == FrameType.INTRA:  # nothing is known of what came before the first whole frame
+            if rows or frame.type == FrameType.INTRA:  # earlier frames depend on one that is missing
                 rows.append(frame.data[:width])
-    except Exception:  # at the end of a file that was cut off; orangebox does not look for it
+    except Exception:  # the file ends within a frame, which orangebox does not check
         ended = False
     sound = [row for row in rows if all(isinstance(value, int | float) for value in row)]
     invalid = parser._ctx.invalid_frame_count - junk + len(rows) - len(sound)
@@ -148,7 +148,7 @@ def _scale(headers) -> float:
 
 
 def _most(given) -> float:
-    """Return the largest number of a header; 0 without any."""
+    """Return the largest number of a header, or 0."""
     each = given if isinstance(given, list) else [given]
     return max((number for number in each if isinstance(number, int | float)), default=0)
 

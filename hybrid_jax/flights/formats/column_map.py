@@ -1,4 +1,4 @@
-"""Read any CSV log through a TOML file that states the meaning of its columns; no unit or frame is assumed.
+"""Read any CSV log by a TOML file that describes its columns. You should state every unit and frame; none is assumed.
 
 frames = {world = "NED", body = "FRD", velocity = "world"}      # or "ENU" (any world with z up), "FLU", "body"
 time = {columns = ["timestamp"], unit = "us"}                   # s, ms, us, ns
@@ -11,9 +11,9 @@ voltage = {columns = ["vbat"], unit = "V"}                      # V, mV
 motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}     # rad/s, rpm, rev/s, or commands; in the vehicle's order
 format = {delimiter = ";", decimal = ","}                       # optional, by default "," and "."
 
-All but frames and time may be left out; training on states needs position, attitude, velocity, body_rates and motors.
-Commands are in unit share (0 … 1), percent, pwm (1000 … 2000 µs), 16bit (0 … 65535) or dshot (48 … 2047); or in any
-unit of the log, called command, with polynomial = [c0, c1, …]: rad/s = c0 + c1 command + c2 command² …
+You can leave out all but frames and time; training on states needs position, attitude, velocity, body_rates and motors.
+The unit of commands is share (0 … 1), percent, pwm (1000 … 2000 µs), 16bit (0 … 65535) or dshot (48 … 2047). For any
+other scale it is command, with polynomial = [c0, c1, …]: rad/s = c0 + c1 command + c2 command² …
 """
 
 import math
@@ -92,7 +92,7 @@ class ColumnMap:
 
     @property
     def quantities(self) -> dict[str, Columns]:
-        """Return the columns of each quantity that is given, in the order of `SCALES`."""
+        """Return the columns of each given quantity, in the order of `SCALES`."""
         return {name: getattr(self, name) for name in SCALES if getattr(self, name) is not None}
 
     @property
@@ -128,7 +128,7 @@ def library_map(path: str | Path) -> ColumnMap:
 
 
 def read_mapped(path: str | Path, column_map: ColumnMap | None) -> raw.Parts:
-    """Read the mapped quantities of a CSV file; a quantity has the times of the rows in which it is given."""
+    """Read the mapped quantities of a CSV file. Each has the times of the rows that contain it."""
     column_map = column_map or library_map(path)
     form, stated, frames = column_map.format, column_map.quantities, column_map.frames
     table, notes = read_table(path, column_map.names, delimiter=form.delimiter, decimal=form.decimal)
@@ -138,7 +138,7 @@ def read_mapped(path: str | Path, column_map: ColumnMap | None) -> raw.Parts:
     for name, each in stated.items():
         values, source = np.stack([named[column] for column in each.columns], axis=1), " ".join(each.columns)
         told = np.isfinite(t) & np.isfinite(values).all(axis=1)
-        partly = f"columns {source}: {name} stands in {told.sum()} of {len(t)} rows"
+        partly = f"columns {source}: {told.sum()} of {len(t)} rows contain {name}"
         notes += () if told.all() else (partly,)
         values = of_unit(values[told], each.unit) if name == "motors" else values[told] * SCALES[name][each.unit]
         if each.polynomial:
@@ -162,7 +162,7 @@ def of_unit(motors: Float[np.ndarray, "n m"], unit: str) -> Float[np.ndarray, "n
 def _attitude(values: Float[np.ndarray, "n k"], stated: Columns) -> Float[np.ndarray, "n 4"]:
     fields = " ".join(stated.columns)
     if len(stated.columns) == 3:
-        # Yaw may be counted over turns, tilt may not.
+        # Yaw may be counted beyond a turn, tilt may not.
         if (np.abs(values[:, :2]) > 2 * math.pi).any():
             advice = 'roll or pitch above 2π; are the angles degrees? set [attitude] unit = "deg"'
             raise ValueError(f"field {fields}: {advice}")

@@ -1,10 +1,10 @@
 """Read logs of the Crazyflie's µSD card deck, version 2 of the binary format, plain or gzip.
 
-The format: byte 0xBC, u16 version, u16 number of event types; of each, u16 id, name, u16 number of variables, each
-`group.name(t)` with t of Python's struct; then records of u16 id, u64 µs and values; last CRC-32 of all before.
+The format: byte 0xBC, u16 version, u16 number of event types; for each, u16 id, name, u16 number of variables, each
+`group.name(t)` with t of Python's struct; then records of u16 id, u64 µs and values; finally the CRC-32 of all these.
 (bitcraze/crazyflie-firmware, src/deck/drivers/src/usddeck.c.) Numbers are little endian, texts end with a zero byte.
 
-The Crazyflie's pitch, and its rate in `controller`, are counted nose up; the library's nose down.
+The Crazyflie's pitch, and its rate in `controller`, are positive nose up; the library's nose down.
 """
 
 import array
@@ -29,13 +29,13 @@ def _named(pattern: str, axes: Iterable[str]) -> tuple[str, ...]:
 
 
 def _without_pitch(v: np.ndarray) -> np.ndarray:
-    """Find attitudes with z along acceleration plus gravity, from roll and yaw [deg] and acceleration [g, world]."""
+    """Compute attitudes with z along acceleration plus gravity, from roll, yaw [deg] and acceleration [g, world]."""
     roll, yaw, x, y, z = (v * [DEGREES, DEGREES, 1, 1, 1] + [0, 0, 0, 0, 1]).T
     return from_euler(np.stack([roll, np.arctan2(np.cos(yaw) * x + np.sin(yaw) * y, z), yaw], axis=1))
 
 
 def unpack_attitude(numbers: np.ndarray) -> np.ndarray:
-    """Unpack (w, x, y, z) from 32 bits: index of the largest, then sign and nine bits each (quatcompress.h)."""
+    """Unpack (w, x, y, z) from 32 bits: the index of the largest, then sign and nine bits each (quatcompress.h)."""
     bits = numbers.astype(np.int64)
     largest, q = bits >> 30, np.zeros((len(bits), 4))
     for i in (3, 2, 1, 0):
@@ -46,18 +46,17 @@ def unpack_attitude(numbers: np.ndarray) -> np.ndarray:
     return np.roll(q, 1, axis=1)
 
 
-NOSE = np.array([1.0, -1.0, 1.0])  # signs of (roll, pitch, yaw) where pitch is counted nose up
+NOSE = np.array([1.0, -1.0, 1.0])  # signs of (roll, pitch, yaw) if pitch is positive nose up
 # Rows M1 … M4 of thrust, roll / 2, pitch / 2 and yaw (power_distribution_quadrotor.c).
 MIXER = np.array([[1, -0.5, 0.5, 1], [1, -0.5, -0.5, -1], [1, 0.5, -0.5, 1], [1, 0.5, 0.5, -1]])
 LIMITED = 65535.0  # a jump of a 16-bit number by almost as much is a wrap
 UP = np.array([0.0, 0.0, 1.0])  # g
 ANGLES = ("roll", "pitch", "yaw")
 ACCELERATION = _named("stateEstimate.a{}", "xyz")
-NO_PITCH = "pitch is not logged: the one with which stateEstimate.a* and gravity are along the body's z"
-NO_FORCE = "specific force along z: the length of stateEstimate.a* with gravity; no accelerometer is logged"
-NO_MOTOR = "commands: the mixer's, of controller.cmd_*, as neither motor.m* nor pwm.m*_pwm is logged"
-# Quantity → where it may stand, the first that a log has counts: variables, what to multiply them by or to make of
-# them, and a note.
+NO_PITCH = "pitch is not logged: computed so that stateEstimate.a* and gravity are along the body's z"
+NO_FORCE = "no accelerometer is logged: specific force along z is the norm of stateEstimate.a* with gravity"
+NO_MOTOR = "neither motor.m* nor pwm.m*_pwm is logged: commands are the mixer's output for controller.cmd_*"
+# Quantity → its possible sources, of which the first in a log is used: variables, a factor or a function, and a note.
 Conversion = float | np.ndarray | Callable[[np.ndarray], np.ndarray]
 SOURCES: dict[str, list[tuple[tuple[str, ...], Conversion, str]]] = {
     "position": [
@@ -123,7 +122,7 @@ def read_crazyflie(content: bytes) -> Parts:
 
 
 def is_crazyflie(head: bytes) -> bool:
-    """Whether a file is such a log, by its unpacked first bytes."""
+    """Whether a file is a log of the µSD deck, by its unpacked first bytes."""
     return len(head) >= 3 and head[0] == MAGIC and head[1:3] == VERSION.to_bytes(2, "little")
 
 
@@ -154,7 +153,7 @@ def _text(content: bytes, at: int) -> tuple[str, int]:
 
 
 def _columns(content: bytes, at: int, end: int, events) -> tuple[Variables, int]:
-    """Return the variables of all complete records, and where these end."""
+    """Return the variables of all complete records, and where the records end."""
     starts, sizes = {key: array.array("q") for key in events}, {key: kind.itemsize for key, (_, kind) in events.items()}
     while at + 2 <= end and (size := sizes.get(key := content[at : at + 2])) and at + 2 + size <= end:
         starts[key].append(at + 2)
@@ -163,7 +162,7 @@ def _columns(content: bytes, at: int, end: int, events) -> tuple[Variables, int]
     for key, (names, kind) in events.items():
         if starts[key]:
             rows = np.empty((len(starts[key]), sizes[key]), np.uint8)
-            for column in range(sizes[key]):  # one by one, as an index of every byte would take eight times the log
+            for column in range(sizes[key]):  # an index of every byte would take eight times the memory of the log
                 rows[:, column] = data[np.asarray(starts[key]) + column]
             table = rows.view(kind)[:, 0]
             ticks = table["ticks"].astype(np.int64)

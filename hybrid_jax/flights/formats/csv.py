@@ -17,7 +17,7 @@ BLOCK = 1 << 22  # characters read at once
 LISTS = "a list in a cell: write each of its numbers in a column of its own"
 MAX_ROW_LENGTH = 1 << 16
 COMMENT = re.compile("[#%]+ *")
-NOTHING = ("", "null", "none", "na", "n/a", "-")  # cells without a number, beside nan
+NOTHING = ("", "null", "none", "na", "n/a", "-")  # cells that mean nan
 MAX_ROWS = 4_000_000  # 0.6 GB of numbers; eleven hours at 100 Hz
 CUT = "no line break ends the last row, so its last number may be cut off: cut the row out, or end it with one"
 
@@ -25,10 +25,10 @@ CUT = "no line break ends the last row, so its last number may be cut off: cut t
 def read_table(
     path: str | Path, columns: Sequence[str], *, delimiter: str = ",", decimal: str = ".", max_rows: int = MAX_ROWS
 ) -> tuple[Float[np.ndarray, "n c"], tuple[str, ...]]:
-    """Read the named columns of a CSV file in the given order, and a note if the file was cut off.
+    """Read the named columns of a CSV file in the given order; also return a note if the file was cut off.
 
-    Cells without a number are NaN. Lines before the header that begin with #, % or `sep=;` are skipped; the header
-    itself may begin with # or %.
+    Empty cells are NaN. Lines before the header that begin with #, % or `sep=;` are skipped. The header itself may also
+    begin with # or %.
     """
     parts, block = [], ""
     try:
@@ -59,7 +59,7 @@ def read_table(
 
 
 def header_of(path: str | Path) -> list[str]:
-    """Return the column names; raises like `read_table`."""
+    """Return the column names. It raises the errors of `read_table`."""
     with readable(path) as file, contextlib.suppress(UnicodeDecodeError):
         return _header(io.TextIOWrapper(file, encoding="utf-8-sig"), ",")[0]
     return []
@@ -78,7 +78,7 @@ def _header_complaint(name: str, names: list[str], header: str, delimiter: str) 
     if not header.strip():
         return "row 1: the file is empty or has no header; export the log again"
     if name in names:
-        return f"row 1, field {name}: stands {names.count(name)} times in the header; rename all but one"
+        return f"row 1, field {name}: occurs {names.count(name)} times in the header; rename all but one"
     for other in (";", "\t", ",", " "):
         if len(names) == 1 and other != delimiter and header.count(other) > 2:
             advice = f"set format = {{delimiter = {json.dumps(other)}}} in a column map, columns=…"
@@ -89,7 +89,7 @@ def _header_complaint(name: str, names: list[str], header: str, delimiter: str) 
 
 
 def _numbers(lines: list[str], row: int, names, picked, delimiter: str) -> Float[np.ndarray, "n c"]:
-    """Parse the picked cells of some lines, whose first is the given row."""
+    """Parse the picked cells of some lines, which begin at a row."""
     for at, line in enumerate(lines):
         if (count := line.count(delimiter) + 1) != len(names):
             found = f"{count} fields" if line.strip() else "a blank line"
@@ -113,7 +113,7 @@ def _told(cell: str) -> str:
 
 
 def _bad_cell(cell: str, delimiter: str) -> str:
-    """Say why a cell is not a number and what to do; empty if it is one."""
+    """Explain why a cell is not a number and what to do; "" if it is one."""
     with contextlib.suppress(ValueError):
         np.loadtxt([_told(cell)], delimiter=delimiter, comments=None)
         return ""

@@ -18,23 +18,23 @@ from hybrid_jax.flights.log import LARGEST, unlike_one
 from hybrid_jax.flights.recording import GAP, Recording, Signal, axes_of
 
 GZIP = b"\x1f\x8b"
-LATE = 0.1  # s; a time that is further behind is a restarted clock, not a sample that came late
-SHARED = 0.1  # share of samples with the time of the one before, from which on that is no double
-FEW_DIGITS = "it has too few digits, as of %g: write it with nine after the point, or as whole µs"
-# Counters that may begin anew: what they are called, and the seconds that they count to.
+LATE = 0.1  # s; a time further behind is a restarted clock instead of a late sample
+SHARED = 0.1  # share of samples with the time of the previous one above which times have too few digits
+FEW_DIGITS = "it has too few digits, for example from %g: write it with nine after the point, or as whole µs"
+# Counters that may wrap: their names, and their range in seconds.
 WRAPS = {f"{bits} bits of {unit}": 2**bits * tick for bits in (16, 32) for unit, tick in (("µs", 1e-6), ("ms", 1e-3))}
 STRAY = 0.01  # share of samples whose time stamps may be wrong
-APART = 0.5  # share of a log's time by which a few samples at an end must lie off to be such
-LOST = 0.5  # share of samples that may be no number, or no rotation, and are left out
-FEWEST_OF_LINES = 100  # samples; of fewer, lines may be chance
-STRAIGHT = 1e-6  # of the steepest slope: by how much that of a line may change at a sample, by rounding
-BENT = 0.5  # share of samples with a bend from which on a signal was not made of lines
-WHOLE = 1e-3  # by how much a number of steps may differ from a whole one, by rounding
-HELD = 1.5  # rows in which a value stands, on average, from which on slow samples were repeated
-REGULAR = 0.9  # share of the values that must stand in as many rows, or one more or less
-OPTIONAL = ("voltage",)  # of which any number of samples may be left out
-AS_TOLD = ("command", "voltage")  # quantities that may well keep a value
-RATIO, MOST, SMALL = 100, 2**31, 2**24  # bytes that a packed log may hold: for each of its own, at most, at least
+APART = 0.5  # share of a log's time by which a few samples at an end must be apart to be strays
+LOST = 0.5  # share of samples that may be left out because they are not a number or a rotation
+FEWEST_OF_LINES = 100  # samples; fewer may be on lines by chance
+STRAIGHT = 1e-6  # relative change of a line's slope at a sample that rounding may cause
+BENT = 0.5  # share of samples with a bend above which a signal was not interpolated
+WHOLE = 1e-3  # distance of a number of steps from an integer that rounding may cause
+HELD = 1.5  # mean number of equal rows above which slow samples were repeated
+REGULAR = 0.9  # share of the values that must be repeated equally often, or once more or less
+OPTIONAL = ("voltage",)  # quantities of which any number of samples may be left out
+AS_TOLD = ("command", "voltage")  # quantities that may be constant for a while
+RATIO, MOST, SMALL = 100, 2**31, 2**24  # limits of unpacked bytes: over packed ones, at most, at least
 
 
 class Samples(NamedTuple):
@@ -49,7 +49,7 @@ Parts = tuple[Mapping[str, Samples], float, Sequence[str], Mapping[str, str]]  #
 
 
 class Unpacked:
-    """Counts bytes that a log, a file or a folder, unpacks to; ValueError for more than a log may have."""
+    """Counts the unpacked bytes of a file or folder; ValueError if there are too many for a log."""
 
     def __init__(self, path: Path):
         files = path.rglob("*") if path.is_dir() else [path]
@@ -63,7 +63,7 @@ class Unpacked:
 
 
 class _Gzip(io.RawIOBase):
-    """Bytes of a gzip file, up to the size that a log may have."""
+    """The bytes of a gzip file, up to the largest size of a log."""
 
     def __init__(self, path: Path, packed: IO[bytes]):
         self.file, self.unpacked = gzip.GzipFile(fileobj=packed), Unpacked(path)
@@ -103,8 +103,8 @@ def record(
 ) -> Recording:
     """Convert samples by quantity, on a clock of `tick` seconds, to a recording.
 
-    These samples are left out, with a note, and become gaps: repeated time stamps, samples up to `LATE` out of order, a
-    few with outlying times, and values that are not a number or a rotation. The first of several equal times is kept.
+    Samples are left out, with a note, if they repeat a time stamp, are up to `LATE` out of order, have an outlying time
+    or are not a number or a rotation. They become gaps. The first of several samples with equal times is kept.
     """
     parts = {name: part for name, part in parts.items() if len(part.ticks)}
     if not parts:
@@ -124,9 +124,9 @@ def record(
         t, gone = (part.ticks - start).astype(float) * tick, _lost(name, part)
         beside = ordered.get("attitude", part)
         if part.source.split()[:1] == beside.source.split()[:1] and np.array_equal(part.ticks, beside.ticks):
-            gone |= lost if lost.mean() <= LOST else False  # a message without an attitude has no position either
+            gone |= lost if lost.mean() <= LOST else False  # a message without an attitude lacks the position, too
         if gone.any() and (name in OPTIONAL or gone.mean() <= LOST):
-            why = f"{name} is no {'rotation' if name == 'attitude' else 'number'} in {gone.sum()} samples"
+            why = f"{name} is not a {'rotation' if name == 'attitude' else 'number'} in {gone.sum()} samples"
             said.append(f"{part.source}: {why}, the first at {t[gone][0]:.4g} s: left out")
             t, part = t[~gone], part._replace(values=part.values[~gone])
         elif gone.any():
@@ -157,7 +157,7 @@ def _wrong(name: str, part: Samples, row: int, t: np.ndarray) -> str:
 
 
 def _in_order(where: str, ticks: np.ndarray, tick: float) -> tuple[np.ndarray, list[str]]:
-    """Return which samples come after all before them, and notes about the others."""
+    """Return the indices of samples later than all before them, and notes about the others."""
     t = (ticks - ticks[len(ticks) // 2]).astype(float) * tick
     for row in np.flatnonzero(~np.isfinite(t))[:1]:
         raise ValueError(f"{where}: the time of sample {row} is {t[row]}, must be finite")
@@ -193,7 +193,7 @@ def _in_order(where: str, ticks: np.ndarray, tick: float) -> tuple[np.ndarray, l
 
 
 def wrapped(fall: float) -> str:
-    """Name the counter that falls by so many seconds when it wraps; empty if there is none."""
+    """Describe the counter whose range is so many seconds; "" if there is none."""
     found = [name for name, seconds in WRAPS.items() if abs(fall / seconds - 1) < 0.02]
     return f"a counter of {found[0]} began anew" if found else ""
 
@@ -203,7 +203,7 @@ def longest_rise(t: Float[np.ndarray, " n"]) -> np.ndarray:
     tops, at, before = [], [], np.full(len(t), -1)
     for i, time in enumerate(t.tolist()):
         place = bisect.bisect_right(tops, time)
-        # A slice, as it may be one beyond the end.
+        # A slice, because the place may be one beyond the end.
         tops[place : place + 1], at[place : place + 1] = [time], [i]
         before[i] = at[place - 1] if place else -1
     chain = [at[-1]]
@@ -215,9 +215,9 @@ def longest_rise(t: Float[np.ndarray, " n"]) -> np.ndarray:
 def own_samples(t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], repeated: bool = True):
     """Recover the original samples of a signal that a program repeated or interpolated; else return the arguments.
 
-    A program that joins signals of several rates repeats each slow value until the next, or draws lines with bends at
-    the samples. A sample between two times of its clock is where the adjacent lines meet. A line of several intervals
-    keeps a sample in each; one longer than `GAP` intervals becomes a gap unless the value is constant.
+    A program that joins signals of several rates repeats each slow value until the next, or interpolates linearly, so
+    that lines meet at the samples, which may be between two times of its clock. A line over several intervals keeps a
+    sample in each; one longer than `GAP` intervals becomes a gap unless the value is constant.
     """
     sound = np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()
     if len(t) < FEWEST_OF_LINES or not sound:
@@ -247,7 +247,7 @@ def _in_steps(values: Float[np.ndarray, "n k"]) -> bool:
 
 
 def _fresh(values: Float[np.ndarray, "n k"]) -> np.ndarray:
-    """Which rows have new values, if they repeat about equally often (or regularly at rest); else all."""
+    """Whether each row is a new value, if values are repeated about equally often; otherwise all are."""
     new = np.append(True, (np.diff(values, axis=0) != 0).any(axis=1))
     counts = np.diff(np.flatnonzero(new))
     counts = counts[counts <= GAP * np.median(counts)] if len(counts) else counts
@@ -259,7 +259,7 @@ def _fresh(values: Float[np.ndarray, "n k"]) -> np.ndarray:
 
 
 def _meetings(t, values, slope, bend):
-    """Find the samples at which lines meet: at a bend, or between two consecutive bends."""
+    """Iterate over the samples at which lines meet: at a bend, or between two consecutive bends."""
     k = 1
     while k < len(t) - 1:
         late = 0.0
@@ -290,7 +290,7 @@ def attitude(q: Float[np.ndarray, "n 4"], world: str, body: str) -> Float[np.nda
     turned = np.array(q, float)
     if (world, body) != ("ENU", "FLU") and sound.any():
         matrices = WORLDS[world] @ rotation_of(q[sound]).as_matrix() @ BODIES[body].T
-        # Not of length 1: a wrong norm must still be seen.
+        # Keep the norm, so that a wrong one can still be detected.
         norms = np.linalg.norm(q[sound], axis=1, keepdims=True)
         turned[sound] = quaternion_from_matrix(matrices) * norms
     return turned

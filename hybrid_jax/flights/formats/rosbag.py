@@ -1,10 +1,10 @@
 """Read bags of ROS 2 (SQLite or MCAP) and ROS 1 with rosbags (extra `logs`).
 
 Odometry, poses, IMU and battery are found by message type. You should name the topics of motors, which have no standard
-type, and of a quantity with several topics, for example {"odometry": "/mavros/odometry", "motors": "/rotors:data:rpm"}:
-topic, field with one number per motor, and unit.
+type, and of a quantity with several topics, for example {"odometry": "/mavros/odometry", "motors": "/rotors:data:rpm"}.
+For motors, this is the topic, the field with one number per motor, and the unit.
 
-Frames follow REP 103 and 105: world z up, body forward-left-up, the twist of an odometry in the body.
+Frames follow REP 103 and 105: world z up, body forward-left-up, and twists of odometry in the body.
 """
 
 import re
@@ -32,8 +32,8 @@ def _pose(prefix: str) -> dict[str, str]:
 
 
 VELOCITY = "twist.twist.linear"
-# Role → message type, without package → quantity → its field. Roles, and "motors", are the keys of `topics`; those that
-# come later count where two tell of one quantity.
+# Role → message type without package → quantity → its field. Roles, and "motors", are keys of `topics`. If two of them
+# have the same quantity, the later one is used.
 READERS: dict[str, dict[str, dict[str, str]]] = {
     "pose": {
         "PoseStamped": _pose("pose."),
@@ -52,7 +52,7 @@ READERS: dict[str, dict[str, dict[str, str]]] = {
     "imu": {"Imu": {"rates": "angular_velocity", "specific_force": "linear_acceleration"}},
     "voltage": {"BatteryState": {"voltage": "voltage"}},
 }
-# Read in a role only if `topics` says so.
+# Read in a role only if `topics` names them.
 ASKED_FOR = {("velocity", "Odometry"), ("velocity", "Vector3Stamped"), ("pose", "PointStamped")}
 ROLES = (*READERS, "motors")
 Messages = dict[str, list[tuple[int, Any]]]  # topic → time [ns] and content of each
@@ -96,9 +96,8 @@ def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, t
         with AnyReader([Path(path)], default_typestore=get_typestore(Stores.LATEST)) as bag:
             types = {each.topic: each.msgtype for each in bag.connections if each.msgcount}
             chosen = _chosen(types, topics)
-            names = {topic for topic, *_ in chosen.values()} | {
-                topic for topic in types if _px4(types[topic]) in TOPICS
-            }
+            names = {topic for topic, *_ in chosen.values()}
+            names |= {topic for topic in types if _px4(types[topic]) in TOPICS}
             wanted = [each for each in bag.connections if each.topic in names]
             messages: Messages = {each.topic: [] for each in wanted}
             unpacked = Unpacked(Path(path))
@@ -108,10 +107,8 @@ def _heard(path, topics: Mapping[str, str]) -> tuple[dict[str, str], dict[str, t
     except ValueError:
         raise
     except Exception as error:  # a damaged bag makes its libraries raise any exception
-        why = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
-        raise ValueError(
-            f"is not a bag, or is cut off or damaged; run ros2 bag reindex, or copy it again ({why})"
-        ) from error
+        why = f"run ros2 bag reindex, or copy it again ({type(error).__name__}: {' '.join(str(error).split())[:120]})"
+        raise ValueError(f"is not a bag, or is cut off or damaged; {why}") from error
     if empty := [topic for topic, found in messages.items() if not found]:
         raise ValueError(f"topic {empty[0]} has lost its messages; run ros2 bag reindex, or copy the bag again")
     return types, chosen, messages
@@ -170,10 +167,8 @@ def _chosen(types: Mapping[str, str], topics: Mapping[str, str]) -> dict[str, tu
         topic, *given = topics["motors"].split(":")
         _require(topic, types)
         if len(given) != 2 or given[1] not in SCALES["motors"] or given[1] == "command":
-            units = ", ".join(unit for unit in SCALES["motors"] if unit != "command")
-            raise ValueError(
-                f"topics: motors must be TOPIC:FIELD:UNIT, the unit one of {units}; got {topics['motors']}"
-            )
+            form = f"TOPIC:FIELD:UNIT, the unit one of {', '.join(u for u in SCALES['motors'] if u != 'command')}"
+            raise ValueError(f"topics: motors must be {form}; got {topics['motors']}")
         found["motors"] = (topic, *given)
     elif fitting := [topic for topic, kind in types.items() if kind.split("/")[-1] == "Actuators"]:
         found["motors"] = (sorted(fitting)[0], "|".join(FIELDS), "rad/s")
@@ -206,13 +201,13 @@ def _numbers(message, field: str):
 
 
 def _motors(topic: str, field: str, messages) -> tuple[np.ndarray, str]:
-    """Return the numbers of each motor and the name of their field."""
+    """Return the numbers of all motors and the name of their field."""
     fields = field.split("|")
     name = next((name for name in fields if len(_numbers(messages[0], name))), fields[0])
     try:
         rows = [np.asarray(_numbers(message, name), float).ravel() for message in messages]
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{topic}: field {name} must hold a number for each motor") from error
+        raise ValueError(f"{topic}: field {name} must contain a number for each motor") from error
     counts = {len(row) for row in rows}
     if len(counts) > 1 or min(counts) < FEWEST_ROTORS:
         known = ", ".join(each for each in vars(messages[0]) if not each.startswith("_"))

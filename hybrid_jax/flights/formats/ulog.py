@@ -17,7 +17,7 @@ from hybrid_jax.vehicle import FEWEST_ROTORS
 
 ODOMETRY, LOCAL, ATTITUDE = "vehicle_odometry", "vehicle_local_position", "vehicle_attitude"
 STATUS, OUTPUTS = "vehicle_status", "actuator_outputs"
-# Quantity → where it may stand, the first that a log has counts: topic and fields. Of ULog and of px4_msgs in bags.
+# Quantity → its possible topics and fields, of which the first in a log is used. For ULog, and px4_msgs in bags.
 SOURCES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
     "position": ((LOCAL, ("x", "y", "z")), (ODOMETRY, tuple(f"position[{i}]" for i in range(3)))),
     "velocity": ((LOCAL, ("vx", "vy", "vz")), (ODOMETRY, tuple(f"velocity[{i}]" for i in range(3)))),
@@ -41,9 +41,10 @@ TOPICS = sorted({topic for each in SOURCES.values() for topic, _ in each} | {*MO
 ROTORS = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}  # MAV_TYPE of multirotors → rotors
 OTHERS = {1: "fixed wing", 3: "coaxial helicopter", 4: "helicopter", 7: "airship", 10: "rover", 11: "boat"}
 OTHERS |= {12: "submarine"} | dict.fromkeys(range(19, 26), "VTOL")
-IDLE_PWM, FULL_PWM, LEAST_PWM = 1000.0, 2000.0, 700.0  # µs, where a log does not say; less than PWM ever is
+IDLE_PWM, FULL_PWM = 1000.0, 2000.0  # µs, by default
+LEAST_PWM = 700.0  # µs; PWM is never less
 UAVCAN, DSHOT = 8191.0, 1999.0  # outputs at full command
-SLOWEST_RPM = 1500.0  # rpm: the largest of a simulated multirotor is more
+SLOWEST_RPM = 1500.0  # rpm: any simulated multirotor is faster at some time
 MOST = 16  # motors or outputs in any topic
 
 
@@ -69,7 +70,7 @@ def read_ulog(content: bytes) -> Parts:
 
 
 def _instances(data) -> tuple[dict[str, Any], list[str]]:
-    """Map topic → its first instance that changes, else its first, with notes about the others."""
+    """Return the first instance of each topic that changes, or else the first, with notes about the others."""
     chosen = {}
     for each in sorted(data, key=lambda each: each.multi_id):
         values = [column for name, column in each.data.items() if not name.startswith(("timestamp", "noutputs"))]
@@ -92,7 +93,7 @@ def _load(content: bytes) -> tuple[Any, str]:
     except ImportError as error:
         raise ValueError("reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
     try:
-        # pyulog reports damage on standard output only. In memory, where a seek stops at 0, it may go round for ever.
+        # pyulog reports damage on standard output only. From memory, where a seek stops at 0, it may loop forever.
         with contextlib.redirect_stdout(io.StringIO()), tempfile.TemporaryFile() as file:
             file.write(content)
             file.seek(0)
@@ -109,11 +110,11 @@ def _load(content: bytes) -> tuple[Any, str]:
 def _cut(content: bytes) -> bool:
     """Whether the last message is incomplete, which pyulog does not report."""
     at = 16  # behind the header
-    if content[at + 2 : at + 3] == b"B":  # appended data begin at an offset, whatever was cut before it
+    if content[at + 2 : at + 3] == b"B":  # appended data begin at an offset, even if data before it were cut
         at = max(at, *struct.unpack("<3Q", content[at + 19 : at + 43]))
     while at + 3 <= len(content):
         size = int.from_bytes(content[at : at + 2], "little")
-        if not size:  # no message is empty: zeros follow
+        if not size:  # messages are never empty, so zeros follow
             return True
         at += 3 + size
     return at != len(content)
@@ -142,7 +143,7 @@ def _has(tables, topic: str, fields) -> bool:
 def _table(tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple[np.ndarray, np.ndarray]:
     """Return the ticks [µs] and fields of a topic."""
     table = tables[topic]
-    # The time of the measurement where it is recorded, else that of the message.
+    # The time of the measurement if it is recorded, else of the message.
     use_clock = clock in table and table[clock].min(initial=1) > 0
     ticks = table[clock if use_clock else "timestamp"].astype(np.int64)
     with np.errstate(invalid="ignore"):  # damaged numbers are rejected later
@@ -177,7 +178,7 @@ def _valid(table, quantity: str, ticks, values, notes: list[str]) -> tuple[np.nd
 
 
 def motors(tables, parameters, expected: int, notes: list[str], simulated: bool = False) -> dict[str, Samples]:
-    """Read rotor speeds and commands of all motors, or of `expected` rotors if their number is unknown."""
+    """Read rotor speeds and commands of all motors. The log's own number of rotors replaces `expected`."""
     expected, found = _whole(parameters, "CA_ROTOR_COUNT") or expected, {}
     for topic, field in MOTORS.items():
         quantity = "rotor_speed" if topic == "esc_status" else "command"
@@ -186,7 +187,7 @@ def motors(tables, parameters, expected: int, notes: list[str], simulated: bool 
             continue
         ticks, values = _table(tables, topic, fields, "timestamp")
         moving = [i for i in range(len(fields)) if len(np.unique(values[np.isfinite(values[:, i]), i])) > 1]
-        count = max(expected, max(moving, default=-1) + 1)  # no motor is dropped: checks compare with the vehicle
+        count = max(expected, max(moving, default=-1) + 1)  # keep all motors: checks compare them with the vehicle
         if topic == "esc_status" and not moving:
             continue  # ESCs without telemetry report zero
         if not 0 < count <= len(fields):
@@ -207,7 +208,7 @@ def motors(tables, parameters, expected: int, notes: list[str], simulated: bool 
 
 
 def _shares(outputs: np.ndarray, parameters) -> tuple[np.ndarray, str]:
-    """Scale outputs to 0 … 1 and describe their unit, which only their range shows."""
+    """Scale outputs to 0 … 1, and describe their unit, which follows from their range."""
     running = outputs[outputs > 0]
     low, full = (_pwm(parameters, end, default) for end, default in (("MIN", IDLE_PWM), ("MAX", FULL_PWM)))
     unit = f"from {low:g} to {full:g} µs"
@@ -221,6 +222,6 @@ def _shares(outputs: np.ndarray, parameters) -> tuple[np.ndarray, str]:
 
 
 def _pwm(parameters, end: str, default: float) -> float:
-    """Return PWM_MIN or PWM_MAX, in later versions PWM_MAIN_MIN1 …"""
+    """Return the parameter PWM_MIN or PWM_MAX, in later versions PWM_MAIN_MIN1 …"""
     given = (_whole(parameters, name) for name in (f"PWM_MAIN_{end}1", f"PWM_MAIN_{end}", f"PWM_{end}"))
     return float(next((value for value in given if value > 0), default))
