@@ -197,7 +197,7 @@ def coverage_figure(rows: Results) -> Figure:
     """Draw the share of pooled and single-source intervals that contain the truth, a panel for each noise."""
     fitted = rows.where(lambda row: row["inside"] is not None)
     noises, changes = fitted.unique("noise"), fitted.unique("domain")
-    figure, (panels,) = subplots(1.5 + 0.42 * len(changes), 1, len(noises), sharey=True)
+    figure, (panels,) = subplots(1.5 + 0.52 * len(changes), 1, len(noises), sharey=True)
     kinds = {
         "alone": ("one source", COLOURS["fine-tuned"], "s"),
         "inside": ("three sources, pooled", COLOURS["adapted"], "o"),
@@ -211,8 +211,10 @@ def coverage_figure(rows: Results) -> Figure:
             for column, share in shares.items():
                 label, colour, marker = kinds[column]
                 axes.plot(share, y, marker, ms=4, color=colour, label=label, clip_on=False)
-            note(axes, parameter, (min(shares.values()), y), (-6, 0), va="center", ha="right", color="0.4")
-        axes.set(title="without noise" if noise == "none" else "with sensor noise", xlim=(60, 100.5))
+            edge = {"xycoords": axes.get_yaxis_transform()}
+            note(axes, parameter, (0.0, y), (3, 0), va="center", color="0.4", **edge)
+        axes.set(title="without noise" if noise == "none" else "with sensor noise")
+        axes.set_xlim(min(80.0, axes.get_xlim()[0]), 100.5)
         axes.set_xlabel("intervals that contain\nthe true value [%]")
         name_lines(axes, [*map(names.label, changes)])
     meaning = "Ix, Iy: moments of inertia; k: thrust coefficient"

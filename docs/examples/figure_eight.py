@@ -52,8 +52,8 @@ for name, states, style in (
 ):
     wanted = np.array(reference)[:401, :3]
     error = 100 * np.linalg.norm(states[:, :3] - wanted, axis=1)
-    print(f"{name}: {error.max():.2f} cm off at most")
-    plt.plot(time, error, label=name, **style)
+    most = f"{name}: at most {error.max():.1g} cm"
+    plt.plot(time, error, label=most, **style)
 plt.xlabel("time [s]")
 plt.ylabel("distance from the figure-8 [cm]")
 plt.legend(fontsize=7, frameon=False)

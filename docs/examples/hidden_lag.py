@@ -50,7 +50,7 @@ fitted = hj.simulate(result.model, empty, dt=0.02)[0]["place"][:, 0]
 without = hj.simulate(model(0.5, 1e-3), empty, dt=0.001)[0]["place"][:, 0]
 plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
-plt.plot(times, place, ".", ms=3, color="0.7", label="measured")
+plt.plot(times, place, "o", ms=5, color="0.8", label="measured")
 plt.plot(times, without, color="0.45", ls="--", label="without a lag")
 plt.plot(times, fitted, color="#0072B2", label="with the lag that was found")
 plt.xlabel("time [s]")

@@ -42,7 +42,8 @@ print(result.report())
 found = [result.parameters[f"efficiency[{i}]"] for i in range(4)]
 plt.rc("axes.spines", top=False, right=False)
 plt.figure(figsize=(4.2, 2.8), layout="constrained")
-plt.bar(range(4), 100 * share, color="0.85", label="true")
+true = {"color": "0.8", "lw": 6, "label": "true"}
+plt.hlines(100 * share, np.arange(4) - 0.3, np.arange(4) + 0.3, **true)
 for i, one in enumerate(found):
     plt.plot([i, i], [100 * one.low, 100 * one.high], color="#CC79A7", lw=3)
     plt.plot(
@@ -54,6 +55,6 @@ for i, one in enumerate(found):
     )
 plt.xticks(range(4), [f"rotor {i}" for i in range(4)])
 plt.ylabel("thrust [% of nominal]")
-plt.ylim(70, 115)
+plt.ylim(80, 106)
 plt.legend(fontsize=7, ncols=2, frameon=False)
 plt.savefig("weak_rotor.png", dpi=110)

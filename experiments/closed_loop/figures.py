@@ -13,7 +13,7 @@ from experiments.reporting.names import EXTERNAL_FORCE
 from experiments.reporting.plots import METHODS, STYLE, legend_of, name_lines, subplots, tick_errors
 from experiments.reporting.results import Results
 
-SMALLEST = 0.1  # cm, at the left edge
+SMALLEST = 0.1  # cm, of what is drawn
 COLOURS_OF = {"hybrid": METHODS["fine-tuned"], "invariant": "#56B4E9", "least_squares": METHODS["adapted"]}
 
 
@@ -31,10 +31,11 @@ def shares(rows: Results, domain: str) -> Figure:
     models = [name for name in SOURCES if any(agent.model == name for agent in found)]
     names = [name for name in REFERENCES if any(name in line for line in found.values())]
     figure, ((axes,),) = subplots(1.8 + 0.48 * len(names), 1, 1)
-    at_home = rows.where(domain=domain, distance=0.0)
+    at_home, edge = rows.where(domain=domain, distance=0.0), ""
     for line, name in enumerate(names):
         flown = by_agent(at_home.where(reference=name))
         errors = {agent: 100 * group.spread(ERROR).mean for agent, group in flown.items()}
+        edge = f"; {SMALLEST}: or less" if min(errors.values()) < SMALLEST else edge
         errors = {agent: max(error, SMALLEST) for agent, error in errors.items()}
         axes.plot([errors[ORACLE]] * 2, [line - 0.4, line + 0.4], color="0.4", linestyle=":")
         for i, model in enumerate(models):
@@ -46,7 +47,7 @@ def shares(rows: Results, domain: str) -> Figure:
             for mark, error in marked.items():
                 style = {"color": COLOURS_OF[model], "markerfacecolor": "white" if mark == "o" else None}
                 axes.plot(error, y, mark, **style)
-    axes.set(xscale="log", xlabel=f"position RMSE [cm]\n(log scale from {SMALLEST}; lower is better)")
+    axes.set(xscale="log", xlabel=f"position RMSE [cm]\n(log scale; lower is better{edge})")
     tick_errors(axes.xaxis, *axes.get_xlim(), room=3.0)
     name_lines(axes, [REFERENCES[name] for name in names])
     known: dict[str, Artist] = {LEARNED[name]: Line2D([], [], color=COLOURS_OF[name], lw=3) for name in models}

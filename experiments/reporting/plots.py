@@ -46,6 +46,7 @@ LARGEST_RATIO = 100.0  # an axis of errors ends at this many times the smallest 
 PADDING = 1.15  # factor of room at either end of an axis of errors
 SMALL = 1e-4  # an axis that begins below it has powers of ten
 LONG_NUMBER = 0.05  # numbers up to this need room on an axis
+MOST_DECADES = 5  # with a tick of their own on a log axis
 HALF_LINE = 0.3  # half the height of a line in a panel: of a mean's bar, and of the band of its seeds
 FLOOR = "no model can do better"  # the label of the attainable error
 
@@ -177,7 +178,7 @@ def tick_errors(axis: Axis, low: float, high: float, room: float = 0.0) -> None:
     decades = math.log10(high / low)
     room = room or (2.2 if low > LONG_NUMBER else 1.5)
     subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if decades < 0.8 else (1.0, 2.0, 5.0) if decades < room else (1.0,)
-    axis.set_major_locator(MaxNLocator(3) if decades < 0.5 else LogLocator(subs=subs))
+    axis.set_major_locator(MaxNLocator(3) if decades < 0.5 else LogLocator(subs=subs, numticks=MOST_DECADES))
     powers = decades > 2 and low < SMALL
     axis.set_major_formatter(LogFormatterMathtext() if powers else FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
@@ -214,6 +215,7 @@ def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[
     marks += [("<", low, f"{below} of {len(values)} below")] if below else []
     for marker, x, text in marks:
         axes.plot(x, y, marker, color=tint, markersize=7, clip_on=False, zorder=5)
-        # Right of the marker: outside the panel at its right edge, where they hide no seed.
-        note(axes, text, (x, y), (8, 0), va="center", ha="left", fontsize=7, color=tint)
+        # Inside the panel, left of the seeds or, at its left edge, right of the marker: outside they would narrow it.
+        at, offset, ha = (x, 8, "left") if marker == "<" else (min(values[near], default=high), -8, "right")
+        note(axes, text, (at, y), (offset, 0), va="center", ha=ha, fontsize=7, color=tint)
     return mean
