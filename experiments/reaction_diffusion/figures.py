@@ -62,7 +62,8 @@ def scores(rows: Results) -> Figure:
             mine = own.where(model=model, mode=mode)
             tint = TINTS.get(mode, colour(model)) if model == HYBRID else colour(model)
             if mode == SOURCE_ONLY:
-                panel.axhline(mine.spread("mse").median, color=tint, linestyle=":", label=_way(model, mode))
+                between = 0 if model == HYBRID else 2, (1, 3)  # two models of one error alternate
+                panel.axhline(mine.spread("mse").median, color=tint, linestyle=between, label=_way(model, mode))
                 continue
             if not len(mine):
                 continue

@@ -46,7 +46,7 @@ LARGEST_RATIO = 100.0  # an axis of errors ends at this many times the smallest 
 PADDING = 1.15  # factor of room at either end of an axis of errors
 SMALL = 1e-4  # an axis that begins below it has powers of ten
 LONG_NUMBER = 0.05  # numbers up to this need room on an axis
-MOST_DECADES = 5  # with a tick of their own on a log axis
+MOST_DECADES = 7  # with a tick of their own on a log axis
 HALF_LINE = 0.3  # half the height of a line in a panel: of a mean's bar, and of the band of its seeds
 FLOOR = "no model can do better"  # the label of the attainable error
 
