@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator, Sequence
 
 __all__ = ["main"]
-EXTRA = ("tyro", "matplotlib")  # what the script needs beside the library
+EXTRA = ("tyro", "matplotlib")  # packages that the script needs beside the library
 INTERRUPTED = "interrupted; each file that was written is complete"
 
 
@@ -18,7 +18,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: a verb and its options, by default `sys.argv`.
     """
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # else XLA tells of slow compilations
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # otherwise XLA reports slow compilations
     given = sys.argv[1:] if arguments is None else arguments
     try:
         with answering(" ".join(["hybrid-jax", *given[:1]]), INTERRUPTED, end=True):  # also while modules load
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @contextlib.contextmanager
 def answering(program: str, answer: str, end: bool = False) -> Iterator[None]:
-    """Answer the first Ctrl-C at once, even while XLA is busy, and perhaps end the process."""
+    """Answer the first Ctrl-C at once, even while XLA is busy; if `end`, also end the process."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -51,7 +51,7 @@ def answering(program: str, answer: str, end: bool = False) -> Iterator[None]:
                     return
 
     threading.Thread(target=listen, daemon=True).start()
-    before = signal.set_wakeup_fd(mouth, warn_on_full_buffer=False)  # to which a signal is written at once
+    before = signal.set_wakeup_fd(mouth, warn_on_full_buffer=False)  # Python writes signals to it at once
     handler = signal.signal(signal.SIGINT, lambda *_: None) if end else None
     try:
         yield

@@ -1,4 +1,4 @@
-"""`hybrid-jax adapt`: find what changed, and adapt a model."""
+"""The verb `hybrid-jax adapt`: find what changed, and adapt a model."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +21,10 @@ from hybrid_jax.io.models import load, save
 from hybrid_jax.trajectories import Trajectories
 
 __all__ = ["Options", "run"]
-UNLIKELY = 0.05  # probability that nothing changed, below which the vehicle is another one
+UNLIKELY = 0.05  # probability that nothing changed below which the vehicle has changed
 SHOWN = 5  # parameters beside the answer
 DIFFER = "These flights differ from the model, but do not determine which of its parameters changed."
-ALONE = "physics alone predicts the flights before better than with the network, and is the adapted model."
+ALONE = "only its physics is kept, because it predicts the flights before better without the network."
 STILL = "These flights hardly move, so they determine hardly anything."
 TAUGHT = ", to which the model was adapted"
 LACKED = (
@@ -89,7 +89,7 @@ def _page(
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
     answer = f"Changed: {what}." if own else DIFFER
     if not changed and found.candidates["source"] >= UNLIKELY:
-        answer = f"These flights show no change; {ALONE}" if different else "These flights show no change."
+        answer = f"These flights show no change; of the model {ALONE}" if different else "These flights show no change."
     todo = f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS." if different else KEEP
     title = "What changed" if changed else "Parameters, none of which clearly changed"
     moved = [each for each in changes if each[1] != each[2].value] or changes
@@ -105,8 +105,8 @@ def _page(
         [(f"RMSE on these flights{TAUGHT * different}", errors.figure(curves, known.dt))],
         [
             f"{error} was {old}; it is now {new[0]}." if new else f"{error} is {old}{expected}.",
-            *[f"On flights not seen expect {v:.3g} m/s ({low:.3g} to {high:.3g})." for v, low, high in unseen],
-            *([f"Of the model before, {ALONE}"] if found.physics_only else []),
+            *[f"On new flights you should expect {v:.3g} m/s ({low:.3g} to {high:.3g})." for v, low, high in unseen],
+            *([f"Of the model before {ALONE}"] if found.physics_only else []),
             *[WITHIN] * any(one.contains_before for *_, one in own),
             *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
             *errors.unknown(found),

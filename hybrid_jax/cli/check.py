@@ -1,4 +1,4 @@
-"""`hybrid-jax check`: compare predictions with flights and baselines, and find where they are wrong."""
+"""The verb `hybrid-jax check`: compare predictions with flights and baselines, and find where they are wrong."""
 
 from dataclasses import dataclass
 from pathlib import Path

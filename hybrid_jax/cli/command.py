@@ -24,7 +24,7 @@ from hybrid_jax.cli.help import expected, option_of, short_help, values
 from hybrid_jax.runtime import configure
 
 Options = TypeVar("Options")
-# Exit codes; that of a signal is 128 + its number. ADAPTED is 0.
+# Exit codes. For a signal it is 128 + its number.
 BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED = 2, 3, 4
 VERBS = {
     "inspect": "check what logs contain, and write a vehicle file from them",
@@ -45,11 +45,11 @@ For example: hybrid-jax fit before/ -o source.npz
 hybrid-jax VERB --help lists the common options, --help-all all of them.
 Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."""
 
-# Arguments that messages of the library name, and the options of the commands that have them.
+# Arguments in messages of the library, and the corresponding options of the commands that have them.
 READ_LOGS = ("inspect", "fit", "adapt", "check", "replay", "real_flight")
 _SAME = ("columns", "polynomial", "topics", "motor_order", "dt", "delay")
 FLAGS = {name: f"--{name.replace('_', '-')}" for name in _SAME} | {"failed": "--ignore-checks"}
-_KEYS = ("columns", "polynomial")  # words of column maps as well: options only before a value
+_KEYS = ("columns", "polynomial")  # also words of column maps, so options only before a value
 _NAMED, _FREE = "|".join(FLAGS), "|".join(name for name in FLAGS if name not in _KEYS)
 _VALUE = r"\([^)]*\)|\{[^}]*\}|\"[^\"]*\"|[^\s,;:)]+"
 
@@ -79,7 +79,7 @@ def run(arguments: Sequence[str]) -> None:
             checks.writable_folder("--output", output if verb == "export" else output.parent)
             if verb != "export" and output.is_dir():
                 raise ValueError(f"--output {output}: is a folder; name a file in it")
-        _ = getattr(options, "reading", None)  # is checked before anything is read
+        _ = getattr(options, "reading", None)  # raises an error for invalid options before anything is read
         code = module.run(options)
     sys.exit(code)
 
@@ -92,7 +92,7 @@ def parsed(
     description: str = "",
     common: Collection[str] | None = None,
 ) -> Options:
-    """Parse a command line into a dataclass; raise ValueError if it is invalid. `common`: options of --help."""
+    """Parse a command line into a dataclass; ValueError if it is invalid. `common` are the options listed by --help."""
     output, given = io.StringIO(), list(sys.argv[1:] if arguments is None else arguments)
     description = description or inspect.cleandoc(str(kind.__doc__))
     if {"-h", "--help"} & {*given}:
@@ -121,8 +121,8 @@ def _options(kind: type) -> Iterator[tuple[str, str]]:
 
 
 def _complaint(known: Mapping[str, str], given: Sequence[str], box: str, usage: str) -> str:
-    """Say in one line what is wrong with a command line, around which tyro draws a box."""
-    # One that is wrong is named even where an argument is missing, which tyro finds first.
+    """Explain in one line what is wrong with a command line, from the box that tyro draws."""
+    # An unknown option is reported first, whereas tyro would report a missing argument.
     for word in (re.split(r"[=.]", word)[0] for word in given if word.startswith("--")):
         if word.replace("--no-", "--", 1) not in (*known, "--help"):
             return f"Unrecognized options: {word}{_meant(word, known)}"
@@ -160,7 +160,7 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
             binary = io.BufferedWriter(_Output(program, stream.fileno()))
             stream = io.TextIOWrapper(binary, stream.encoding, line_buffering=True)
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a letter ends no run
+            stream.reconfigure(errors="replace")  # a letter that a terminal cannot show should not end a run
         setattr(sys, name, stream)
     before, warnings.showwarning = warnings.showwarning, partial(_warn, program)
     try:
@@ -184,7 +184,7 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
 
 
 def _warn(program: str, message: Warning | str, *_: Any) -> None:
-    """Print a warning as one line for the user, without the place in the library where it was raised."""
+    """Print a warning as one line, without the place in the library where it was raised."""
     print(f"{program}: warning:", printable(" ".join(str(message).split())), file=sys.stderr)
 
 
@@ -206,7 +206,7 @@ class _Output(io.FileIO):
         except OSError as error:
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
             if sys.stdout.fileno() == self.fileno():
-                print(f"{self.program}: standard output: {error.strerror}; what is left is not shown", file=sys.stderr)
+                print(f"{self.program}: standard output: {error.strerror}; the rest is not shown", file=sys.stderr)
             return memoryview(text).nbytes
 
 

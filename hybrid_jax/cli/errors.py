@@ -12,8 +12,8 @@ from hybrid_jax.cli.page import STYLE, Table
 from hybrid_jax.identification.learning import UNITS
 
 BASELINE = (
-    "RMSE is the root mean square of the error of predictions. Frozen rates are a baseline: the thrust of the motors "
-    "acts, and body rates stay as they are."
+    "RMSE is the root mean square of the prediction error. Frozen rates are a baseline: the thrust of the motors acts, "
+    "and body rates stay constant."
 )
 LINES = {  # colour and dashes of a model, the same on every page
     "thrust, rates frozen": ("0.6", "--"),
@@ -50,12 +50,11 @@ def figure(errors: Mapping[str, Float[np.ndarray, "flights t 4"]], dt: float) ->
 
 
 def parameter_table(found: Adaptation) -> Table:
-    """List all parameters with their intervals."""
     lines = [(name, str(one)) for name, one in found.parameters.items()]
     return Table(f"Parameters ({found.level:.0%} intervals)", ("parameter", "value"), lines)
 
 
 def unknown(found: Adaptation) -> list[str]:
-    """Say which parameters the flights do not identify; empty if there are none."""
+    """Return a sentence on the parameters that the flights do not identify, if there are any."""
     names = [name for name, one in found.parameters.items() if one.high == np.inf]
     return [f"The flights do not identify {', '.join(names)}: other values fit as well."] if names else []

@@ -1,4 +1,4 @@
-"""`hybrid-jax export`: write a model as C, CasADi functions or StableHLO."""
+"""The verb `hybrid-jax export`: write a model as C, CasADi functions or StableHLO."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,8 +39,8 @@ PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.m
 FORCE, TORQUE = 3.0, 5.0  # standard deviations of a disturbance: m/s² and rad/s²
 STATES = "x: position [m], quaternion w x y z, velocity [m/s], body rates [rad/s]; u: rotor speeds [rad/s]."
 PAST = (
-    "The model predicts its errors from those before. Behind its state are {} filtered errors: 0 at first, then what "
-    "`observe` returns after each sample, from the state before, u and the sample."
+    "The model predicts its errors from earlier ones. Its state ends with {} filtered errors, which are 0 at first. "
+    "You should then pass on what `observe` returns after each sample, for the state before, u and the sample."
 )
 
 
@@ -48,15 +48,15 @@ PAST = (
 class Options:
     """Write a model's field ẋ = f(x, u), and a step x⁺ = F(x, u) of it, for other programs.
 
-    Of a model with a past also `observe`, which returns the state after each sample: you carry it.
+    A model with a past also gets `observe`, which returns the state after each sample, for you to pass on.
 
-    c: NAME.h and NAME.c in C99, for a flight controller, and if the physics has parameters NAME_adaptation.h and
-    NAME_adaptation.c, a filter that adapts them in flight. casadi: field.casadi and step.casadi for
+    c: NAME.h and NAME.c in C99, for a flight controller; and NAME_adaptation.h and NAME_adaptation.c, a filter that
+    adapts the parameters of the physics in flight, if it has any. casadi: field.casadi and step.casadi for
     casadi.Function.load. stablehlo: field.npz and step.npz for hybrid_jax.export.load_program or JAX.
     """
 
     model: Annotated[Path, tyro.conf.Positional]
-    """Model that `hybrid-jax fit` or `adapt` wrote. Or an experiment, or hybrid_jax.save."""
+    """Model that `hybrid-jax fit` or `adapt` wrote. It may also be from an experiment, or from hybrid_jax.save."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the files."""
     to: tuple[Literal["c", "casadi", "stablehlo"], ...] = ("c",)
@@ -66,16 +66,16 @@ class Options:
     double: bool = False
     """C in double precision."""
     smooth: float | None = None
-    """Replace ReLU by ½ (z + √(z² + 1/β²)) with this β. This is for solvers of optimal control problems, which converge
-    with 5 and mostly not with 30: see docs/howto/solvers.md. The page says how much ẋ changes."""
+    """Replace ReLU by ½ (z + √(z² + 1/β²)) with this β. You should do so for solvers of optimal control problems, which
+    converge with 5 but mostly not with 30: see docs/howto/solvers.md. The page shows how much ẋ changes."""
     dt: float | None = None
     """Length of a step [s]. By default the sample interval of the training flights."""
     out: Path = Path("runs/export")
     """Folder of the page."""
     noise: Annotated[tuple[float, ...], RARE] = ()
     """Filter: standard deviation of the measurements: position [m], quaternion, velocity [m/s] and body rates
-    [rad/s], by default 0.001 0.002 0.02 0.02; or one number for all states, or one for each. A system other than a
-    rigid body has no default, and no filter without it. For other settings of the filter see docs/howto/c.md."""
+    [rad/s], by default 0.001 0.002 0.02 0.02; or one number for all states, or one for each. For other systems than a
+    rigid body there is no default, and no filter without it. For other settings of the filter see docs/howto/c.md."""
     state_size: Annotated[int | None, RARE] = None
     """Size of x, if the model is not of a rigid body."""
     input_size: Annotated[int | None, RARE] = None
@@ -86,7 +86,7 @@ def run(options: Options) -> int:
     model = load(options.model)
     field, dt = model.field, model.about.get("dt") if options.dt is None else options.dt
     if dt is None:
-        raise ValueError(f"--dt is needed: {options.model} does not say how long the steps of its flights were")
+        raise ValueError(f"--dt is needed: {options.model} does not contain the sample interval of its flights")
     checks.positive(f"{options.model}: dt" if options.dt is None else "--dt", dt, "a positive number of seconds")
     if options.noise and "c" not in options.to:
         raise ValueError("--noise needs --to c: the filter is only written as C")
@@ -140,13 +140,13 @@ def _page(
         page.Table("Files", ("file", "size"), rows),
         _response(field, dt),
         [*([STATES] if rigid else []), *said],
-        todo or ["docs/howto/export.md says what reads them."],
+        todo or ["docs/howto/export.md explains how to read them."],
     )
 
 
 @mpl.rc_context(page.STYLE)
 def _response(field: AbstractVectorField, dt: float) -> list[tuple[str, Figure]]:
-    """Plot what a multirotor does after a rotor speeds up, to compare with what the files give."""
+    """Plot the response of a multirotor to a faster rotor, to compare with the files."""
     if (vehicle := vehicle_in(field)) is None or isinstance(field, Actuated):
         return []
     steps = max(2, round(RESPONSE / dt))
@@ -159,11 +159,11 @@ def _response(field: AbstractVectorField, dt: float) -> list[tuple[str, Figure]]
         panel.set(xlabel="time [s]", ylabel=name)
         panel.legend()
     told = f"From rest at 1 m with {vehicle.hover_speed:.4g} rad/s, and the first rotor {FASTER - 1:.0%} faster"
-    return [(f"{told}: what step gives", figure)]
+    return [(f"{told}: the result of step", figure)]
 
 
 def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> OnlineAdaptation | str:
-    """Make the filter, or say why there is none; raise ValueError if the noise does not match the model."""
+    """Make the filter, or return why there is none; ValueError if the noise does not match the model."""
     rigid = state_space(field) == RIGID_BODY_SPACE and d == STATE_SIZE
     try:
         ravel_parameters(field)
@@ -172,14 +172,14 @@ def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> 
             raise
         return str(error)
     if not (noise := options.noise or SENSOR_NOISE * rigid):
-        return "--noise must say how exactly the states are measured"
+        return "--noise must be given, because it has no default for this system"
     known = {1: 1, d: 1} | ({len(PARTS): PARTS} if d == STATE_SIZE else {})  # repeats of each number
     if len(noise) not in known:
         expected = f"1, {len(PARTS)} or {d}" if d == STATE_SIZE else f"1 or {d}"
         raise ValueError(f"--noise must be {expected} numbers, got {len(noise)}")
     field = field if options.smooth is None else smoothed(field, options.smooth)
     beyond, process = 0.0, 0.0
-    if rigid:  # an adapted model may have a disturbance of some states alone
+    if rigid:  # an adapted model may have a disturbance of some states only
         own = getattr(disturbance_of(field), "indices", None) or range(VELOCITY.start, STATE_SIZE)
         beyond = tuple(TORQUE if i >= BODY_RATES.start else FORCE for i in own)
         process = np.repeat(PROCESS, PARTS)
@@ -195,5 +195,5 @@ def _change(field: AbstractVectorField, beta: float) -> str:
     before, after = (np.asarray(eqx.filter_jit(one.infer_batch)(*columns)) for one in (field, smoothed(field, beta)))
     off = np.abs(after - before).max(axis=1)
     entry = int(off.argmax())
-    told, rms = f"ẋ differs by at most {off[entry]:.2g}, in entry {entry}", np.sqrt(np.mean(np.square(before[entry])))
-    return f"smooth {beta:g}: {told}, of RMS {rms:.2g}; {len(motion)} training states."
+    told, rms = f"ẋ changes by at most {off[entry]:.2g}, in entry {entry}", np.sqrt(np.mean(np.square(before[entry])))
+    return f"With smooth {beta:g}, {told}, whose RMS is {rms:.2g}, at {len(motion)} training states."

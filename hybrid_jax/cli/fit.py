@@ -1,4 +1,4 @@
-"""`hybrid-jax fit`: learn a vehicle from its logs, with a network if that predicts better than physics only."""
+"""The verb `hybrid-jax fit`: learn a vehicle from its logs, with a network if it improves predictions."""
 
 import contextlib
 from dataclasses import dataclass, replace
@@ -25,10 +25,10 @@ from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
 
 __all__ = ["Options", "run"]
-OF_MODEL = ("windows", "motion")  # of the model, and not of the report
+OF_MODEL = ("windows", "motion")  # not in the report
 REMEMBERS = (
-    "The model also uses its errors in the seconds before: they show forces that last, for example of a load that "
-    "swings, and noise in the first sample. docs/howto/records.md says how you give them to it."
+    "The model also uses its errors in the seconds before, which show lasting forces, for example of a swinging load, "
+    "and noise in the first sample. docs/howto/records.md explains how to pass them."
 )
 QUANTILES = np.linspace(0.01, 0.99, 99)
 
@@ -40,9 +40,9 @@ class Options(FlightOptions):
     Each flight is held out in turn, to choose between physics only and physics with a network, and to estimate the
     error on a new flight.
 
-    Your logs should have position, velocity, attitude, body rates, and rotor speeds (or commands with --polynomial).
-    From logs without some of these, and from commands where the vehicle file has a table [actuator], only physics is
-    identified, with a 95 % interval of each parameter that is infinite if the logs do not determine it: see
+    Your logs should have position, velocity, attitude, body rates, and rotor speeds (or commands with --polynomial). If
+    some of these are missing, or if there are commands and the vehicle file has a table [actuator], only physics is
+    identified. Each parameter then gets a 95 % interval, which is infinite if the logs do not determine it: see
     docs/howto/identify.md.
     """
 
@@ -51,8 +51,8 @@ class Options(FlightOptions):
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """File for the model."""
     vehicle: Path | None = None
-    """Vehicle file: see docs/howto/vehicle.md. It has what is known and, in `learn`, what to learn. By default, one is
-    estimated from the logs, with a mass of 1 kg and arms of 0.1 m, which scale the results."""
+    """Vehicle file: see docs/howto/vehicle.md. It has the known constants and, in `learn`, the names to learn. By
+    default, one is estimated from the logs, with a mass of 1 kg and arms of 0.1 m, which scale the results."""
     learn: tuple[str, ...] = ()
     """Parameters to learn, instead of the vehicle file's. If it has none: inertia, thrust and aerodynamics."""
     dt: float | None = None
@@ -65,7 +65,7 @@ class Options(FlightOptions):
     """Identification: steps of a window. Short windows are robust to slow disturbances, long ones identify slow
     effects."""
     windows: Annotated[int, RARE] = 300
-    """Identification: most windows, half of which are the most informative, and half evenly spaced."""
+    """Identification: largest number of windows. Half are the most informative ones, and half are evenly spaced."""
     disturbance: Annotated[tuple[float, ...], RARE] = Layout.disturbance
     """Identification: initial standard deviation of a window's constant force [m/s²] and torque [rad/s²] along x, y and
     z. You should use 0 for a damaged rotor, because a free torque would absorb its trim."""
@@ -104,7 +104,7 @@ def run(options: Options) -> int:
 
 
 def _identified(options: Options, model: VehicleModel) -> bool:
-    """Whether the first log that can be read is incomplete, or the vehicle file's actuator is used or learned."""
+    """Whether the first readable log is incomplete, or the vehicle file's actuator is used or learned."""
     for path in paths_of(options.before)[0]:
         with contextlib.suppress(ValueError):  # a log that cannot be read is left out later
             found = read_recording(path, **options.reading)
@@ -116,10 +116,9 @@ def _identified(options: Options, model: VehicleModel) -> bool:
 
 
 def _about(options: Options, model: VehicleModel, flights: Flights, found: Learned) -> dict[str, Any]:
-    """Collect what other verbs need to know about the model."""
-    features = RIGID_BODY_SPACE.features(
-        *(np.concatenate([getattr(log, part) for log in flights.logs]) for part in "xu")
-    )
+    """Collect the metadata of the model that other verbs need."""
+    x, u = (np.concatenate([getattr(log, part) for log in flights.logs]) for part in "xu")
+    features = RIGID_BODY_SPACE.features(x, u)
     return {
         "steps": STEPS,
         "vehicle": model.vehicle.name,
@@ -157,7 +156,7 @@ def _page(options: Options, flights: Flights, found: Learned, dt: float, left: s
             f"The model is {found.chosen}: a network beside the physics {helps}.",
             errors.BASELINE,
             *([REMEMBERS] if found.chosen.endswith(PAST) else []),
-            *([f"Rotors follow the motors of the logs with {1000 * found.lag:.3g} ms."] if found.lag else []),
+            *([f"Rotors follow the motors of the logs with a lag of {1000 * found.lag:.3g} ms."] if found.lag else []),
             *[left] * bool(left),
             *errors.unknown(found.physics),
             *flights.warnings,

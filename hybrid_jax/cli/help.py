@@ -1,4 +1,4 @@
-"""`--help`: a line or two for each common option; tyro lists all of them for `--help-all`."""
+"""Print `--help`, with a line or two for each common option. For `--help-all`, tyro lists all of them."""
 
 import ast
 import inspect
@@ -13,16 +13,16 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type
 
 import tyro
 
-RARE = "rare"  # in the annotation of an option that only --help-all lists
+RARE = "rare"  # annotation of an option that only --help-all lists
 INDENT, WIDEST, LONG = 26, 100, 15  # columns; choices that are longer follow the text
 VALUES: dict[Any, str] = {bool: "", int: "N", float: "X", str: "NAME"}
 WORDS = {"N": "an integer", "X": "a number"}
 
 
 def short_help(kind: type, program: str, about: str, default: Any, common: Collection[str] | None) -> str:
-    """Return the help of a dataclass of options: those in `common`, or all without RARE in their annotation.
+    """Return the help on options of a dataclass: those in `common`, or all without RARE in their annotation.
 
-    Of descriptions, it has the first paragraph of the program's, and the first sentence of each option's.
+    It has the first paragraph of the program's description, and the first sentence of each option's.
     """
     said, hints = _documented(kind), get_type_hints(kind, include_extras=True)
     every = [each for each in fields(cast(Any, kind)) if tyro.conf.Suppress not in _marks(hints[each.name])]
@@ -98,7 +98,7 @@ def values(hint: Any) -> str:
 
 
 def expected(typed: str) -> str:
-    """Describe what a user should type after an option, of which `values` says it in short."""
+    """Describe in words what a user should type after an option, from the result of `values`."""
     typed, many, _ = typed.partition(" …")
     one, *more = typed.split()
     what = f"one of {one.replace('|', ', ')}" if "|" in one else WORDS.get(one, one)

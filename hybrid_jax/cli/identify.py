@@ -1,4 +1,4 @@
-"""`hybrid-jax fit`, `adapt` and `check` for logs of commands and of any other measurements, without all states."""
+"""The verbs `fit`, `adapt` and `check` for logs of commands, or logs without some of the states."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -33,12 +33,12 @@ Errors = Float[np.ndarray, "n t k"]
 KEEP = "Keep the model. If something did change, you should fly manoeuvres that excite it more."
 HEADER = ("parameter", "before", "after", "from", "to", "unit")
 ENDS = ("value", "low", "high")
-LINES = 5  # of what is not folded
-FITS = ("dt", "steps", "windows", "disturbance")  # options that a model remembers
-NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
-STOPPED = "The fit stopped before it converged: start closer, or learn fewer parameters."
-MEND = "nothing was identified; mend the logs as the lines above say, or go on with --ignore-checks"
-IGNORED = "{} checks of the logs failed, and --ignore-checks went on: no number below counts until they pass."
+LINES = 5  # lines of a table that are not folded
+FITS = ("dt", "steps", "windows", "disturbance")  # options stored in a model
+NOT_NEEDED = ("quantities", "slowest signal")  # missing signals are not compared, and slow ones at their own times
+STOPPED = "The fit stopped before it converged. You should start closer, or learn fewer parameters."
+MEND = "nothing was identified; correct the logs as described above, or continue with --ignore-checks"
+IGNORED = "{} checks of the logs failed, but --ignore-checks continued: you should not trust any number below."
 
 
 def run(options: Any, path: Path, model: VehicleModel) -> int:
@@ -57,7 +57,7 @@ def run(options: Any, path: Path, model: VehicleModel) -> int:
 
 
 def layout_of(fits: Mapping[str, Any]) -> Layout:
-    """Return how recordings are cut into windows (one of FITS)."""
+    """Return the layout of windows from the options FITS."""
     return Layout(fits["dt"], fits["steps"], fits["windows"], disturbance=tuple(fits["disturbance"]))
 
 
@@ -73,9 +73,9 @@ def checked(options: Any, path: Path, model: VehicleModel) -> tuple[Flights, Any
 def read_checked(
     folder: Path, options: Any, vehicle: Vehicle, learn: Sequence[str], start: Callable[..., tuple[Any, str]]
 ) -> tuple[Flights, Any]:
-    """Read and check the logs of a folder like `checked`; `start` makes a field for them, and says what it lacks."""
+    """Read and check logs as `checked` does; `start` makes a field for them, and a line on what it does not learn."""
     raws, contents, said = recordings_of(folder, options)
-    failed: list[tuple[str, str, str]] = []  # a log, a check and what it says
+    failed: list[tuple[str, str, str]] = []  # a log, a check and its suggestion
 
     def require(checks_of: Callable[[Recording], list[Check]]) -> None:
         for name, log in [*raws.items()]:
@@ -168,10 +168,10 @@ def _notes(found: Identified, logs: Sequence[Recording], unseen: Sequence[str]) 
     notes = {
         STOPPED: not found.converged,
         f"Not identifiable from these logs, unchanged: {', '.join(unseen)}.": unseen,
-        f"Commands {max(slow, default=0):.3g} s apart: the intervals include changes in between; such a log "
-        "hardly distinguishes a delay from a lag.": slow,
-        f"Share of the changes of the body rates that the motors explain: {shares}; the less, the wider are the "
-        "intervals of inertia and torque.": True,
+        f"Commands are {max(slow, default=0):.3g} s apart. The intervals include changes in between, and a delay and a "
+        "lag can hardly be distinguished.": slow,
+        f"Share of the changes of the body rates that the motors explain: {shares}. If it is small, the intervals of "
+        "inertia and torque are wide.": True,
         ("" if "drag" in learned else unlearned_drag(logs)): True,
     }
     return [note for note, holds in notes.items() if note and holds]
@@ -206,7 +206,6 @@ def _nearest(part: Errors, asked: int, dt: float) -> str:
 
 @mpl.rc_context(page.STYLE)
 def figure(errors: Mapping[str, Errors], logs: Sequence[Recording], dt: float) -> Figure:
-    """Plot prediction errors against time."""
     rows = -(-len(errors) // 2)
     picture = Figure(figsize=(6.0, 2.6 * rows), layout="constrained")
     for i, (name, part) in enumerate(errors.items(), 1):
@@ -236,7 +235,7 @@ def adapt(options: Any, model: Model) -> int:
     ]
     alone = [
         f"{name} from {before[name]['value']:.4g} to {value:.4g} ({low:.4g} to {high:.4g}) would by itself explain "
-        f"{share:.0%} of how these logs differ."
+        f"{share:.0%} of the difference of these logs."
         for name, (share, value, low, high) in changed.items()
     ]
     errors = {"before": window_errors(model.field, logs, layout), "adapted": window_errors(found.field, logs, layout)}
@@ -282,7 +281,7 @@ def check(options: Any, model: Model) -> int:
 
 
 def _like(options: Any, folder: Path, model: Model) -> tuple[Flights, Any]:
-    """Read logs for an identified model; none of them may be one of its training logs."""
+    """Read logs for an identified model; ValueError if one of them is a training log."""
     field = cast(Any, model.field)
     body = field.body if isinstance(field, Actuated) else field
     learned = tuple(name.partition("[")[0] for name in model.about["parameters"])

@@ -1,4 +1,4 @@
-"""`hybrid-jax inspect`: check which signals logs have, advise what to log, and write a vehicle file."""
+"""The verb `hybrid-jax inspect`: check which signals logs have, advise what to log, and write a vehicle file."""
 
 import math
 from collections.abc import Sequence
@@ -24,23 +24,23 @@ from hybrid_jax.io.files import write_atomic
 from hybrid_jax.vehicle import Vehicle
 
 __all__ = ["Options", "run"]
-PICTURED, POINTS = 6, 3000  # logs that get a picture; samples of each line at most
-LINES = 5  # of what is not folded
-# Checks that a log may fail and still say something of its vehicle: it needs no position, and is cut at gaps.
+PICTURED, POINTS = 6, 3000  # logs that get a picture; most samples of a line
+LINES = 5  # lines of a table that are not folded
+# Checks that a log for a vehicle file may fail, because it does not need a position and is cut at gaps.
 BORNE = ("quantities", "slowest signal", "gaps", "repeated samples")
 SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
 NOT_RUN = f"Without --vehicle these are not checked: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
 EMPTY = "–"
-READY = "ready"  # the result of a log that every verb takes
-LESS = "Some logs have motors and lack states ({}): hybrid-jax fit learns what these determine."
+READY = "ready"  # the result of a log that every verb accepts
+LESS = "Some logs have motors, but lack states ({}). You can use hybrid-jax fit to learn what they determine."
 
 
 @dataclass(frozen=True)
 class Options(LogOptions):
     """Check the logs of a folder: their signals, whether they suffice for a model, and what you should log instead.
 
-    Reads PX4's .ulg, logs of a Crazyflie's SD card, ROS bags, Betaflight's blackbox and CSV. Files are read separately,
-    so one damaged file does not hide the others. Nothing is trained and no log is changed.
+    You can inspect PX4's .ulg, logs of a Crazyflie's SD card, ROS bags, Betaflight's blackbox and CSV. Files are read
+    separately, so one damaged file does not hide the others. Nothing is trained and no log is changed.
 
     First inspect the logs, then write a vehicle file from them, correct it by hand, and inspect the logs with it:
 
@@ -52,7 +52,7 @@ class Options(LogOptions):
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of logs, or one log."""
     vehicle: Path | None = None
-    """Vehicle file to check the logs against. It has the number and order of motors, spin, thrust and largest speed."""
+    """Vehicle file to check the logs against. The number and order of motors, spin, thrust and speeds should agree."""
     write_vehicle: Path | None = None
     """Write an initial vehicle file. Hover, thrust, rotor positions, spin, lag and centre of thrust are estimated from
     logs that pass all checks; the rest is marked with a comment. Existing files are not overwritten."""
@@ -84,7 +84,7 @@ def run(options: Options) -> int:
     page.write(options.out, "inspect", _page(options, logs, [printable(line) for line in left]), {"rows": rows})
     if path is not None:
         write_vehicle(path, logs, options.folder, options.mass, options.arm)
-    return BAD_INPUT if all(log.recording is None for log in logs) else 0  # the lines above say why
+    return BAD_INPUT if all(log.recording is None for log in logs) else 0
 
 
 def result_of(log: Looked) -> str:
@@ -104,7 +104,7 @@ def warned(log: Looked) -> str:
 
 
 def inspected(paths: Sequence[Path], vehicle: Vehicle | None, options: Any) -> list[Looked]:
-    """Read and check logs by the options of this verb or of `fit`; an error becomes part of the result."""
+    """Read and check logs with the options of this verb or of `fit`; an error becomes part of the result."""
     found, first = [], {}
     for path in paths:
         name = printable(path.name)
@@ -134,7 +134,7 @@ def trusted(logs: Sequence[Looked]) -> list[Recording]:
     left = [log.name for log in logs if any(check.name not in BORNE for check in log.failed)]
     kept = [log.recording for log in logs if log.recording is not None and log.name not in left]
     if not kept:
-        raise ValueError(f"vehicle file: no log flew and passed its checks; {logs[0].name}: {result_of(logs[0])}")
+        raise ValueError(f"vehicle file: no log of a flight passed its checks; {logs[0].name}: {result_of(logs[0])}")
     if left:
         print(f"left out of the vehicle file, as checks failed: {', '.join(left)}")
     return kept
@@ -194,8 +194,6 @@ def _signals(logs: Sequence[Looked]) -> page.Table:
 
 
 def _checks(logs: Sequence[Looked]) -> page.Table:
-    """List the results of all checks."""
-
     def shown(check: Check) -> str:
         number = f" {check.value:.3g} {check.unit}" if check.unit and math.isfinite(check.value) else ""
         return f"{SHOWN.get(check.verdict, 'ok')}{number}"

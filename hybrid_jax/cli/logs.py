@@ -1,4 +1,4 @@
-"""Read logs of a folder, check them, and cut them into flights and windows, for every verb; and models of them."""
+"""Read logs and models, check them, and cut logs into flights and windows, for every verb."""
 
 import itertools
 import sys
@@ -38,9 +38,9 @@ from hybrid_jax.io.models import Model
 from hybrid_jax.trajectories import WARN, shares_outside
 from hybrid_jax.vehicle import Vehicle
 
-ONE_TO_ONE = (0.0, 1.0)  # rotor speed = command, in whatever unit: motors are still compared with the motion
-CUT = ("time on the ground",)  # is cut out
-CHANGED = 2.0  # factor by which thrust may differ from the vehicle's where a change is asked for
+ONE_TO_ONE = (0.0, 1.0)  # rotor speed = command, in any unit, to compare motors with the motion
+CUT = ("time on the ground",)  # checks that do not matter, because this time is cut out
+CHANGED = 2.0  # factor by which thrust may differ from the vehicle's after a change
 BORNE = {RATIO: lambda ratio: 1 / CHANGED < ratio < CHANGED, GYRO: lambda lag: lag > 0}  # values that may be right
 
 
@@ -49,21 +49,21 @@ class LogOptions:
     """Options for reading logs."""
 
     columns: Path | None = None
-    """TOML file about the columns of CSV logs. It names their units and frames, too: see docs/howto/logs.md."""
+    """TOML file that describes the columns of CSV logs. It states units and frames, too: see docs/howto/logs.md."""
     topics: tuple[str, ...] = ()
-    """ROS topics: odometry=/odom motors=/rotors:data:rpm …. Also pose, imu, voltage."""
+    """ROS topics: odometry=/odom motors=/rotors:data:rpm …. You can also name pose, imu and voltage."""
     motor_order: tuple[int, ...] = ()
-    """Index of each rotor's motor in the log, as 2,0,3,1. Indices begin with 0."""
+    """Index of each rotor's motor in the log, for example 2,0,3,1. Indices begin with 0."""
     polynomial: tuple[float, ...] = ()
-    """c0, c1, …: rotor speed [rad/s] = c0 + c1 command …. For logs with commands, from 0 (stop) to 1 (full), but no
-    rotor speeds. You can measure it on a test stand, or at two points: 100,1000 if a motor starts at 100 rad/s and
-    reaches 1100 at full command. PWM (1000 … 2000 µs) and DShot are scaled to 0 … 1 first."""
+    """c0, c1, …: rotor speed [rad/s] = c0 + c1 command …. You need it for logs with commands, 0 (stop) to 1 (full), but
+    no rotor speeds. You can measure it on a test stand, or at two points: give 100,1000 if a motor starts at 100 rad/s
+    and reaches 1100 at full command. PWM (1000 … 2000 µs) and DShot are scaled to 0 … 1 first."""
     delay: Annotated[float, RARE] = 0.0
     """Delay to add to the motors [s], if a check found that they lead the gyro."""
 
     @property
     def reading(self) -> dict[str, Any]:
-        """Arguments of the functions of `hybrid_jax.flights.load`; raises ValueError for malformed ones."""
+        """The arguments of functions of `hybrid_jax.flights.load`; ValueError if one is malformed."""
         if self.columns is not None:
             load_column_map(self.columns)
         for word in self.topics:
@@ -84,11 +84,11 @@ class FlightOptions(LogOptions):
 class Flights(NamedTuple):
     """The flights of a folder, at one interval."""
 
-    logs: list[Any]  # of those that passed: flights in the air, or recordings
+    logs: list[Any]  # the logs that passed: flights in the air, or recordings
     contents: dict[str, str]  # digests by name
     said: list[str]  # lines on logs that were read, left out or cut
     warnings: Sequence[str] = ()  # of checks
-    still: bool = False  # whether none moves enough to be compared with itself
+    still: bool = False  # whether no log has enough motion to be checked against itself
 
     @property
     def seconds(self) -> float:
@@ -101,8 +101,8 @@ class Looked(NamedTuple):
 
     name: str
     recording: Recording | None = None
-    checks: Sequence[Check] = ()  # of its signals, except what every verb corrects
-    refusal: str = ""  # why it cannot be read, or is no flight
+    checks: Sequence[Check] = ()  # of its signals, except for what every verb corrects
+    refusal: str = ""  # why it cannot be read, or is not a flight
     notes: Sequence[str] = ()  # what was repaired and cut
     log: FlightLog | None = None  # airborne
 
@@ -112,7 +112,7 @@ class Looked(NamedTuple):
 
 
 def require_distinct(flights: Sequence[tuple[str, Any]]) -> None:
-    """Raise ValueError if a flight occurs twice, as it could be in training and test; pass names and contents."""
+    """Raise ValueError if a flight occurs twice, because it could be in training and test; pass names and contents."""
     first: dict[Any, str] = {}
     for name, content in flights:
         if first.setdefault(content, name) != name:
@@ -135,7 +135,7 @@ def content_of(recording: Recording) -> str:
 
 
 def paths_of(folder: Path) -> tuple[list[Path], list[str]]:
-    """List the logs of a folder, or one log; also return a line for each other file."""
+    """Return the logs of a folder, or one log, and a line for each other file."""
     if not folder.exists():
         raise ValueError(f"{folder}: no such file or folder")
     paths, others = find_logs(folder) if folder.is_dir() else ([folder], {})
@@ -146,9 +146,9 @@ def paths_of(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def recordings_of(folder: Path, options: LogOptions) -> tuple[dict[str, Recording], dict[str, str], list[str]]:
-    """Read the logs of a folder, or one log, by file name: recordings, their digests, and a line for each other file.
+    """Read the logs of a folder, or one log; return recordings and digests by file name, and a line for other files.
 
-    A log that cannot be read is left out with a line, unless there is no other.
+    An unreadable log is left out with a line, but ValueError if all are unreadable.
     """
     paths, said = paths_of(folder)
     found, unread, reading = {}, [], options.reading
@@ -171,12 +171,12 @@ def read_flights(
 ) -> Flights:
     """Read, check and cut logs; failed ones are left out with a line.
 
-    `changed` tolerates another thrust, and `lagging` motors that lead the gyro because the model includes their lag.
+    With `changed`, thrust may differ; with `lagging`, motors may lead the gyro, because the model includes their lag.
     """
     with step(f"reading {folder}") as done:
         raws, contents, said = recordings_of(folder, options)
         logs: list[FlightLog] = []
-        failed: list[tuple[str, str, str]] = []  # a log, a check and what it says
+        failed: list[tuple[str, str, str]] = []  # a log, a check and its suggestion
         warned: list[tuple[str, str, str]] = []
         moving = False
         for name, raw in raws.items():
@@ -195,7 +195,7 @@ def read_flights(
         if not logs:
             other = all({RATIO, ROTORS} & {check for log, check, _ in failed if log == name} for name in raws)
             why = f"; or are they of another vehicle than {vehicle.name}?" * other
-            raise ChecksFailed(*short, f"no log passed its checks; correct them as said, or use --ignore-checks{why}")
+            raise ChecksFailed(*short, f"no log passed its checks; correct them, or use --ignore-checks{why}")
         for line in short:
             print(f"  {printable(in_flags(line))}", file=sys.stderr)
         found = Flights(logs, contents, said, list(map(in_flags, grouped(warned))), not moving)
@@ -204,7 +204,7 @@ def read_flights(
 
 
 def grouped(lines: Sequence[tuple[str, str, str]]) -> list[str]:
-    """Return a line for each check that logs failed: what it says of the first, and how many more there are."""
+    """Return a line for each check that logs failed: the suggestion for the first, and the number of others."""
     checks: dict[str, list[str]] = {}
     for name, check, told in lines:
         checks.setdefault(check, []).append(f"{name}: {check}: {told}")
@@ -220,7 +220,7 @@ def look(
     changed: bool = False,
     lagging: bool = False,
 ) -> Looked:
-    """Check a log and cut it to its flight; if the vehicle cannot be used, it is compared with itself."""
+    """Check a log and cut it to its flight; if the vehicle cannot be used, the log is only compared with itself."""
     checks, notes, log, refusal = check_recording(raw, vehicle, dt), [], None, ""
     scaled = "rotor_speed" in raw.signals or bool(options.polynomial)
     try:
@@ -228,11 +228,11 @@ def look(
         fits = log.dt == dt and not unevenness(log).any()
         log, cut = clean(log, Cleaning(in_flight=True, resample=None if fits else dt, delay=options.delay))
         notes = [line for line in cut if not line.startswith("0 ")]
-        other = vehicle is not None and log.u.shape[1] != vehicle.rotors  # a check that failed says so
+        other = vehicle is not None and log.u.shape[1] != vehicle.rotors  # which a check has reported
         checks += check_log(log, None if other or not scaled else vehicle)
         require_length([log], STEPS)
         if not scaled:
-            flight_at(raw, dt)  # says what is missing
+            flight_at(raw, dt)  # raises an error that names what is missing
     except ValueError as error:
         log, refusal = None, str(error).removeprefix(f"{path}: ")
     borne = {RATIO: changed, GYRO: lagging}
@@ -252,7 +252,7 @@ class Known(NamedTuple):
 
 
 def known_of(path: Path, model: Model) -> Known:
-    """Convert a model from a file; raise ValueError if `fit` or `adapt` did not write it."""
+    """Convert a model from a file; ValueError if `fit` or `adapt` did not write it."""
     vehicle = vehicle_in(model.field)
     if "identified" in model.about:
         raise ValueError(f"{path}: was identified without the states that replay draws; use hybrid-jax check")
@@ -262,7 +262,7 @@ def known_of(path: Path, model: Model) -> Known:
 
 
 def flights_for(known: Known, folder: Path, options: FlightOptions, changed: bool, unseen: bool = True) -> Flights:
-    """Read the flights of a folder like those of a model; if `unseen`, none may be one that it was trained on."""
+    """Read flights as for the training of a model; if `unseen`, ValueError if it was trained on one of them."""
     polynomial = options.polynomial or tuple(known.about.get("polynomial", ()))
     lag, options = known.about.get("lag", 0.0), replace(options, polynomial=polynomial)
     found = read_flights(folder, known.vehicle, known.dt, options, changed, lag > 0)

@@ -65,7 +65,7 @@ def counted(several: Sized, what: str) -> str:
 
 
 def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
-    """Write report.html and report.json (`found`, for programs) into a folder; print the answer and where they are."""
+    """Write report.html and report.json (`found`, for programs) into a folder; print the answer and the path."""
     record = {"format": FORMAT, "verb": verb, "answer": page.answer, "notes": list(page.notes)} | found
     write_atomic(out / "report.json", json_text(json_value(record)).encode())
     write_atomic(out / "report.html", document(page).encode())
@@ -82,7 +82,7 @@ def say(line: str) -> None:
 
 
 def _rows(table: Table) -> list[str]:
-    """Return a table's title, header and first rows in columns, as many as a terminal has room for."""
+    """Return a table's title, header and first rows, with as many columns as a terminal has room for."""
     rows = [table.header, *table.lines[:ROWS]]
     widths = [max(len(str(cell)) for cell in column) + 2 for column in zip(*rows, strict=True)]
     while sum(widths) > WIDTH - 2:
@@ -92,7 +92,6 @@ def _rows(table: Table) -> list[str]:
 
 
 def document(page: Page) -> str:
-    """Render the page as HTML."""
     first, *others = [_figure(*each) for each in page.figures] or [""]
     parts = [f"<h1>{escape(page.question)}</h1><p class=answer>{escape(page.answer)}</p>", first]
     parts += [_table(page.table)] if page.table else []
@@ -102,7 +101,7 @@ def document(page: Page) -> str:
     parts += [_folded("More pictures", "".join(others))] if others else []
     parts += [_folded("Notes", _list(page.notes))] if page.notes else []
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-    head += '<link rel="icon" href="data:,">'  # without one a browser asks for it
+    head += '<link rel="icon" href="data:,">'  # otherwise a browser requests one
     title = f"<title>{escape(page.question)}</title><style>{CSS}</style>"
     return f'<!doctype html><html lang="en"><head>{head}{title}</head><body>{"".join(parts)}</body></html>\n'
 

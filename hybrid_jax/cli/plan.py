@@ -1,4 +1,4 @@
-"""`hybrid-jax plan`: design the most informative ten seconds of flight for a model."""
+"""The verb `hybrid-jax plan`: design the most informative ten seconds of flight for a model."""
 
 import warnings
 from dataclasses import dataclass
@@ -28,8 +28,8 @@ from hybrid_jax.vehicle import POSITION, VELOCITY
 __all__ = ["Options", "run"]
 WINDOW, HALF, WELL = 10, 1.96, 0.1  # intervals; standard errors of half an interval; share of a value
 MAIN = 5  # intervals that are not folded
-MEANS = "A flight like this gives these intervals where the model is right, with a constant force and torque unknown."
-CHANGING = "The errors that the model predicts from its past count as a force and torque that change as much."
+MEANS = "You should get these intervals if the model is right, for an unknown constant force and torque."
+CHANGING = "The errors that the model predicts from its past are treated as a force and torque that change as much."
 HEADER = "t,px,py,pz,yaw,vx,vy,vz"
 BOX = FlightBounds()
 
@@ -44,13 +44,13 @@ class Options:
     model: Annotated[Path, tyro.conf.Positional]
     """Model that `hybrid-jax fit` or `adapt` wrote."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """CSV file for the set points. Time [s], position [m], yaw [rad] and velocity [m/s]."""
+    """CSV file for the set points. Its columns are time [s], position [m], yaw [rad] and velocity [m/s]."""
     learn: tuple[str, ...] = ()
     """Parameters to identify. By default all of the model's physics."""
     seconds: float = 10.0
     """Length of the flight [s]."""
     low: tuple[float, float, float] = BOX.low
-    """Lower corner of the box [m]. As x, y and z, which points up."""
+    """Lower corner of the box [m]. Give x, y and z, which points up."""
     high: tuple[float, float, float] = BOX.high
     """The opposite corner [m]."""
     speed: float = BOX.speed

@@ -1,4 +1,4 @@
-"""`hybrid-jax replay`: show a flight in 3-D with the models' predictions."""
+"""The verb `hybrid-jax replay`: show a flight in 3-D with the models' predictions."""
 
 import io
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ Forecasts = Mapping[str, Float[np.ndarray, "n t 3"]]
 class Options(FlightOptions):
     """Show a flight in 3-D with each model's predictions at each time, under the recorded inputs.
 
-    Writes replay.gif, which is also on the page.
+    The animation is on the page, and in replay.gif.
     """
 
     model: Annotated[Path, tyro.conf.Positional]
@@ -43,7 +43,7 @@ class Options(FlightOptions):
     flight: Annotated[Path, tyro.conf.Positional]
     """One log."""
     other: Path | None = None
-    """A second model to compare. For example the one before adaptation."""
+    """A second model to compare. For example, give the one before adaptation."""
     ahead: float = 0.5
     """Prediction horizon [s]."""
     seconds: float = 10.0
@@ -77,10 +77,10 @@ def run(options: Options) -> int:
     seconds = steps * windows.dt
     result = page.Page(
         f"Where do models expect the vehicle of {options.flight.name}?",
-        f"{seconds:g} s ahead it is {rms[str(options.model)]:.3g} m from where {options.model.name} expects it.",
+        f"After {seconds:g} s it is {rms[str(options.model)]:.3g} m from where {options.model.name} expects it.",
         page.Table(f"Distance after {seconds:g} s", ("model", "RMS", "largest"), rows),
         [("The flight, and what models expect next, in real time", picture)],
-        ["Each line begins where the vehicle is, and ends where a model expects it with the recorded inputs."],
+        ["Each line begins where the vehicle is, and ends where a model expects it under the recorded inputs."],
         [f"Over whole flights and against baselines: hybrid-jax check {options.model} FLIGHTS."],
     )
     page.write(options.out, "replay", result, {"distance": rms, "files": [options.out / "replay.gif"]})
@@ -88,7 +88,6 @@ def run(options: Options) -> int:
 
 
 def _animated(windows: Trajectories, forecasts: Forecasts, dt: float) -> bytes:
-    """Animate the flight in real time."""
     path = np.asarray(windows.x0)[:, POSITION]
     middle, half = (path.min(axis=0) + path.max(axis=0)) / 2, max(0.6, 0.6 * np.ptp(path, axis=0).max())
     figure = Figure(figsize=(6.4, 5.2), layout="constrained")

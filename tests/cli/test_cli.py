@@ -116,7 +116,7 @@ def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_chang
     files = ["-o", tmp_path / "adapted.npz", "--out", tmp_path]
     code, said, _ = called("adapt", tmp_path / "m.npz", tmp_path, *files)
     assert code == 0
-    assert "These flights show no change; physics alone predicts" in said
+    assert "These flights show no change; of the model only its physics is kept" in said
     assert (tmp_path / "adapted.npz").exists()
     keys = {*json.loads((tmp_path / "report.json").read_text())} - {"format", "verb", "answer", "notes"}
     (listed,) = re.findall(r"^- `adapt`:(.*?)^- ", (ROOT / "docs/howto/tool.md").read_text(), re.MULTILINE | re.DOTALL)

@@ -54,7 +54,7 @@ def test_of_a_model_with_a_past_the_update_is_written_and_said(tmp_path, called,
     model = DisturbanceModel(hj.rigid_body(hj.IRIS), jnp.eye(12, 13), jnp.ones(13), (0.1,), ())
     hj.save(tmp_path / "model.npz", model, {"dt": 0.02})
     _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--to", "c,stablehlo", "--out", tmp_path)
-    assert "Behind its state are 12 filtered errors: 0 at first" in said
+    assert "Its state ends with 12 filtered errors, which are 0 at first" in said
     assert "adapts Ix, Iy, k, disturbance, of the model without its past, with" in said
     x0 = np.concatenate([X, np.zeros(12)])
     seen = load_program(tmp_path / "observe.npz")(x0, U, X)
@@ -82,7 +82,7 @@ def test_c_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, ca
     assert (filters[0][0].name, filters[0][-1]["name"], filters[0][-1]["double"]) == ("board", "iris_adaptation", True)
     assert "IRIS_DT 0.02" in (tmp_path / "board" / "iris.h").read_text()
     assert "typedef double real" in (tmp_path / "board" / "iris.c").read_text()
-    (found,) = map(float, re.findall(r"smooth 30: ẋ differs by at most ([\d.e-]+),", said))
+    (found,) = map(float, re.findall(r"smooth 30, ẋ changes by at most ([\d.e-]+),", said))
     assert 0 < found <= np.abs(field.residual.weight_out).sum(axis=1).max() / 60
 
 

@@ -138,7 +138,7 @@ def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
     assert "FAILS q̇ against ω: body rates are in degrees per second" in result_of(logs[1])
     assert [kept.name for kept in trusted(logs)] == [str(paths[0])]
     assert "left out of the vehicle file, as checks failed: chirp_run2.csv.gz" in capsys.readouterr().out
-    with pytest.raises(ValueError, match=r"^vehicle file: no log flew and passed its checks"):
+    with pytest.raises(ValueError, match=r"^vehicle file: no log of a flight passed its checks"):
         trusted(logs[1:])
 
 
