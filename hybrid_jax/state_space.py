@@ -40,7 +40,7 @@ class Quantity:
     def __post_init__(self):
         checks.count("size", self.size)
         if len(self.labels) not in (0, self.size):
-            raise ValueError(f"labels must be {self.size} of {self.name}, or none, got {self.labels}")
+            raise ValueError(f"labels must be one for each of size={self.size} of {self.name}, got {self.labels}")
 
     @property
     def tangent_size(self) -> int:
@@ -275,7 +275,12 @@ class StateSpace:
 
     def features(self, x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
         """Return, by name, the quantities that decide how alike samples are; by default each number of x and of u."""
-        return {f"{name}[{i}]": column for name, part in (("x", x), ("u", u)) for i, column in enumerate(part.T)}
+        known = self.padded(x.shape[1]).quantities
+        labels = (
+            one.labels or [one.name if one.size == 1 else f"{one.name}[{i}]" for i in range(one.size)] for one in known
+        )
+        names = [*chain.from_iterable(labels), *(f"u[{i}]" for i in range(u.shape[1]))]
+        return dict(zip(names, (*x.T, *u.T), strict=True))
 
     def _curved(self) -> Iterator[tuple[slice, Quantity]]:
         return ((part, one) for part, one in self.parts if not one.is_vector)

@@ -18,7 +18,7 @@ from hybrid_jax.trajectories import Trajectories, errors_of
 
 LEVEL = 0.8
 JOINED = 10  # adjacent windows, at most so many, are joined and predicted as one
-FAR = 1e3  # times the error: wider intervals are not printed, for example where all errors are rounding
+FAR = 30  # times the error: wider intervals say nothing and are not printed
 NO_INTERVAL = "no interval: the parts left out are too few or differ too much"
 Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
 

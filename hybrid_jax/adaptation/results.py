@@ -20,9 +20,10 @@ NETWORK = "network"  # the candidate that changes the network
 SHOWN = 0.01  # less probable candidates are not reported
 NOT_CONFIRMED = "errors in windows that were left out of the fit do not confirm it"
 AS_LARGE = "the source's own errors may be as large without any change"
+UNLIKE = ", as its network is unknown outside of its training range"
 WITHIN = (
     "Some intervals contain the value before: they include the network's uncertainty. The changes are more certain, "
-    "since the network is the same before and after."
+    "since the network is the same before and after, unless what it learned scales with a parameter that changed."
 )
 
 
@@ -142,12 +143,13 @@ class Adaptation:
             rather = known.pop(NETWORK, None)
             found = ", ".join(f"{name} {share:.2g}" for name, share in known.items() if share >= SHOWN)
             yield f"Chosen: {self.chosen}. Probability of each change: {found}."
-            if rather is not None:
+            if self.chosen == NETWORK:
                 yield f"Probability that the network changed, rather than the most probable of these: {rather:.2g}."
             # If the evidence of the most probable change is strong, left-out windows rejected it.
             likely = next(iter(known))
             strong = known[likely] > STRONG * known.get("source", 1.0)
-            for reason, sure in ((NOT_CONFIRMED, True), (AS_LARGE, False)):
+            as_large = AS_LARGE + UNLIKE * any(share > WARN for share in self.outside.values())
+            for reason, sure in ((NOT_CONFIRMED, True), (as_large, False)):
                 if names := [name for name in self.rejected if (strong and name == likely) == sure]:
                     yield f"Rejected: {', '.join(names)}: {reason}."
         if self.physics_only:
@@ -172,9 +174,9 @@ class Adaptation:
                 yield from [WITHIN] * any(self.parameters[name].contains_before for name in self.changed)
             told = [name for name, one in self.parameters.items() if one.has_interval and one.high < np.inf]
             effective = [name for name, one in self.parameters.items() if one.effective]
-            if len(told + effective) < len(self.parameters) and self.chosen is not None:
-                names = f"only {', '.join(told + effective)}" if told + effective else "no parameter"
-                yield f"These windows identify {names}; hj.excitation plans an experiment for the others."
+            if 0 < len(told + effective) < len(self.parameters) and self.chosen is not None:
+                names = ", ".join(told + effective)
+                yield f"These windows identify only {names}; hj.excitation plans an experiment for the others."
             for reason in dict.fromkeys(self.parameters[name].effective for name in effective):
                 names = ", ".join(name for name in effective if self.parameters[name].effective == reason)
                 yield f"Effective, so without an interval: {names}: {reason}."

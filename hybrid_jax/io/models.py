@@ -1,8 +1,10 @@
 """Save and load trained models. A file contains only data; loading it runs no code of the file."""
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,6 +19,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.integrate import checked, rollout, rollout_batch
 from hybrid_jax.io.files import Arrays, load_archive, named_leaves, save_archive, to_numpy, with_leaves
 from hybrid_jax.io.structure import Structure, decode, static_values
+from hybrid_jax.networks.normalisation import AbstractScaling
 from hybrid_jax.runtime import entry
 
 FORMAT = "hybrid_jax model 2"
@@ -69,7 +72,8 @@ class Model:
 def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = None) -> None:
     """Save a model, any Equinox module, to one file, with JSON values `about` it.
 
-    You get a warning if `load` will need `like`, because the file is not enough to rebuild the model.
+    You get a warning if `load` will need `like`, because the file is not enough to rebuild the model, or if other
+    programs will need it, because a class is defined in the script that runs.
 
     Args:
         path: the file to write; an existing file is replaced.
@@ -86,6 +90,9 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
     structure = Structure(field)
     arrays = named_leaves({"field": field}) | {key: to_numpy(leaf) for key, leaf in structure.static_arrays.items()}
     save_archive(path, FORMAT, {"field": structure.tree, "about": dict(about)}, arrays)
+    if structure.of_script:
+        where = "define it in a module, which other programs can import, or let them pass like="
+        checks.warn(f"{path}: class {structure.of_script} is of the script that runs; {where}")
     if structure.problem is not None:
         checks.warn(f"{path}: this model can only be loaded with like=: {structure.problem}")
     if spoiled := _not_finite(field):
@@ -97,8 +104,8 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
 
     Args:
         path: the file to read.
-        like: a field of the same structure, whose arrays are replaced by those in the file. You need it for classes and
-            functions that the file cannot name, for example local classes and lambdas.
+        like: a field of the same structure, whose arrays and scalings are replaced by those in the file. You need it
+            for classes and functions that the file cannot name, for example local classes and lambdas.
 
     Raises:
         ValueError: if the file is missing, damaged or not a model, a class or function is unknown, an array is not
@@ -131,11 +138,39 @@ def _not_finite(field: eqx.Module) -> str:
 
 def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
     dynamic = {key: array for key, array in arrays.items() if not key.startswith("static/")}
-    filled, saved = with_leaves({"field": like}, dynamic)["field"], static_values(tree)
+    like, saved = _with_scalings(like, tree, arrays), static_values(tree)
+    filled = with_leaves({"field": like}, dynamic)["field"]
     for key, value in static_values(Structure(like).tree).items():
         if saved.get(key, value) != value:
             raise ValueError(f"{key} is {saved[key]!r}, but {value!r} in `like`")
     return jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, filled)
+
+
+def _with_scalings(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
+    """Return `like` with the scalings in the file: `fit` sets them, so a new field has none."""
+    parts, structure = jax.tree_util.tree_flatten_with_path(like, is_leaf=_is_scaling)
+    leaves = []
+    for path, leaf in parts:
+        if _is_scaling(leaf):
+            with contextlib.suppress(KeyError, IndexError, TypeError):  # of another structure, which is said later
+                leaf = decode(reduce(_part, path, tree), arrays)
+        leaves.append(leaf)
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _is_scaling(part: Any) -> bool:
+    return isinstance(part, AbstractScaling)
+
+
+def _part(node: Any, key: Any) -> Any:
+    match node:
+        case {"fields": parts}:
+            return parts[key.name]
+        case {"items": pairs}:
+            return dict(pairs)[key.key]
+        case {"tuple": parts} | {"list": parts}:
+            return parts[key.idx]
+    raise KeyError(key)
 
 
 def check_savable(field: Any) -> str | None:

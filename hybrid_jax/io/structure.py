@@ -89,6 +89,7 @@ class Structure:
             raise ValueError(f"field must be an Equinox module, got {short_repr(field)}")
         self.static_arrays: dict[str, Any] = {}  # by path; the other arrays are leaves of the field
         self.problem: str | None = None  # why `decode` cannot rebuild the field
+        self.of_script: str | None = None  # a class that other programs cannot import
         try:
             self.tree = self._encode(field, "field", static=False)
         except RecursionError as error:
@@ -118,6 +119,8 @@ class Structure:
 
     def _encode_fields(self, value: Any, path: str, static: bool) -> Any:
         name = _name_of(type(value)) or _address(type(value))
+        if name.startswith("__main__:") and hasattr(sys.modules["__main__"], "__file__"):  # not a notebook's
+            self.of_script = type(value).__name__
         try:
             if find_class(name) is not type(value):
                 self.problem = self.problem or f"{path} is of a class that {name} no longer refers to"

@@ -2,6 +2,7 @@
 
 import functools
 import re
+import subprocess
 import sys
 import warnings
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from hybrid_jax.dynamics.rigid_body import Kinematics
 from hybrid_jax.io import structure
 from hybrid_jax.io.files import named_leaves, save_archive
 from hybrid_jax.io.models import FORMAT
+from hybrid_jax.networks.standardise import with_motion, with_scaling
 
 
 class Convolution(hj.AbstractVectorField):
@@ -175,6 +177,32 @@ def test_what_a_file_cannot_rebuild_is_filled_into_a_skeleton(name, tmp_path):
     loaded = hj.load(path, like=like).field
     assert eqx.tree_equal(named_leaves(loaded), named_leaves(field))
     assert type(loaded) is type(like)
+
+
+@pytest.mark.filterwarnings("ignore:.*like=")
+def test_a_fitted_model_fills_a_new_one_whose_scaling_is_not_set(tmp_path):
+    def new(key):
+        network = hj.residual_network(3, 1, key, hidden=4, norm="none", activation="tanh")
+        return hj.Hybrid(local_field(), network)
+
+    windows = hj.Trajectories(jnp.ones((5, 3)), jnp.ones((5, 2, 1)), jnp.ones((5, 2, 3)), 0.1)
+    fitted = with_motion(with_scaling(new(KEY), windows), windows)
+    hj.save(tmp_path / "model.npz", fitted)
+    loaded = hj.load(tmp_path / "model.npz", like=new(jax.random.key(1))).field
+    assert eqx.tree_equal(named_leaves(loaded), named_leaves(fitted))
+    assert loaded.residual.scaling.offset == fitted.residual.scaling.offset != new(KEY).residual.scaling.offset
+
+
+def test_another_program_cannot_import_a_class_of_the_script(tmp_path):
+    (tmp_path / "script.py").write_text(
+        "import jax.numpy as jnp, hybrid_jax as hj\n"
+        "class Own(hj.AbstractVectorField):\n    a: object\n    def __call__(self, x, u): return self.a * x\n"
+        "hj.save('own.npz', Own(jnp.ones(())))\n"
+    )
+    said = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=True
+    ).stderr
+    assert "class Own is of the script that runs; define it in a module" in said
 
 
 @pytest.mark.filterwarnings("ignore:.*like=")
