@@ -37,7 +37,8 @@ VERBS = {
 }
 USAGE = """usage: hybrid-jax VERB ...
 
-Learn a model from a folder of flight logs, and adapt it after a change:
+Learn a model of a multirotor from a folder of flight logs, and adapt it after a
+change. For other systems, use hj.fit and hj.adapt in Python.
 
 {verbs}
 
