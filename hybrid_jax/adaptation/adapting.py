@@ -241,9 +241,7 @@ def _parameters(
     groups = groups_of([*values])
     units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
     before = values_of(source, d)
-    found = {
-        name: Parameter(value, unit=units[name], before=before.get(name, np.nan)) for name, value in values.items()
-    }
+    found = {name: Parameter(one, unit=units[name], before=before.get(name, np.nan)) for name, one in values.items()}
     free, absorbed, vague = np.ones(len(values), bool), np.zeros(len(values)), np.zeros(len(values), bool)
     if choice is not None:
         places = [choice.parameters.index(name) for name in values]

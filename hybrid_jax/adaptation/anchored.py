@@ -111,9 +111,8 @@ def with_change(field: AbstractVectorField, change: Float[Array, " w"]) -> Abstr
 
 def has_network(field: AbstractVectorField) -> bool:
     """Whether a field is a hybrid with a trainable residual other than a disturbance."""
-    return (
-        isinstance(field, Hybrid) and physics_of(field) is not field and any(jax.tree.leaves(trainable(field.residual)))
-    )
+    learned = isinstance(field, Hybrid) and any(jax.tree.leaves(trainable(field.residual)))
+    return learned and physics_of(field) is not field
 
 
 def weights_of(field: AbstractVectorField) -> tuple[Float[Array, " w"], Callable[[Float[Array, " w"]], PyTree]]:

@@ -182,7 +182,7 @@ class Ridge(Method):
     penalties: tuple[float, ...] = ridge.PENALTIES
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
-        check(train, "windows")  # before they are traced: it needs the state before and after each interval
+        check(train, "windows")  # before tracing: defects need all states
         return Solution(_fit_ridge(self.update, field, train, validation, self.penalties, settings).field)
 
 

@@ -38,7 +38,7 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "force_torque_drag": ("theta", "force", "torque", "drag"),
     "all": ("theta", "force", "torque", "drag", "efficiency", "reaction_torque"),
 }
-CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
+CONFOUNDED = ("k", "k_rotors")  # parameters that are not identifiable beside the rotors' efficiencies
 
 
 @dataclass(frozen=True)

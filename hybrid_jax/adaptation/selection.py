@@ -101,9 +101,8 @@ def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, learned_fro
     apparent = jnp.maximum(beyond, 0.0) / jnp.maximum(jnp.sum(jnp.square(known), axis=0), TINY)
     unknown = jnp.square(outside * missed) * added
     total = jnp.maximum(jnp.sum(own.equations.square) - own.noise * jnp.sum(~jnp.isnan(learned_from.x)), 0.0)
-    return Unchanged(
-        apparent / places + unknown / jnp.maximum(jnp.sum(information, axis=0), TINY), total / places + unknown
-    )
+    variance = apparent / places + unknown / jnp.maximum(jnp.sum(information, axis=0), TINY)
+    return Unchanged(variance, total / places + unknown)
 
 
 def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:

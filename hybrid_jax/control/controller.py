@@ -23,7 +23,7 @@ from hybrid_jax.control.sensitivities import advance_lagged, condensed
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
-from hybrid_jax.rotation import attitude_error, normalise
+from hybrid_jax.rotation import attitude_error
 from hybrid_jax.vehicle import BODY_RATES, QUATERNION, STATE_SIZE, Input, State, Vehicle
 
 VARIABLE_BOUND = 3.0  # there tanh is within 0.5 % of its limit, and its slope is still 1 %
@@ -183,7 +183,7 @@ class Controller:
             raise ValueError(f"plan must have variables of shape {shape}, got {plan.variables.shape}")
         model = as_field(model).fuse_for_inference()
         x, reference, plan = checked_states("x", x, reference, plan, self.steps, as_field(model).hidden)
-        x = RIGID_BODY_SPACE.canonical(x, x.at[QUATERNION].set(normalise(x[QUATERNION])))
+        x = RIGID_BODY_SPACE.canonical(x, RIGID_BODY_SPACE.normalise(x))
         start = x, (self.speeds(plan)[0] if speeds is None else speeds).astype(x.dtype)
         point = self._initial_guess(model, reference, start, plan)
 

@@ -17,7 +17,8 @@ from hybrid_jax.control.observer import observer_of
 from hybrid_jax.control.sensitivities import advance, lagged_speeds
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import like
-from hybrid_jax.rotation import heading, normalise
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.rotation import heading
 from hybrid_jax.runtime import entry
 from hybrid_jax.vehicle import POSITION, QUATERNION, Input, State
 
@@ -86,8 +87,8 @@ class Hardware:
         """Add sensor noise to the state."""
         if not any(self.noise):
             return x
-        x = x + jnp.asarray(self.sizes(), x.dtype) * jax.random.normal(key, x.shape, x.dtype)
-        return x.at[QUATERNION].set(normalise(x[QUATERNION]))
+        noise = jnp.asarray(self.sizes(), x.dtype) * jax.random.normal(key, x.shape, x.dtype)
+        return RIGID_BODY_SPACE.normalise(x + noise)
 
     def sizes(self) -> Float[np.ndarray, "13"]:
         """Return the standard deviation of each entry of the state."""

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.integrate import RK4, Derivative, rk4_step, traced_once
-from hybrid_jax.rotation import normalise
-from hybrid_jax.vehicle import QUATERNION, Input, State
+from hybrid_jax.vehicle import Input, State
 
 
 def lagged_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple[Input, Input]:
@@ -69,7 +69,7 @@ def advance(model: AbstractVectorField, x: State, u: Input, dt: float) -> State:
         model: a rigid body's ẋ = f(x, u).
         dt: length of the step [s].
     """
-    return _with_unit_quaternion(rk4_step(model, x, u, dt))
+    return RIGID_BODY_SPACE.normalise(rk4_step(model, x, u, dt))
 
 
 def advance_lagged(
@@ -79,7 +79,7 @@ def advance_lagged(
     if not lag:
         return advance(model, x, command, dt), command
     inputs = [command + share * (speeds - command) for share in stage_shares(lag, dt)]
-    return _with_unit_quaternion(step_of(model, x, inputs, dt)), lagged_speeds(speeds, command, lag, dt)[1]
+    return RIGID_BODY_SPACE.normalise(step_of(model, x, inputs, dt)), lagged_speeds(speeds, command, lag, dt)[1]
 
 
 def advance_with_jacobian(
@@ -102,7 +102,7 @@ def advance_with_jacobian(
 
     directions = jnp.eye(d, inputs[0][1].shape[1], dtype=x.dtype)
     both = step_of(slopes, jnp.concatenate([x[:, None], directions], axis=1), inputs, dt)
-    return jvp_columns(_with_unit_quaternion, (both[:, 0],), (both[:, 1:],))
+    return jvp_columns(RIGID_BODY_SPACE.normalise, (both[:, 0],), (both[:, 1:],))
 
 
 def condensed(
@@ -127,7 +127,3 @@ def condensed(
 
     none, stages = jnp.zeros((d, t, m), x.dtype), jax.vmap(stage)(x, speeds, commands)
     return jax.lax.scan(interval, none, (stages, jnp.asarray(mixed), jnp.arange(t)))[1]
-
-
-def _with_unit_quaternion(x: State) -> State:
-    return x.at[QUATERNION].set(normalise(x[QUATERNION]))

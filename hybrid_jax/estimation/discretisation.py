@@ -27,12 +27,6 @@ FINE = 1e-3  # of the states' motion: the smallest error that counts as noise
 REMEDY = "windows with a smaller dt, or a solver with more substeps, such as RK4(substeps=2)"
 
 
-def is_named(field: AbstractVectorField) -> bool:
-    """Return whether a field learns only a few parameters of physics, and no network."""
-    size = ravel_learned(physics_of(field))[0].size
-    return 0 < size <= NAMED and size == ravel_learned(field)[0].size
-
-
 def discretisation(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, named: bool
 ) -> float:
@@ -50,7 +44,7 @@ def discretisation(
     weight = np.where(np.isnan(some.x), 0, 1 / np.asarray(1 if scale is None else scale))
     parts = (halved[:, 1::2] - errors, errors, some.x - some.x0[:, None], some.x)
     change, error, moved, states = (np.linalg.norm(np.where(weight, each, 0) * weight) for each in parts)
-    rounded = 2 * np.finfo(some.x.dtype).eps * states  # both predictions
+    rounded = 2 * np.finfo(some.x.dtype).eps * states  # of both predictions
     if change <= rounded:
         return 0.0
     size = error + FINE * moved
@@ -66,7 +60,8 @@ def compare_steps(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, named: bool | None = None
 ) -> float:
     """Return the `discretisation` of a field, by default of all that it learns, and warn if the step is too long."""
-    named = is_named(field) if named is None else named
+    if named is None:  # whether the field learns only a few parameters of physics, and no network
+        named = 0 < ravel_learned(physics_of(field))[0].size == ravel_learned(field)[0].size <= NAMED
     moved = discretisation(field, windows, solver, scale, named)
     warn_of_steps(moved, REMEDY, named)
     return moved

@@ -134,9 +134,8 @@ def covariance(
     cov = (half @ through).sum(axis=0) @ theta
     told = told & (np.diagonal(cov) >= 0)  # few pieces may give a negative variance
     cov = np.where(told[:, None] & told, cov, 0.0)
-    variance = np.einsum("nsp,pq,nsq->ns", slope, cov, slope) - 2 * np.einsum(
-        "nsp,npt,nts->ns", slope, half[..., p:], back
-    )
+    across = np.einsum("nsp,npt,nts->ns", slope, half[..., p:], back)
+    variance = np.einsum("nsp,pq,nsq->ns", slope, cov, slope) - 2 * across
     variance += np.einsum("nst,ntu,nus->ns", back, meat[:, p:, p:], back)
     size = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 0.0))
     total = np.sqrt((size[:, :p] ** 2).sum(axis=0))

@@ -30,14 +30,6 @@ class NormalEquations(NamedTuple):
     score: Float[Array, "*n q"]  # Jᵀr
     square: Float[Array, "*n"]  # rᵀr
 
-    @staticmethod
-    def of_errors(jacobian: Float[Array, "s q"], r: Float[Array, " s"], robust: float = np.inf) -> "NormalEquations":
-        """Compute them for one window; an error above `robust` counts linearly, not as a square (Huber 1964)."""
-        size = jnp.maximum(jnp.abs(r), FLAT)
-        weighted = jacobian * jnp.minimum(1.0, robust / size)[:, None]
-        square = r**2 if np.isinf(robust) else jnp.where(size <= robust, r**2, 2 * robust * size - robust**2)
-        return NormalEquations(weighted.T @ jacobian, weighted.T @ r, jnp.sum(square))
-
 
 # Compiled on its own, so that selecting a disturbance and the covariance share it.
 @jit_by_size()
@@ -58,9 +50,15 @@ def normal_equations(
     return in_chunks(jax.vmap(one), windows, chunk)
 
 
-def equations_of(jacobian: Float[Array, "t d p"], r: Float[Array, "t d"]) -> NormalEquations:
+def equations_of(jacobian: Float[Array, "*s q"], r: Float[Array, "*s"], robust: float = np.inf) -> NormalEquations:
+    """Return the equations of one window; an error above `robust` counts linearly, not as a square (Huber 1964)."""
     effect, r = jacobian.reshape(-1, jacobian.shape[-1]), r.ravel()
-    return NormalEquations(effect.T @ effect, effect.T @ r, r @ r)
+    if np.isinf(robust):
+        return NormalEquations(effect.T @ effect, effect.T @ r, r @ r)
+    size = jnp.maximum(jnp.abs(r), FLAT)
+    weighted = effect * jnp.minimum(1.0, robust / size)[:, None]
+    square = jnp.where(size <= robust, r**2, 2 * robust * size - robust**2)
+    return NormalEquations(weighted.T @ effect, weighted.T @ r, jnp.sum(square))
 
 
 @jit_by_size()

@@ -242,10 +242,8 @@ def _covariance(search: record_search.Search, end: End, errors):
     gram, score, _ = search.local(end.theta, end.own).equations
     meat = np.asarray(end.equations.gram + jnp.einsum("rsp,rsq->rpq", score, score) - jnp.sum(gram, axis=1))
     found, starts = elimination.covariance(end.equations, len(end.theta), meat)  # priors count as usual
-    problem = search.problem
-    r = np.concatenate(
-        [np.clip(e / problem.scale[k], -problem.robust, problem.robust).ravel() for k, e in errors.items()]
-    )
+    problem, most = search.problem, search.problem.robust
+    r = np.concatenate([np.clip(e / problem.scale[k], -most, most).ravel() for k, e in errors.items()])
     spare = len(r) - len(end.theta) - len(end.own) * np.count_nonzero(problem.model.spread)
     share = float(r @ r) / max(spare, 1)
     with np.errstate(invalid="ignore", divide="ignore"):  # infinite if not identifiable, zero if known

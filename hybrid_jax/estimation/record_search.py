@@ -197,9 +197,7 @@ def check_signals(model: Model, records: Sequence[Record], gridded: list[Gridded
                 most = len(each.index[name]) < len(signal) / 2
                 found += [f"{record.name}: {name} {line}" for line in _turns(signal)]
             if most:
-                found.append(
-                    f"{record.name}: most of {name} is not between {begin:.6g} and {end:.6g} s: check all times"
-                )
+                found += [f"{record.name}: most of {name} is not between {begin:.6g} and {end:.6g} s: check all times"]
     for line in found:
         checks.warn(line)
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import ravel_learned
-from hybrid_jax.estimation.normal_equations import NormalEquations
+from hybrid_jax.estimation.normal_equations import NormalEquations, equations_of
 from hybrid_jax.integrate import Solver, integrate
 from hybrid_jax.records import Gridded
 
@@ -146,16 +146,15 @@ def local(problem: Problem, theta, x0, through: Float[Array, "d q"], segment: Se
 
     (jacobian, slope), (r, end) = jax.jacfwd(errors, has_aux=True)(jnp.concatenate([theta, x0]))
     both = jnp.concatenate([jnp.eye(p, through.shape[1]), through])
-    return Local(NormalEquations.of_errors(jacobian @ both, r, problem.robust), slope @ both, end)
+    return Local(equations_of(jacobian @ both, r, problem.robust), slope @ both, end)
 
 
 @eqx.filter_jit
 def shooting(problem: Problem, theta, nodes: Float[Array, "r s d"], charts: Float[Array, "r s d e"], segments) -> Local:
     """Return the normal equations of every segment in (θ, change of its own initial state)."""
     slopes = jnp.concatenate([jnp.zeros((*nodes.shape, len(theta))), charts], axis=-1)
-    return in_chunks(
-        lambda each: jax.vmap(jax.vmap(partial(local, problem, theta)))(*each), (nodes, slopes, segments), CHUNK
-    )
+    every = jax.vmap(jax.vmap(partial(local, problem, theta)))
+    return in_chunks(lambda each: every(*each), (nodes, slopes, segments), CHUNK)
 
 
 @eqx.filter_jit

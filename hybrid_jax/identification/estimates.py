@@ -194,9 +194,7 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
     unit, motors = "of full command" if found.commands else "rad/s", ", ".join(f"{each:.3g}" for each in found.hover)
     volts = f"{found.voltage:.3g} V" if np.isfinite(found.voltage) else "unknown voltage"
     flown = f"{found.seconds:.0f} s of flight"
-    at_top = (
-        "PLACEHOLDER at full command: only thrust matters" if found.commands else "1.2 times the largest in the logs"
-    )
+    at_top = "PLACEHOLDER: only thrust matters" if found.commands else "1.2 times the largest in the logs"
     weighed = "as given" if mass else "PLACEHOLDER: weigh it; thrust and inertia grow with it"
     length = "arm as given" if arm else f"arm {ARM:g} m is a PLACEHOLDER: measure it; inertia grows with it"
     of_log = "in the order of the log's motors"

@@ -249,9 +249,7 @@ def expected_from_parts(parts: Sequence[Sequence[Float[np.ndarray, " 4"]]]) -> F
     return expected(np.log([rmse(np.stack(each)) for each in parts if len(each)]))
 
 
-def rmse_by_flight(
-    field: AbstractVectorField, logs: Sequence[FlightLog], steps: int
-) -> Float[np.ndarray, "flights t 4"]:
+def rmse_by_flight(field: AbstractVectorField, logs: Sequence[FlightLog], steps: int) -> Float[np.ndarray, "f t 4"]:
     """Compute the RMSE in UNITS on each flight at the end of each interval."""
     return np.stack([rmse(errors_of(field, log, steps)) for log in logs])
 

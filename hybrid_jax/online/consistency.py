@@ -63,10 +63,8 @@ def believed(
 def sound(new: OnlineState, begun: OnlineState, old: OnlineState, variances: Float[Array, " d"]) -> OnlineState:
     """Return the new state, or restart at the last good θ and the prior covariance if a number is not finite."""
     root = kalman.diagonal_root(variances, jnp.ones_like(old.theta))
-    values = old.trusted, old.trusted, old.settled, root, old.doubt, old.changes, old.restarts + 1
-    again = eqx.tree_at(
-        lambda s: (s.theta, s.trusted, s.settled, s.root, s.doubt, s.changes, s.restarts), begun, values
-    )
+    kept = old.trusted, old.trusted, old.settled, root, old.doubt, old.changes, old.restarts + 1
+    again = eqx.tree_at(lambda s: (s.theta, s.trusted, s.settled, s.root, s.doubt, s.changes, s.restarts), begun, kept)
     parts = [new.root, new.x, new.theta, new.nis, new.excitation.sensitivity, new.excitation.root]
     if (mixture := again.mixture) is not None and new.mixture is not None:
         # The filter of all parameters is now used.

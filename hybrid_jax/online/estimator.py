@@ -39,7 +39,7 @@ from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, fl
 from hybrid_jax.online.tuning import BREEZE, HOLD, MEMORY, PAUSE, TAKEN, Tuning
 from hybrid_jax.runtime import entry
 
-RISE, FALL = 10.0, 0.2  # rates of the logarithm of this factor [1/s]
+RISE, FALL = 10.0, 0.2  # rates of `OnlineState.haste` [1/s]
 
 
 class OnlineAdaptation(AbstractEstimator):

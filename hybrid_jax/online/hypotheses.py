@@ -43,9 +43,7 @@ class Hypothesis:
         for name, size in (*self.parameters.items(), *self.rates.items()):
             checks.positive(f"hypothesis {self.name}: {name}", size)
         if unknown := sorted(self.rates.keys() - self.parameters.keys()):
-            raise ValueError(
-                f"hypothesis {self.name}: rates of {', '.join(unknown)}, which are not among its parameters"
-            )
+            raise ValueError(f"hypothesis {self.name}: rates must be of its parameters, got {', '.join(unknown)}")
         checks.not_negative(f"hypothesis {self.name}: lead", self.lead)
 
 

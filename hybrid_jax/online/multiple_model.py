@@ -100,10 +100,8 @@ def update(
     shares, periods = weights(mixture), model.dt / model.tuning.pace
     mixture, white, likelihoods = filtered(mixture, models, model, sample)
     white = jnp.concatenate([white, correction.white[None]])
-    test, concerned = mixture.test.after(
-        correction._replace(white=shares @ white), sample, periods, model.tuning, SETTLE
-    )
-    changed = jnp.max(concerned) > 0
+    test, alarmed = mixture.test.after(correction._replace(white=shares @ white), sample, periods, model.tuning, SETTLE)
+    changed = jnp.max(alarmed) > 0
     # Bayes' rule; a hypothesis at the floor stays there, except the filter of all parameters.
     before = mixture.log_weights
     likelihoods = jnp.concatenate([likelihoods, correction.log_likelihood[None]])

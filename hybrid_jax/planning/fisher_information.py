@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.hidden import DisturbanceModel
-from hybrid_jax.estimation.least_squares import Solver, ravel_parameters
+from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import inverse, inverses
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.vehicle import SENSOR_NOISE, STATE_SIZE
@@ -37,7 +37,6 @@ def information_of(
     dt: float,
     steps: int,
     noise: Float[Array, " s"],
-    solver: Solver = None,
     past: DisturbanceModel | None = None,
 ) -> Information:
     """Return the information of true states x, one every `dt` [s], cut into windows of `steps` intervals.
@@ -56,7 +55,7 @@ def information_of(
             own = unravel(theta)
             own = own if past is None else DisturbanceModel(own, e[:, None], jnp.ones(1), (), ())  # constant
             moved = x0 + jnp.concatenate([noise, jnp.ones(len(x0) - measured)]) * start
-            return rollout(own, moved, u, dt, compact(solver))[:, :measured] / noise
+            return rollout(own, moved, u, dt, compact(None))[:, :measured] / noise
 
         return jax.jacfwd(predicted, argnums=(0, 1, 2))(theta, jnp.zeros_like(x0), jnp.zeros_like(sizes))
 

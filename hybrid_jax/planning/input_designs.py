@@ -95,9 +95,7 @@ class InputBounds:
 
 
 def _check_box(name: str, low, other: str, high, size: int | None = None) -> None:
-    arrays = [
-        np.asarray(checks.finite(each, checks.real_array(each, value))) for each, value in ((name, low), (other, high))
-    ]
+    arrays = [np.asarray(checks.finite(one, checks.real_array(one, end))) for one, end in ((name, low), (other, high))]
     if arrays[0].ndim != 1 or {len(array) for array in arrays if array.ndim} != {size or len(arrays[0])}:
         raise ValueError(f"{name} and {other} must be {size or 'equally many'} numbers, got {low} and {high}")
     if not (arrays[0] < arrays[1]).all():
@@ -141,9 +139,7 @@ class FlatOutputs(eqx.Module):
         amplitudes = coefficients * self.unit()
 
         def path(t: Scalar) -> tuple[Float[Array, "3"], Scalar]:
-            ramp = jnp.polyval(
-                jnp.asarray(SMOOTH.coef[::-1]), jnp.clip(jnp.minimum(t, self.seconds - t) / RAMP, 0.0, 1.0)
-            )
+            ramp = jnp.polyval(jnp.asarray(SMOOTH.coef[::-1]), jnp.clip(jnp.minimum(t, self.seconds - t) / RAMP, 0, 1))
             flat = jnp.asarray(centre, amplitudes.dtype) + ramp * _series(amplitudes, t, self.seconds)
             return flat[:3], flat[3]
 

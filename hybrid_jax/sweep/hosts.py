@@ -42,9 +42,7 @@ class Peers:
         host, _, port = coordinator.rpartition(":")
         self.lost = ""  # which process is lost and how, if any
         self._timeout, until = timeout, time.monotonic() + timeout
-        self._links = (
-            self._gather(int(port), processes, until) if process == 0 else self._join(host, int(port), process)
-        )
+        self._links = self._join(host, int(port), process) if process else self._gather(int(port), processes, until)
         self._heard = dict.fromkeys(self._links, time.monotonic())
         threading.Thread(target=self._listen, daemon=True).start()
 

@@ -72,9 +72,7 @@ def neighbour_weights(field: Hybrid, predicted, window: Trajectories, solver: So
     return jnp.concatenate([jnp.zeros(0), *(network.neighbour_weights().ravel() for network in networks)])
 
 
-PENALTIES: dict[str, Rows] = {
-    rule.__name__: rule for rule in (residual_norm, trajectory_correlation, neighbour_weights)
-}
+PENALTIES: dict[str, Rows] = {one.__name__: one for one in (residual_norm, trajectory_correlation, neighbour_weights)}
 
 
 @entry
@@ -111,9 +109,8 @@ def fit_gauss_newton(
     checked(field, windows.x0, windows.u, windows.dt, solver, windows=True)
     checks.not_negative("weight", weight)
     checks.count("max_steps", max_steps)
-    if penalty is not None and (
-        not isinstance(penalty, str) or penalty not in PENALTIES or not isinstance(field, Hybrid)
-    ):
+    valid = isinstance(penalty, str) and penalty in PENALTIES and isinstance(field, Hybrid)
+    if penalty is not None and not valid:
         known = ", ".join(PENALTIES)
         raise ValueError(f"penalty must be one of {known}, for a Hybrid, got {penalty!r} for {type(field).__name__}")
     size = ravel_learned(field)[0].size

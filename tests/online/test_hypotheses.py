@@ -150,7 +150,7 @@ def test_bad_samples_keep_the_model_and_its_weights():
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [({}, "parameters must contain"), ({"parameters": {"push": 1.0}, "rates": {"gain": 1.0}}, "rates of gain")],
+    [({}, "parameters must contain"), ({"parameters": {"push": 1.0}, "rates": {"gain": 1.0}}, "rates must be of its")],
 )
 def test_hypotheses_that_cannot_be_are_refused(options, said):
     with pytest.raises(ValueError, match=f"hypothesis a: {said}"):
