@@ -47,12 +47,8 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
     options.sort(key=lambda option: option[0])  # arguments, needed options, own ones, inherited ones
     width = min(shutil.get_terminal_size().columns, WIDEST) - 1
     needs = [name.partition(", ")[2] or name for place, name, _ in options if place < 2]
-    text = [
-        f"usage: {' '.join([program, *needs])} [OPTIONS]",
-        "",
-        *textwrap.wrap(about.partition("\n\n")[0], width),
-        "",
-    ]
+    summary = textwrap.wrap(about.partition("\n\n")[0], width)
+    text = [f"usage: {' '.join([program, *needs])} [OPTIONS]", "", *summary, ""]
     for _, name, told in options:
         head = f"  {name}".ljust(INDENT)
         text += [head.rstrip()] * (len(head) > INDENT)

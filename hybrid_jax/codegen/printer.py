@@ -132,10 +132,7 @@ class CPrinter:
         return [self.table(name, numbers) for name, numbers in tables.numbers.items() if name in read]
 
     def function(self, one: nodes.Function) -> str:
-        given = [
-            *(f"const real *{array.name}" for array in one.inputs),
-            *(f"real *{array.name}" for array in one.outputs),
-        ]
+        given = [*(f"const real *{each.name}" for each in one.inputs), *(f"real *{each.name}" for each in one.outputs)]
         read = nodes.names(one.body)
         unused = "".join(f"    (void){array.name};\n" for array in one.inputs if array.name not in read)
         return f"static void {one.name}({', '.join(given)}) {{\n{unused}{self.body(one.body)}\n}}\n"

@@ -108,9 +108,8 @@ def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
             return [whole(x, u), n, jnp.zeros((0, 0), n.dtype), n, n]
         norm, read = batch_norms(whole)[0], []
         given = _Given(norm, n, read.append)
-        slope = jax.tree.map(lambda node: given if node is norm else node, whole, is_leaf=lambda node: node is norm)(
-            x, u
-        )
+        probed = jax.tree.map(lambda node: given if node is norm else node, whole, is_leaf=lambda node: node is norm)
+        slope = probed(x, u)
         if len(read) != 1:
             raise ValueError(f"its batch normalisation is evaluated {len(read)} times")
         return [slope, *read[0]]

@@ -76,9 +76,8 @@ class SamplePrinter(CPrinter):
             case nodes.Array(name, size):
                 return f"HELD real {name}[{size}];"
             case nodes.Assign(target, value):  # sums over samples begin at zero
-                return (
-                    f"{self.expression(target)} {'+=' if target.name == 's' else '='} wide({self.expression(value)});"
-                )
+                sign = "+=" if target.name == "s" else "="
+                return f"{self.expression(target)} {sign} wide({self.expression(value)});"
             case nodes.Call("product", (*arguments, m, k, n)):
                 return f"product<{m}, {k}, {n}>({', '.join(map(self.expression, arguments))});"
         return super().statement(node)

@@ -72,9 +72,7 @@ class CFile:
         inputs = {key: shape for key, shape in inputs.items() if 0 not in shape}
         results = {key: one.shape for key, one in zip(outputs, program.out_avals, strict=True)}
         signature = f"void {self.name}_{name}({self._declared(inputs, 'const ')},\n    {self._declared(results)})"
-        passed = [
-            ("&" if not shape else "") + key + "[0]" * (len(shape) == 2) for key, shape in (inputs | results).items()
-        ]
+        passed = [("&" if not shape else "") + k + "[0]" * (len(shape) == 2) for k, shape in (inputs | results).items()]
         self.declarations.append(f"/* {about} */\n{signature};\n")
         self.definitions[name] = f"{signature} {{ {name}({', '.join(passed)}); }}\n"
 
