@@ -172,11 +172,12 @@ class Adaptation:
             if self.changed:
                 yield f"Significantly different from the source: {', '.join(self.changed)}."
                 yield from [WITHIN] * any(self.parameters[name].contains_before for name in self.changed)
-            told = [name for name, one in self.parameters.items() if one.has_interval and one.high < np.inf]
             effective = [name for name, one in self.parameters.items() if one.effective]
-            if 0 < len(told + effective) < len(self.parameters) and self.chosen is not None:
-                names = ", ".join(told + effective)
-                yield f"These windows identify only {names}; hj.excitation plans an experiment for the others."
+            same = [name for name, one in self.parameters.items() if one.value == one.before]
+            kept = [name for name in same if not self.parameters[name].has_interval and name not in effective]
+            if kept and self.chosen is not None:
+                names = "all parameters" if len(kept) == len(self.parameters) else ", ".join(kept)
+                yield f"Kept as before: {names}. If these may have changed, hj.excitation plans an experiment for them."
             for reason in dict.fromkeys(self.parameters[name].effective for name in effective):
                 names = ", ".join(name for name in effective if self.parameters[name].effective == reason)
                 yield f"Effective, so without an interval: {names}: {reason}."

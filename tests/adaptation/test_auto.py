@@ -56,6 +56,7 @@ def test_windows_choose_what_changed(chosen):
     assert chosen == "source" or abs(length.value - np.log(LENGTH)) < 4 / 1.96 * (length.high - length.value) < 0.2
     assert f"Chosen: {chosen}. Probability of each change: {chosen}" in found.report()
     assert chosen != "source" or eqx.tree_equal(found.field.physics, hybrid().physics)
+    assert ("Kept as before: all parameters" in found.report()) == (chosen == "source")
 
 
 def test_a_step_of_the_network_is_taken_if_the_source_does_not_err_as_much():
