@@ -1,3 +1,3 @@
-"""Translation of JAX programs to C: walk over the operations, build code as values, and print it."""
+"""Translate JAX programs to C: walk over the operations, build code as values, and print it."""
 
 __all__: list[str] = []

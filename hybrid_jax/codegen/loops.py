@@ -1,4 +1,4 @@
-"""Loops over columns: the layout of their entries in arrays and tables, and statements that fill arrays."""
+"""Loops over entries of arrays and tables, and statements that fill arrays."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -7,12 +7,12 @@ import numpy as np
 
 from hybrid_jax.codegen.nodes import Address, Assign, Entry, Expression, Function, Loop, Operation, Statement, nested
 
-LOOPED = 8  # so many entries are copied by a loop
+LOOPED = 8  # entries from which on a loop copies them
 
 
 @dataclass
 class Tables:
-    """Functions of a file, and its tables of numbers in double or single precision, by unused names."""
+    """The functions of a file, and its tables of numbers in double or single precision, by name."""
 
     double: bool
     functions: dict[str, Function] = field(default_factory=dict)
@@ -33,7 +33,7 @@ class Tables:
 
 
 def address(tables: Tables, array: np.ndarray) -> Address | None:
-    """Return where entries begin if they are contiguous in an array, or numbers, which become a table."""
+    """Return the address of entries if they are contiguous in an array, or numbers, which become a table."""
     if _are_numbers(array):
         return Address(tables.table(array.ravel()))
     places = _places(array)
@@ -42,11 +42,11 @@ def address(tables: Tables, array: np.ndarray) -> Address | None:
 
 
 def indexed(tables: Tables, array: np.ndarray) -> Expression | None:
-    """Return the entry at indices i0, i1, …, or None if its place is not linear in them."""
+    """Return the entry at indices i0, i1, … as an expression, or None if its place is not linear in them."""
     first = array.flat[0]
     if all(one == first for one in array.flat):
         return first
-    if _are_numbers(array):  # a table, with one entry along axes that do not matter
+    if _are_numbers(array):  # a table, with one entry along axes on which it does not depend
         kept = [bool((array != array.take([0], axis)).any()) for axis in range(array.ndim)]
         core = array[tuple(slice(None) if keep else slice(0, 1) for keep in kept)]
         strides = np.array(_strides(core.shape)) * kept
@@ -68,7 +68,7 @@ def _are_numbers(array: np.ndarray) -> bool:
 
 
 def _places(array: np.ndarray) -> np.ndarray | None:
-    """Return the indices of entries of one array."""
+    """Return the indices of entries of one array, or None for others."""
     first = array.flat[0]
     if any(not isinstance(one, Entry) or one.name != first.name or one.index is None for one in array.flat):
         return None

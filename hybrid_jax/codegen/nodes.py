@@ -12,7 +12,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Entry:
-    """A variable, or the entry of an array at index + Σ steps[k] ik, in loops with counters ik; 0 or 1 if logical."""
+    """A variable, or the entry of an array at index + Σ steps[k] ik in loops with counters ik. Booleans are 0 or 1."""
 
     name: str
     index: int | None = None
@@ -20,7 +20,7 @@ class Entry:
 
 
 class Address(Entry):
-    """The start of entries of an array, at an index like `Entry`'s."""
+    """The address of an entry."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Call:
-    """Call a function, which writes its results into some of its arguments."""
+    """Call a function, which writes its results to some of its arguments."""
 
     function: str
     arguments: tuple[Expression, ...]
@@ -89,7 +89,7 @@ class Function:
 
 @dataclass(frozen=True)
 class Step:
-    """Statements that make one variable, or one array, which is not declared yet."""
+    """Statements that set one variable, or one array, which they do not declare."""
 
     makes: str
     code: tuple[Statement, ...]
@@ -97,7 +97,7 @@ class Step:
 
     @cached_property
     def uses(self) -> frozenset[str]:
-        """Names that the statements read."""
+        """The names that the statements read."""
         return names(self.code) - {self.makes}
 
 
@@ -109,7 +109,7 @@ def walk(node: Any) -> Iterator[Any]:
 
 
 def names(node: Any) -> frozenset[str]:
-    """Names of the variables and arrays in a node."""
+    """Return the names of the variables and arrays in a node."""
     return frozenset(one.name for one in walk(node) if isinstance(one, Entry))
 
 
@@ -132,7 +132,7 @@ def nested(shape: Sequence[int], *body: Statement) -> Statement:
 
 
 def arranged(steps: Sequence[Step], results: frozenset[str], end: Sequence[Statement]) -> tuple[Statement, ...]:
-    """Assemble a function's body: the steps that results need, and the end. Arrays no longer read are reused."""
+    """Assemble a function's body from the steps that results need, and the end. Arrays no longer read are reused."""
     kept, last = [], dict.fromkeys(results, len(steps))  # name → the step that uses it last
     for i, step in reversed(list(enumerate(steps))):
         if step.makes in last:

@@ -1,7 +1,7 @@
-"""Translate JAX programs into C99: a few entries as expressions, simplified at zeros and ones, many as loops.
+"""Translate JAX programs into C99: few entries as expressions, simplified at zeros and ones, and many as loops.
 
-Entries are numbers (floats or bools), and `Entry` for computed values. Sparse Jacobians of physics become straight-line
-code, and network layers become loops over tables and arrays.
+Entries are numbers (floats or bools), or `Entry` for computed values. For example, sparse Jacobians of physics become
+straight-line code, and network layers become loops over tables and arrays.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,9 +19,9 @@ from hybrid_jax.codegen.nodes import Address, Array, Call, Entry, Expression, Fu
 from hybrid_jax.codegen.printer import OPERATIONS
 from hybrid_jax.codegen.translation import Translation, applied, array_of, depends, objects
 
-EXPANDED = 24  # operations on at most so many entries are written out; more become a loop if they can
-COPIED = 200  # and on at most so many if they cannot
-PRODUCTS = 160  # multiplications of a matrix product that are written out
+EXPANDED = 24  # most entries for which an operation is written out if it could be a loop
+COPIED = 200  # most entries if they would have to be copied for a loop
+PRODUCTS = 160  # most multiplications of a matrix product that are written out
 
 _NUMBERS: dict[str, Callable] = {
     "add": lambda a, b: a + b,
@@ -40,7 +40,7 @@ class CTranslation(Translation):
     operations: ClassVar[dict[str, str]] = OPERATIONS
     tables: Tables
     steps: list[Step] = field(default_factory=list)
-    _written: dict[Any, Entry] = field(default_factory=dict)  # (operation, operands) → what holds its result
+    _written: dict[Any, Entry] = field(default_factory=dict)  # (operation, operands) → its result
 
     def scalar(self, name, *operands):
         if (found := self._simple(name, *operands)) is None:
@@ -53,7 +53,7 @@ class CTranslation(Translation):
         if name in _NUMBERS and all(isinstance(one, float) for one in operands):
             return _NUMBERS[name](*operands)
         match name, *operands:
-            # As in sparse linear algebra, zero times a value is zero, even if that value is not finite.
+            # As in sparse linear algebra, zero times any value is zero, even if it is not finite.
             case ("mul", 0.0, _) | ("mul", _, 0.0) | ("div", 0.0, Entry()):
                 return 0.0
             case ("add", 0.0, other) | ("add" | "sub", other, 0.0) | ("mul", 1.0, other) | ("mul" | "div", other, 1.0):
@@ -101,7 +101,7 @@ class CTranslation(Translation):
         return result
 
     def _loops(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """A B as loops."""
+        """Multiply A by B in loops."""
         (m, k), n = a.shape, b.shape[1]
         if m == 1 and n > 1:
             return self._loops(b.T, a.T).T
@@ -127,7 +127,7 @@ class CTranslation(Translation):
         inner, rows, shared, carried = (equation.params[key] for key in ("jaxpr", "length", "num_consts", "num_carry"))
         if equation.params["reverse"]:
             raise self._refusal(equation, " from the end")
-        whole = self.tables.name("a")  # what is carried, as much of the next call, and the results of all rows
+        whole = self.tables.name("a")  # the carry, the next carry, and the results of all rows
         begin = np.concatenate([objects(one).ravel() for one in (np.zeros(0), *inputs[shared : shared + carried])])
         inside, given = self._passed(inputs, shared, carried, whole)
         outs = [self.tables.name("r") for _ in equation.outvars]
@@ -146,11 +146,11 @@ class CTranslation(Translation):
     def _passed(
         self, inputs: Sequence[np.ndarray], shared: int, carried: int, whole: str
     ) -> tuple[list[np.ndarray], list[Address]]:
-        """Return the inputs of the function in a loop as it sees them, and where its arrays begin in each call."""
+        """Return the inputs of the function in a loop, and the addresses that each call passes for them."""
         inside, given, at = list(inputs), list[Address](), 0
         for i, value in enumerate(inputs):
             if i < shared and not depends(value):
-                continue  # numbers are a part of the function
+                continue  # numbers become part of the function
             inside[i] = entries(self.tables.name("p"), value.shape[int(i >= shared + carried) :])
             if shared <= i < shared + carried:
                 given.append(Address(whole, at))
@@ -172,7 +172,7 @@ class CTranslation(Translation):
         return [one for out, result, begin in filled for one in loops.stores(out, result.ravel(), begin)]
 
     def _address(self, array: np.ndarray) -> Address:
-        """Return where the entries begin, which are copied unless they are contiguous."""
+        """Return the address of entries, which are copied unless they are contiguous."""
         return loops.address(self.tables, array) or self._address(self._copied(array))
 
     def _compact(self, array: np.ndarray) -> np.ndarray:
@@ -204,14 +204,14 @@ class CTranslation(Translation):
 
 
 def entries(name: str, shape: Sequence[int], begin: int = 0) -> np.ndarray:
-    """Return the entries of an array, from `begin` on, in this shape."""
+    """Return the entries of an array from `begin` on, in this shape."""
     return array_of([Entry(name, begin + i) for i in range(int(np.prod(shape)))]).reshape(shape)
 
 
 def define(
     tables: Tables, name: str, program: ClosedJaxpr, arguments: Sequence[np.ndarray], outputs: Sequence[str]
 ) -> Function:
-    """Translate a program into a function of a file; its inputs are the arguments that are entries of an array."""
+    """Translate a program into a function of a file, whose inputs are the arguments that are not numbers."""
     translation = CTranslation(tables)
     results = translation.run(program, arguments)
     inputs = tuple(Array(one.flat[0].name, one.size) for one in arguments if depends(one) and one.size)
@@ -231,8 +231,8 @@ def _places(sizes: Iterable[int]) -> list[int]:
 
 
 def called(name: str) -> str:
-    """Return the name that a jitted function has which is translated to a call of a file's function."""
-    return f"C {name}"  # no name of Python
+    """Return the name of jitted functions that are translated to a call of a file's function."""
+    return f"C {name}"  # no Python function has such a name
 
 
 def is_zero(entries: np.ndarray) -> bool:

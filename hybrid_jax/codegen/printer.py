@@ -85,7 +85,7 @@ class CPrinter:
         return f"({digits})" if value < 0 else digits
 
     def expression(self, node: Any) -> str:
-        """Print an expression without brackets around it."""
+        """Print an expression without brackets."""
         match node:
             case bool() | int():
                 return str(int(node))
@@ -138,7 +138,7 @@ class CPrinter:
         return f"static void {one.name}({', '.join(given)}) {{\n{unused}{self.body(one.body)}\n}}\n"
 
     def file(self, tables: Tables, names: Iterable[str]) -> str:
-        """Print functions of these names, with the tables, helpers and functions that they use."""
+        """Print the functions with these names, and the tables, helpers and functions that they use."""
         used, printed = set(names), list[nodes.Function]()
         for one in reversed(tables.functions.values()):
             if one.name in used:

@@ -1,7 +1,7 @@
 """Walk a JAX program operation by operation to translate it into another language.
 
-Every value is a NumPy array of its shape: of numbers, or, if it depends on the arguments, of objects, which are numbers
-and what stands for a number in the language.
+Every value is a NumPy array of its shape. If it depends on the arguments, its entries are objects: numbers, and
+expressions of the language.
 """
 
 from abc import ABC, abstractmethod
@@ -16,10 +16,10 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
 
 class Translation(ABC):
-    """Operations of a program in a language."""
+    """Translates a program, operation by operation, into a language."""
 
     language: ClassVar[str]
-    operations: ClassVar[Container[str]]  # on numbers, by the names in JAX
+    operations: ClassVar[Container[str]]  # supported operations on numbers, named as in JAX
 
     @abstractmethod
     def scalar(self, name: str, *operands: Any) -> Any:
@@ -38,7 +38,7 @@ class Translation(ABC):
         """Multiply A (m × k) by B (k × n)."""
 
     def scan(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Apply one program to each of several arrays; unsupported by most languages here."""
+        """Apply a program to each row of arrays; by default unsupported."""
         raise self._refusal(equation)
 
     def run(self, program: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -52,7 +52,7 @@ class Translation(ABC):
         def read(atom) -> np.ndarray:
             return np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
 
-        for equation in filter(lambda one: one.outvars, program.eqns):  # a derivative may leave calls of nothing
+        for equation in filter(lambda one: one.outvars, program.eqns):  # derivatives may contain calls without results
             results = self._results(equation, [read(atom) for atom in equation.invars])
             values.update(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in program.outvars]
@@ -104,7 +104,7 @@ class Translation(ABC):
         """Translate operations that only move entries, by applying them to indices in JAX."""
         entries, sent = list[Any](), list(inputs)
         for i in range(len(inputs))[MOVES[equation.primitive.name]]:
-            places = len(entries) + np.arange(inputs[i].size, dtype=float)  # of the entries' type, which JAX checks
+            places = len(entries) + np.arange(inputs[i].size, dtype=float)  # JAX checks that the type is the same
             sent[i] = places.reshape(inputs[i].shape)
             entries += objects(inputs[i]).ravel().tolist()
         if any(map(depends, sent)):
@@ -115,7 +115,7 @@ class Translation(ABC):
         return [all_of_them[places.astype(int).ravel()].reshape(places.shape) for places in moved]
 
     def _linear(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> np.ndarray:
-        """Translate operations that are linear in their data, as a matrix times each."""
+        """Translate operations that are linear in their data to products with matrices."""
         data = LINEAR[equation.primitive.name]
         if any(depends(value) for i, value in enumerate(inputs) if i not in data):
             raise self._refusal(equation, " at a place that depends on x or u")
@@ -131,7 +131,7 @@ class Translation(ABC):
         return reduce(partial(self.entrywise, "add"), map(part, data)).reshape(equation.outvars[0].aval.shape)  # type: ignore
 
     def _product(self, dimension_numbers, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """dot_general: the result's axes are the batch axes, then the left's, then the right's."""
+        """Translate dot_general, whose result has the batch axes, then the left's, then the right's."""
         (of_left, of_right), (common_left, common_right) = dimension_numbers
         rows, free = _matrices(left, of_left, common_left)
         columns, others = _matrices(right, of_right, common_right)
@@ -170,7 +170,7 @@ def applied(function: Callable, *arrays: np.ndarray) -> np.ndarray:
 
 
 def _evaluated(equation: JaxprEqn, inputs: Sequence[Any]) -> list[Any]:
-    """Evaluate an operation on numbers, with NumPy if frequent, because JAX compiles each call."""
+    """Evaluate an operation on numbers. Frequent ones use NumPy, because JAX would compile each."""
     inputs = list(map(np.asarray, inputs))
     params, shape = equation.params, equation.outvars[0].aval.shape  # type: ignore
     match equation.primitive.name:
@@ -192,13 +192,13 @@ def _evaluated(equation: JaxprEqn, inputs: Sequence[Any]) -> list[Any]:
     return [np.asarray(one) for one in (found if equation.primitive.multiple_results else [found])]
 
 
-# Operations that call another program. Custom derivatives are replaced by those of the language.
+# Operations that call another program. The language differentiates by itself, so custom derivatives are ignored.
 CALLS = ("jit", "closed_call", "remat2", "custom_jvp_call", "custom_vjp_call")
 _OF_ONE = (
     *("reshape", "squeeze", "expand_dims", "transpose", "rev", "tile", "split", "unstack", "slice", "gather"),
     *("broadcast_in_dim", "dynamic_slice"),
 )
-# Name → those of the inputs whose entries are moved.
+# Name → the inputs whose entries are moved.
 MOVES = {
     **dict.fromkeys(_OF_ONE, slice(1)),
     **dict.fromkeys(("concatenate", "stack", "pad"), slice(None)),
@@ -216,7 +216,7 @@ def _power(of: Callable, params: dict, base: np.ndarray) -> np.ndarray:
     return of("div", number(1), power) if params["y"] < 0 else power
 
 
-# Name → what it is made of, by a function that applies operations of the language.
+# Name → its definition by other operations, which the first argument applies.
 COMPOSED: dict[str, Callable[..., np.ndarray]] = {
     **dict.fromkeys(("copy", "copy_p", "stop_gradient"), lambda of, params, a: a),
     "add_any": lambda of, params, a, b: of("add", a, b),

@@ -12,7 +12,7 @@ from hybrid_jax.runtime import entry
 if TYPE_CHECKING:
     import casadi
 
-MOST_STATES = 512  # a field on a grid of thousands would be a graph of millions of scalar operations
+MOST_STATES = 512  # thousands, for example on a grid, would be a graph of millions of scalar operations
 
 
 @entry
@@ -39,8 +39,8 @@ def casadi_function(
         name: name of the CasADi function.
         smooth: β of ½ (z + √(z² + 1/β²)), which replaces the ReLU of networks (see `smoothed`). You should set it for
             solvers that use second derivatives, for example IPOPT.
-        observe: make the function of x, u and `measured` that returns the state dt after x, where this sample was
-            measured. This is for a field from `fit_disturbance`, whose state you carry: at first its filters are zero.
+        observe: return a function of x, u and `measured`, the sample dt after x, that returns the state there. You need
+            it for a field from `fit_disturbance`, whose state you pass on; at first its filters should be zero.
 
     Raises:
         ValueError: if sizes are unknown, there are more than 512 states, the field does not accept such x and u, or
@@ -57,15 +57,13 @@ def casadi_function(
         checks.positive("dt", dt, "a positive number of seconds")
     sizes = sizes_of(field, state_size, input_size, observe)
     if sizes[0] > MOST_STATES:
-        raise ValueError(
-            f"state_size must be at most {MOST_STATES}, got {sizes[0]}: CasADi would write out every "
-            "number; use export_program"
-        )
+        advice = "CasADi would write out every number; use export_program"
+        raise ValueError(f"state_size must be at most {MOST_STATES}, got {sizes[0]}: {advice}")
     if not isinstance(name, str) or not ca.Function.check_name(name):
         raise ValueError(f"name must be one that CasADi accepts for a function, got {checks.short_repr(name)}")
     names = list(OBSERVED[: len(sizes)])
     symbols = list(map(ca.SX.sym, names, sizes))
-    # In double precision throughout, so that the constants of the physics are not rounded.
+    # In double precision, so that the constants of the physics are not rounded.
     with jax.enable_x64(True):
         likes = [jax.ShapeDtypeStruct((size,), float) for size in sizes]
         result = evaluate(jax.make_jaxpr(program_of(field, likes, dt, smooth))(*likes), symbols)

@@ -42,7 +42,7 @@ OPERATIONS: dict[str, Callable] = {
 
 
 class CasadiTranslation(Translation):
-    """Entries are scalar expressions."""
+    """Translates into CasADi, with scalar expressions as entries."""
 
     language: ClassVar[str] = "CasADi"
     operations: ClassVar[dict[str, Callable]] = OPERATIONS

@@ -16,8 +16,8 @@ from hybrid_jax.integrate import check_field, rk4_step
 from hybrid_jax.networks import smoothed
 from hybrid_jax.vehicle import STATE_SIZE, Vehicle
 
-OBSERVED = "x", "u", "measured"  # arguments of the program that observes
-Size = int | None  # d or m; by default what the field knows
+OBSERVED = "x", "u", "measured"  # arguments of a program with `observe`
+Size = int | None  # d or m; by default from the field
 
 
 def program_of(
@@ -29,8 +29,8 @@ def program_of(
 ) -> Callable[..., Array]:
     """Return ẋ = f(x, u), or the step of RK4 over dt [s], with the field's numbers in the precision of `likes`.
 
-    `likes` are one x and one u; if `batched`, the function takes rows of them. With a third, measured, it returns the
-    state of a field with a past after this sample. ValueError if they do not fit.
+    `likes` are one x and one u; if `batched`, the function takes rows of them. With a third, `measured`, it returns the
+    state of a field with a past after this sample. ValueError if they do not match the field.
     """
     field = prepared(field, likes[:2], smooth)
     if len(likes) > 2:
@@ -46,14 +46,14 @@ def program_of(
 
 
 def observed(model: Any, dt: Any, x, u, measured) -> Float[Array, " d+f"]:
-    """The state after a sample dt [s] after x, with u held in between."""
+    """Return the state after a sample that was measured dt [s] after x, with u held in between."""
     return model.after(x, rk4_step(model.field, x[: len(measured)], u, dt), measured, dt)
 
 
 def prepared(
     field: AbstractVectorField, likes: Sequence[jax.ShapeDtypeStruct], smooth: float | None
 ) -> AbstractVectorField:
-    """Convert the field to the precision of x and u, with `SmoothRelu` if asked; ValueError if they do not fit."""
+    """Convert the field to the precision of x and u, perhaps with `SmoothRelu`; ValueError if they do not match it."""
     precision = likes[0].dtype
     field = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision) if eqx.is_inexact_array(leaf) else leaf, field)
     if smooth is not None:

@@ -1,4 +1,4 @@
-"""Fields and steps as StableHLO programs in files, through `jax.export`: JAX runs them without this library."""
+"""Fields and steps as StableHLO programs in files, by `jax.export`, which JAX can run without this library."""
 
 import importlib.util
 import re
@@ -33,7 +33,7 @@ class Program:
         dt: length of a step [s]; None for a field.
         state_size: d.
         input_size: m.
-        measured_size: n, of a program that observes; else 0.
+        measured_size: n, for a program with `observe`; else 0.
         batched: whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
         platforms: the platforms that can run it, for example "cpu".
         about: JSON values that describe the model.
@@ -59,7 +59,7 @@ class Program:
         Args:
             x: state (d,), or states (b, d).
             u: input (m,), or inputs (b, m).
-            measured: the sample dt later (n,), or (b, n), for a program that observes.
+            measured: the sample dt later (n,), or (b, n), for a program with `observe`.
         """
         sizes = {"x": self.state_size, "u": self.input_size}
         sizes |= {"measured": self.measured_size} if self.measured_size else {}
@@ -164,7 +164,7 @@ def _without_source_locations() -> Iterator[None]:
 
 
 def _check_calls(exported: jax.export.Exported) -> None:
-    """Raise for a program with external calls, which would depend on the machine's libraries."""
+    """Raise ValueError for a program with external calls, which would depend on the machine's libraries."""
     for call in re.findall(r"custom_call\W*(\w*)", exported.mlir_module()):
         if call != "shape_assertion":  # JAX's check of a symbolic length
             raise ValueError(f"field: its program calls {call or 'something'}, which is not an operation of StableHLO")

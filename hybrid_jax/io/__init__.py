@@ -1,4 +1,4 @@
-"""Save and load models and datasets. Files hold data and no code, and a checksum finds damage."""
+"""Save and load models and datasets. Files contain data but no code, and a checksum detects damage."""
 
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.models import Model, check_savable, load, save

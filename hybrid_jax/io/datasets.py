@@ -26,7 +26,7 @@ class Dataset:
 
     Attributes:
         splits: the windows of each split, by its name, for example "train".
-        metadata: JSON values. The entry `config` determines the windows; others describe them, for example versions.
+        metadata: JSON values. The entry `config` determines the windows; others describe them, for example "versions".
     """
 
     splits: Mapping[str, Trajectories]
@@ -93,13 +93,13 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
 
 
 def content_hash(dataset: Dataset) -> str:
-    """SHA-256 (hex) of the configuration and all windows."""
+    """Return the SHA-256 (hex) of the configuration and all windows."""
     splits, arrays = _content(dataset)
     return digest([dataset.config, splits], arrays)
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """The version of Python and of each package, or "not installed"."""
+    """Return the version of Python and of each package, or "not installed"."""
     found = {"python": platform.python_version()} | dict.fromkeys(packages, "not installed")
     for package in packages:
         with suppress(PackageNotFoundError):
@@ -118,13 +118,13 @@ def _check_splits(path: Path | str, dataset: Dataset) -> None:
 
 
 def _content(dataset: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The saved metadata of each split, and its arrays by name."""
+    """Return the saved metadata of each split, and its arrays by name."""
     splits = {name: dataset.splits[name] for name in sorted(dataset.splits)}
     arrays = {f"{name}/{part}": np.asarray(getattr(splits[name], part)) for name in splits for part in ARRAYS}
     return {name: {"dt": windows.dt} for name, windows in splits.items()}, arrays
 
 
 def _flatten(config: dict[str, Any]) -> dict[str, str]:
-    """Nested keys joined by dots → the value as JSON, which does not distinguish tuples from lists."""
+    """Map nested keys, joined by dots, to values as JSON, in which tuples and lists are equal."""
     leaves = jax.tree_util.tree_leaves_with_path(config, is_leaf=lambda node: not isinstance(node, dict))
     return {jax.tree_util.keystr(path, simple=True, separator="."): encode(value).decode() for path, value in leaves}

@@ -1,4 +1,4 @@
-"""Atomic writes, strict JSON, and archives: named arrays and JSON metadata in one reproducible file, without pickle."""
+"""Atomic writes, strict JSON, and archives of named arrays and JSON metadata in a reproducible file, without pickle."""
 
 import hashlib
 import io
@@ -23,13 +23,13 @@ from hybrid_jax.checks import first_line
 
 HEADER = "header.json"
 NUMERIC = {np.dtype(kind) for kind in "?bhilqBHILQefdFD"}
-# JAX's own number types, which a .npy cannot describe: stored as integers of the same size.
+# JAX's own number types, which .npy does not support, are stored as integers of the same size.
 EXTENDED = {np.dtype(kind).name: np.dtype(kind) for kind in (jnp.bfloat16, jnp.float8_e4m3fn, jnp.float8_e5m2)}
 Arrays = Mapping[str, np.ndarray]
 
 
 def write_atomic(path: str | Path, content: str | bytes) -> None:
-    """Write a new file beside `path`, text as UTF-8, then rename it; OSError leaves an earlier file unchanged."""
+    """Write a new file beside `path`, with text as UTF-8, and rename it; OSError leaves an earlier file unchanged."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{secrets.token_hex(8)}.part")
@@ -43,7 +43,7 @@ def write_atomic(path: str | Path, content: str | bytes) -> None:
             file.flush()
             os.fsync(file.fileno())  # otherwise a power cut could leave an empty file
         os.replace(temporary, path)
-    except OSError as error:  # that of a full disk names no file
+    except OSError as error:  # the error of a full disk does not name the file
         raise OSError(f"{path}: cannot be saved: {error.strerror}; what was saved before is intact") from error
     finally:
         temporary.unlink(missing_ok=True)
@@ -54,7 +54,7 @@ def json_text(value: Any) -> str:
 
 
 def json_value(value: Any) -> Any:
-    """The JSON form of nested mappings, sequences, arrays, paths and numbers. Non-finite numbers become null."""
+    """Convert nested mappings, sequences, arrays, paths and numbers to JSON values. Non-finite numbers become null."""
     match value:
         case None | bool() | int() | str():
             return value
@@ -72,12 +72,12 @@ def json_value(value: Any) -> Any:
 
 
 def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> None:
-    """Write an archive of a form such as "hybrid_jax model 2" atomically; ValueError if a part cannot be saved."""
+    """Write an archive of a form, for example "hybrid_jax model 2", atomically; ValueError if it cannot be saved."""
     for name, array in arrays.items():
         if array.dtype.newbyteorder("=") not in NUMERIC:
             raise ValueError(f"array {name!r} has type {array.dtype}, which cannot be saved")
     header, buffer = {"format": form, "sha256": digest(metadata, arrays), "metadata": metadata}, io.BytesIO()
-    # An .npz is a zip of .npy; entries made by hand carry no clock, so equal content gives equal bytes.
+    # An .npz is a zip of .npy. Entries made by hand have no time stamp, so equal content gives equal bytes.
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(HEADER), encode(header))
         for name, array in arrays.items():
@@ -87,7 +87,7 @@ def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> 
 
 
 def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarray]]:
-    """The metadata and arrays of an archive of one of these forms; ValueError of one line if a check fails."""
+    """Read metadata and arrays from an archive of one of these forms; ValueError of one line if a check fails."""
     path = Path(path)
     try:
         entries = _read_entries(path)
@@ -107,10 +107,10 @@ def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarr
 
 
 def digest(metadata: Any, arrays: Arrays) -> str:
-    """SHA-256 (hex) of arrays and of metadata as strict JSON, independent of the order of keys and names."""
+    """Return the SHA-256 (hex) of arrays and of metadata as strict JSON, independent of the order of keys and names."""
     found = hashlib.sha256(encode(metadata, sort_keys=True, separators=(",", ":")))
     for name in sorted(arrays):
-        array = np.asarray(arrays[name], order="C")  # np.ascontiguousarray would make a vector of a scalar
+        array = np.asarray(arrays[name], order="C")  # np.ascontiguousarray would add an axis to a scalar
         found.update(encode([name, array.dtype.str, list(array.shape)]))
         found.update(array.tobytes())
     return found.hexdigest()
@@ -125,7 +125,7 @@ def encode(value: Any, **layout: Any) -> bytes:
 
 
 def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
-    """The arrays of a tree as NumPy arrays, by path; ValueError if two have the same path."""
+    """Return the arrays of a tree as NumPy arrays, by path; ValueError if two have the same path."""
     named = {}
     for keys, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(tree, eqx.is_array)):
         path = jax.tree_util.keystr(keys, simple=True, separator="/")
@@ -136,7 +136,7 @@ def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
 
 
 def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) -> PyTree:
-    """`like` with each array replaced by the one at its path; ValueError, with `origin`, if one does not fit."""
+    """Replace each array of `like` by the one at its path; ValueError, with `origin`, if one does not match."""
     expected = named_leaves(like)
     found, wanted = ({name: f"{a.dtype}{list(a.shape)}" for name, a in side.items()} for side in (arrays, expected))
     for name in sorted(expected.keys() | arrays.keys()):
@@ -151,7 +151,7 @@ def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) 
 
 
 def array_type(array: Any) -> dict[str, str]:
-    """What `to_numpy` loses: the algorithm of a random key, or a type in `EXTENDED`."""
+    """Return what `to_numpy` loses: the algorithm of a random key, or a type in `EXTENDED`."""
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
         return {"key": str(jax.random.key_impl(array))}
     return {"dtype": array.dtype.name} if array.dtype.name in EXTENDED else {}
@@ -170,9 +170,9 @@ def from_numpy(array: np.ndarray, kind: Mapping[str, str]) -> Any:
 
 
 def _read_entries(path: Path) -> dict[str, bytes]:
-    """The bytes of each entry by name; ValueError for paths outside the folder and for compression."""
+    """Read each entry by name; ValueError for paths outside the folder and for compression."""
     if path.exists() and not path.is_file():
-        raise ValueError("not a regular file")  # a pipe would be waited for, a device read without end
+        raise ValueError("not a regular file")  # a pipe or a device may never end
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             place = PurePosixPath(entry.filename.replace("\\", "/"))

@@ -1,4 +1,4 @@
-"""Save and load trained models. A file contains only data; loading it runs no code of the file."""
+"""Save and load trained models. A file contains only data, so loading it cannot run code."""
 
 import contextlib
 import dataclasses
@@ -127,7 +127,7 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
 
 
 def _not_finite(field: eqx.Module) -> str:
-    """The path of an array that is not finite, for example after a fit that diverged; empty if there is none."""
+    """Describe an array that is not finite, for example after a fit that diverged; "" if all are."""
     for keys, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(field, eqx.is_inexact_array)):
         path = jax.tree_util.keystr(keys, simple=True, separator="/")
         unmeasured = np.isnan(leaf) & path.endswith("learned_from/x")

@@ -1,6 +1,6 @@
 """The structure of a field as JSON: classes and functions by name, static values, and the path of each array.
 
-Reading runs no code that the file chooses: a class must be an Equinox module in a module that is already imported.
+A file cannot choose code to run: a class must be an Equinox module in a module that is already imported.
 """
 
 import builtins
@@ -145,7 +145,7 @@ class Structure:
 
 
 def decode(value: Any, arrays: Arrays) -> Any:
-    """The object that a structure describes; ValueError for unknown or unfit classes, or Python's own if malformed."""
+    """Make the object that a structure describes; ValueError for unknown classes, or Python's errors if malformed."""
     match value:
         case None | bool() | int() | float() | str():
             return value
@@ -177,7 +177,7 @@ def decode(value: Any, arrays: Arrays) -> Any:
 
 
 def static_values(tree: Any) -> dict[str, Any]:
-    """The numbers, strings and None in a structure, by path."""
+    """Return the numbers, strings and None in a structure, by path."""
     found = {}
     for keys, leaf in jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: node is None):
         path = jax.tree_util.keystr(keys, simple=True, separator="/").split("/")
@@ -187,7 +187,7 @@ def static_values(tree: Any) -> dict[str, Any]:
 
 
 def find_class(name: str) -> type:
-    """The class "module:qualname" of an imported module, or the portable one "@name"; ValueError for other types."""
+    """Find the class "module:qualname" of an imported module, or a portable one "@name"; ValueError for other types."""
     module, _, qualname = name.partition(":")
     found: Any = _PORTABLE.get(name, sys.modules.get(module))
     if found is None:
@@ -204,7 +204,7 @@ def find_class(name: str) -> type:
 
 
 def _rebuild(name: str, parts: dict[str, Any]) -> Any:
-    """An object with these fields, made without its `__init__` but with the checks of this library's own classes."""
+    """Make an object with these fields, without its `__init__` but with the checks of this library's own classes."""
     cls: Any = find_class(name)
     made, known = object.__new__(cls), dataclasses.fields(cls)
     values = {f.name: f.default for f in known if f.default is not dataclasses.MISSING} | parts
@@ -215,7 +215,7 @@ def _rebuild(name: str, parts: dict[str, Any]) -> Any:
         object.__setattr__(made, key, value)
     if cls.__module__.startswith("hybrid_jax."):
         _require_shapes(name, known, values)
-    for base in reversed(cls.__mro__):  # a damaged or forged file must give no vehicle of negative mass
+    for base in reversed(cls.__mro__):  # for example, a damaged file must not give a vehicle of negative mass
         for check in ("__post_init__", "__check_init__"):
             if base.__module__.startswith("hybrid_jax.") and check in vars(base):
                 vars(base)[check](made)
@@ -223,11 +223,11 @@ def _rebuild(name: str, parts: dict[str, Any]) -> Any:
 
 
 def _require_shapes(name: str, known: Iterable[dataclasses.Field], values: Mapping[str, Any]) -> None:
-    """Require arrays as the class declares them; all may have extra leading axes, for example for stacked models."""
+    """Require arrays as the class declares them. All may have extra leading axes, for example for stacked models."""
     stated = {f.name: f.type for f in known if isinstance(f.type, type) and issubclass(f.type, AbstractArray)}
     with jaxtyped("context"):
         for key, kind in stated.items():
-            if set("*+") & {*kind.dim_str}:  # of any shape, or of sizes that another class states
+            if set("*+") & {*kind.dim_str}:  # any shape, or sizes that another class states
                 continue
             value = values[key]
             if not isinstance(value, kind.dtype[kind.array_type, f"*others {kind.dim_str}"]):

@@ -1,4 +1,4 @@
-"""C++ kernels for rollouts of many windows in single precision with AVX2; otherwise JAX gives the same to rounding."""
+"""C++ kernels for rollouts of many windows in single precision with AVX2. JAX gives the same result to rounding."""
 
 import os
 
@@ -12,13 +12,13 @@ __all__ = ["status"]  # the rest is for the library's own modules
 
 
 def switch_off() -> None:
-    """Do not use kernels in what this process and those that it starts will compile, as HYBRID_JAX_NATIVE=0."""
+    """Disable kernels for later compilations in this process and its children, like HYBRID_JAX_NATIVE=0."""
     os.environ[SWITCH] = "0"
     obstacle.cache_clear()
 
 
 def status() -> str:
-    """Say whether this process uses kernels ("used" or why not), with a line for each unsupported field."""
+    """Return whether this process uses kernels ("used" or why not), with a line for each unsupported field."""
     if (reason := obstacle()) is not None:
         return f"not used: {reason}"
     return "\n".join(["used", *(f"not for {name}: {why}" for name, why in sorted(REFUSED.items()))])

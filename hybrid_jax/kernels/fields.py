@@ -22,8 +22,8 @@ from hybrid_jax.kernels.source import Source
 from hybrid_jax.kernels.trace import Shape, Split, split, traced
 from hybrid_jax.networks.normalisation import AbstractNorm, BatchNorm
 
-MOST = 20_000  # weights: more take long to translate
-REFUSED: dict[str, str] = {}  # a field, as `_name` has it → why there is no kernel for it
+MOST = 20_000  # weights; more would take long to translate
+REFUSED: dict[str, str] = {}  # name of a field → why it has no kernel
 
 
 class Sizes(NamedTuple):
@@ -37,7 +37,7 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """The name under which programs find a field's kernel, and the conversion of its arrays to its weights."""
+    """The name by which programs find a field's kernel, and the conversion of its arrays to weights."""
 
     name: str
     sizes: Sizes
@@ -66,14 +66,14 @@ def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
     leaves, structure = jax.tree.flatten(shapes)
     key = *leaves, structure, d, m
     try:
-        if (known := _KNOWN.get((*key, True))) is None or known.sizes.units:  # else predictions are a part of training
+        if (known := _KNOWN.get((*key, True))) is None or known.sizes.units:  # else training's kernel also predicts
             if (*key, training) not in _KNOWN:
                 _KNOWN[*key, training] = None  # if it fails, it is not tried again
                 _check_methods(shapes)
-                with jax.ensure_compile_time_eval():  # this may be inside of a program that JAX traces
+                with jax.ensure_compile_time_eval():  # JAX may be tracing a program
                     _KNOWN[*key, training] = _made(shapes, Sizes(d, m), training)
             known = _KNOWN[*key, training]
-    except Exception as error:  # a user's code may raise anything, and fields that are not hashable a TypeError
+    except Exception as error:  # a user's code may raise anything, or not be hashable
         reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         REFUSED[_name(field)] = reason.removeprefix("field: ").partition("\n")[0]
         return None
@@ -101,7 +101,7 @@ def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
     of_sample = [Shape((size,), jnp.float32) for size in (sizes.d, sizes.m, units)]
 
     def evaluate(*arrays):
-        """ẋ with a given result n of batch normalisation, and its inputs z, W, γ and β."""
+        """Return ẋ for a given result n of batch normalisation, and its inputs z, W, γ and β."""
         *arrays, x, u, n = arrays
         whole = eqx.combine(jax.tree.unflatten(structure, arrays), rest)
         if not norms:

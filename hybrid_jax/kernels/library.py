@@ -1,8 +1,8 @@
-"""Compile C++ with GCC at first use, keep it in the user's cache folder, verify it and load it.
+"""Compile C++ with GCC at first use, cache it in the user's folder, verify it and load it.
 
 GCC runs while JAX traces and XLA compiles: programs call `cpp/entry.cc`, which waits for the kernel when it runs.
-Because the cache contains code, its folder must belong to the user, and a library whose checksum is wrong is
-recompiled. HYBRID_JAX_NATIVE=0 disables kernels; `obstacle` reports other reasons.
+Because the cache contains code, its folder must belong to the user, and a library with a wrong checksum is recompiled.
+HYBRID_JAX_NATIVE=0 disables kernels; `obstacle` reports other reasons.
 """
 
 import contextlib
@@ -24,11 +24,11 @@ from hybrid_jax import runtime
 
 SWITCH, FOLDER = "HYBRID_JAX_NATIVE", "kernels"
 SOURCES = Path(__file__).parent / "cpp"
-# Errors and exceptions of the square root are not asked for: without them several are taken at once.
+# Without errors and exceptions of the square root, several are computed at once.
 OPTIONS = ["-std=c++17", "-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w", "-shared"]
 LONGEST = 300  # s to compile
 CHECKSUM = 32  # bytes
-# Runs a command; once standard input is closed, ends it with all that it began, and deletes the folder $0.
+# Runs a command. When standard input is closed, ends it with all its children, and deletes the folder $0.
 WATCHED = """
 exec 3<&0
 { read -r _ <&3; trap '' TERM; kill 0; rm -rf "$0"; } &
@@ -57,7 +57,7 @@ def obstacle() -> str | None:
     try:
         _entry()
     except (OSError, AttributeError, Unusable) as error:
-        return str(error) if isinstance(error, Unusable) else f"they could not be kept, or not be loaded: {error}"
+        return str(error) if isinstance(error, Unusable) else f"they could not be saved or loaded: {error}"
     return None
 
 
@@ -72,7 +72,7 @@ def _flags() -> list[str]:
 
 @cache
 def _entry() -> ctypes.CDLL:
-    """Load and register what programs call."""
+    """Load and register the functions that programs call."""
     library = ctypes.CDLL(str(_checked_library((SOURCES / "entry.cc").read_text("utf-8"))))
     for handler in ("forward", "backward"):
         target = jax.ffi.pycapsule(ctypes.cast(library[handler], ctypes.c_void_p).value)
@@ -82,7 +82,7 @@ def _entry() -> ctypes.CDLL:
 
 @cache
 def begun(source: str) -> str:
-    """Begin to compile a source, and return the name under which programs find its functions."""
+    """Begin to compile a source, and return the name by which programs find its functions."""
     name, entry = _digest(source), _entry()
 
     def run() -> None:
@@ -92,7 +92,7 @@ def begun(source: str) -> str:
             library = ctypes.CDLL(str(_checked_library(source)))
             ways = [getattr(library, one, None) for one in ("forward", "backward")]
         except BaseException as error:  # ends the program that calls the kernel
-            said = f"a kernel cannot be used: {error}; {SWITCH}=0 does without"
+            said = f"a kernel cannot be used: {error}; you can disable kernels with {SWITCH}=0"
         entry.publish(name.encode(), said.encode(), *(ctypes.cast(one, ctypes.c_void_p) for one in ways))
 
     threading.Thread(target=run, daemon=True).start()  # Python does not wait for it to exit
@@ -134,22 +134,22 @@ def _compile(library: Path, source: str) -> None:
         with linked.open("r+b") as file:
             file.write(hashlib.sha256(file.read()).digest())
             file.flush()
-            os.fsync(file.fileno())  # there whole or not at all, also after a power cut
+            os.fsync(file.fileno())  # complete, or missing, also after a power cut
         os.replace(linked, library)
-    for path in library.parent.glob("*"):  # of other sources or compilers, and what was left half written
+    for path in library.parent.glob("*"):  # of other sources or compilers, or incomplete
         with contextlib.suppress(FileNotFoundError):  # deleted by another process
             if time.time() - path.stat().st_mtime > (2 * LONGEST if path.is_dir() else runtime.UNUSED):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _run_compiler(arguments: list[str]) -> None:
-    """Compile into the folder of the last argument; if this process ends first, so do compiler and folder."""
+    """Compile into the folder of the last argument. If this process ends first, stop and delete the folder."""
     command, folder = [_compiler() or "g++", *OPTIONS, *arguments], Path(arguments[-1]).parent
     inside, held = os.pipe()  # closed by the system when this process ends, also by SIGKILL
     try:
-        watched, alone = ["sh", "-c", WATCHED, folder, *command], os.environ | {"TMPDIR": str(folder)}
+        watched, environment = ["sh", "-c", WATCHED, folder, *command], os.environ | {"TMPDIR": str(folder)}
         options = {"capture_output": True, "errors": "replace", "timeout": LONGEST, "start_new_session": True}
-        subprocess.run(watched, check=True, stdin=inside, env=alone, **options)
+        subprocess.run(watched, check=True, stdin=inside, env=environment, **options)
     except subprocess.SubprocessError as error:
         said = [line for line in (getattr(error, "stderr", None) or "").splitlines() if "error" in line]
         raise Unusable(f"it could not be compiled: {(said or [f'{command[0]} fails'])[0]}") from error

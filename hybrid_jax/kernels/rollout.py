@@ -15,23 +15,23 @@ from hybrid_jax.kernels import library
 from hybrid_jax.kernels.fields import Kernel, kernel_of
 
 Shaped = Array | np.ndarray | jax.ShapeDtypeStruct
-FEWEST = 16  # windows: for fewer a call costs more than it saves
+FEWEST = 16  # windows; for fewer, a call costs more than it saves
 
 
 class Call(NamedTuple):
-    """What calls of a kernel share."""
+    """The arguments that all calls of a kernel share."""
 
     kernel: Kernel
     dt: float
     windows: int
 
     def forward(self, kept: int, *arrays: Array) -> Sequence[Array]:
-        """Return the states, and so many numbers that the way back needs."""
+        """Return the states, and `kept` numbers that the backward pass needs."""
         shapes = (len(arrays[-1]), *arrays[-2].shape), (kept,)
         return self.run("forward", [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes], *arrays)
 
     def run(self, way: str, results: list, *arrays: Array) -> Sequence[Array]:
-        """Call the kernel on arrays, which it does not check; `vmap` calls it for each lane in turn."""
+        """Call the kernel on arrays, which it does not check. `vmap` calls it for one lane after the other."""
         numbers = np.array([self.dt, self.kernel.epsilon, self.windows], np.float32)
         call = jax.ffi.ffi_call(f"hybrid_jax_{way}", results, vmap_method="sequential")
         return call(*arrays, kernel=self.kernel.name, numbers=numbers)
@@ -71,7 +71,7 @@ def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, s
 
 
 def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, axis: int, training: bool) -> Kernel | None:
-    """Return the kernel for these arrays, whose shapes it does not check itself."""
+    """Return the kernel for these arrays, after checks of their shapes, which it lacks."""
     if type(solver) is not RK4 or solver.substeps != 1 or (x0.ndim, u.ndim) != (2, 3):
         return None
     if x0.shape[axis] != u.shape[axis] or x0.shape[axis] < FEWEST or library.obstacle() is not None:
@@ -82,7 +82,7 @@ def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, axis: int, training: b
 
 
 def _filled(*arrays: Array) -> list[Array]:
-    """Repeat the last window, so that windows fill vectors."""
+    """Repeat the last window until windows fill vectors."""
     more = -arrays[0].shape[-1] % library.width()
     return [jnp.pad(array, (*((0, 0),) * (array.ndim - 1), (0, more)), mode="edge") for array in arrays]
 

@@ -15,24 +15,24 @@ from hybrid_jax.codegen.printer import LOGIC, OPERATIONS, CPrinter
 from hybrid_jax.kernels.library import width
 from hybrid_jax.kernels.trace import Shape, Split, outputs_of, split, traced, with_factors
 
-LONGEST = 4000  # statements of a function: GCC takes long for more, and a program of XLA does as well
+LONGEST = 4000  # statements of a function; for more, GCC takes long, and XLA is as fast
 CHEAP = {"add", "sub", "mul", "neg", "max", "min", "not", "select_n", "convert_element_type", *LOGIC}
-INLINED = 12  # operations of an entry that are done again wherever it is needed, at most
-LARGEST = 8192  # numbers in a function's arrays per sample
+INLINED = 12  # most operations that are repeated wherever their result is needed
+LARGEST = 8192  # most numbers in a function's arrays per sample
 
 
 @dataclass
 class SampleTranslation(CTranslation):
-    """Translates for one of many samples: weights and constants are shared, so their matrices are not copied."""
+    """Translates a program for one of many samples, which share weights and constants without copies."""
 
     language: ClassVar[str] = "kernels"
-    _cheap: dict[Any, Expression] = field(default_factory=dict)  # shape and entry of an array → what it is
+    _cheap: dict[Any, Expression] = field(default_factory=dict)  # shape and entry of an array → its value
 
     def scan(self, equation, inputs):
         raise self._refusal(equation)
 
     def _mapped(self, value, shape):
-        """Cheap values are computed again in loops over entries, instead of being read from an array."""
+        """Store a value in an array, but compute cheap ones again in loops over entries instead of reading them."""
         value = self._inlined(value, shape)
         made = super()._mapped(value, shape)
         operations = [one.name for one in nodes.walk(value) if isinstance(one, Operation)]
@@ -87,11 +87,11 @@ GIVEN = "const float *__restrict w, const Vec *__restrict x, const Vec *__restri
 SLOPE, READ = "const Normal n, Vec *out", "Vec *out"
 SLOPE_BACK = "const Normal n, const Vec *__restrict d_slope, Vec *dx, Vec *du, Vec *dn, Vec *s, Vec *f"
 READ_BACK = "const Vec *d_read, Vec *dx, Vec *du, Vec *s"
-Outputs = list[tuple[str, int]]  # arrays, and where in them the results begin
+Outputs = list[tuple[str, int]]  # array, and where a result begins in it
 
 
 class Source:
-    """Functions of a field's weights and of one sample: x, u, n; see cpp/rollout.h. `back` makes weights of its own."""
+    """Functions of a field's weights and of one sample x, u, n; see cpp/rollout.h. `back` computes its own weights."""
 
     def __init__(self, forward: Split, of_sample: Sequence[Shape], training: bool):
         self.tables, self.printer, self.factors = Tables(double=False), SamplePrinter(double=False), 1
@@ -123,7 +123,7 @@ class Source:
                 where = f"sums + {sums[i][1]}, factors + {at}, F, factors + {at + rows}, F, slots"
                 calls.append(f"    add_products<{rows}, {columns}>({where});")
                 at += rows + columns
-        self.factors = at | 1  # an even number of vectors may put all slots into the same lines of the cache
+        self.factors = at | 1  # with an even number of vectors, all slots could share lines of the cache
         inputs = ("x", "u", "n", "d_slope", "d_read")
         self._add("slope_back", SLOPE_BACK, whole, back.places(), inputs, outputs)
         self._add("read_back", READ_BACK, reading, back.places(), inputs, [*sums, *ways[:2]])
@@ -132,7 +132,7 @@ class Source:
         return back
 
     def _add(self, name: str, parameters: str, program: ClosedJaxpr, weights, inputs, outputs: Outputs) -> None:
-        """Add a function of inputs and weights, which begin at these places of `w`, that fills the outputs."""
+        """Add a function that fills outputs from inputs and weights, which begin at these places of `w`."""
         starts = [*(("w", place) for place in weights), *((name, 0) for name in inputs)]
         pairs = zip(starts, program.in_avals, strict=True)
         arguments = [entries(array, one.shape, first) for (array, first), one in pairs]

@@ -1,4 +1,4 @@
-"""Split JAX programs into a part of the weights, a part of each sample, and products for weight gradients."""
+"""Split JAX programs into a part for the weights, a part for each sample, and products for weight gradients."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -60,9 +60,10 @@ def _program(equations: Sequence[JaxprEqn], inputs: Sequence[Var], outputs: Sequ
 
 
 def split(program: ClosedJaxpr, parameters: int) -> Split:
-    """Split a program whose first `parameters` inputs are parameters; the others are samples.
+    """Split a program whose first `parameters` inputs are parameters and whose others are samples.
 
-    What parameters make of other types, as a comparison, belongs to the samples: weights are in single precision.
+    Weights are in single precision, so functions of parameters of another type, for example comparisons, belong to the
+    samples.
     """
     inputs, outputs = program.jaxpr.invars, program.jaxpr.outvars
     constant, known = set(program.jaxpr.constvars), set(inputs[:parameters])
@@ -97,7 +98,7 @@ def with_factors(program: ClosedJaxpr, count: int) -> tuple[ClosedJaxpr, Product
 
 
 def _factors(out: Any, made: dict[Any, JaxprEqn]) -> list[tuple[Any, Any]]:
-    """Return each a and b of an array that is Σ a bᵀ; empty if it is not."""
+    """Return all pairs a, b of an array Σ a bᵀ, or [] for another array."""
     if isinstance(out, Literal) or out not in made:
         return []
     equation = made[out]

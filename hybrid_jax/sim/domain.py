@@ -1,6 +1,6 @@
-"""Simulated systems, the paper's source domain and its two targets: accelerations of MuJoCo MJX integrated by RK4.
+"""Simulated systems, the paper's source domain and its two targets, with accelerations of MuJoCo MJX and RK4.
 
-Every stage recomputes the forces: MJX freezes xfrc_applied within a step, which makes it first order in drag.
+Every stage recomputes the forces. MJX's own steps freeze xfrc_applied, which makes them first order in drag.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +17,7 @@ from hybrid_jax.sim.forces import DRAG_COEFFICIENT, Force, Parameters, Scalar, d
 from hybrid_jax.sim.pilot import scale_of
 from hybrid_jax.vehicle import BODY_RATES, IRIS, QUATERNION, VELOCITY, Input, State, Vehicle
 
-CHUNK = 64  # flights per vmap: the most that fit into the cache of one core
+CHUNK = 64  # flights per vmap; more would not fit into the cache of one core
 _DERIVED: Any = None  # a default that depends on the vehicle
 
 
@@ -40,7 +40,7 @@ class Quadrotor(eqx.Module):
             u: rotor speeds [rad/s].
             t: time [s], for time-dependent forces such as wind.
         """
-        # Not above: MJX takes as long to import as JAX, and a program that was kept needs no MJX.
+        # Imported here, because MJX takes as long to import as JAX, and cached programs do not need it.
         from hybrid_jax.sim import scene
 
         wrenches = [jnp.concatenate(force(x, u, t, self.parameters)) for force in self.forces]
@@ -62,14 +62,14 @@ class Quadrotor(eqx.Module):
             slope = _derivative(self, x + fraction * dt * slope, u, t + fraction * dt)
             return slope, slope
 
-        # A scan over the stages compiles several times faster than four copies of MJX. It begins with any slope, as the
-        # first fraction is 0; not with zeros, see `batching.like`.
+        # A scan over the stages compiles several times faster than four copies of MJX. The first fraction is 0, so any
+        # slope will do; for why it is not zeros, see `batching.like`.
         k1, k2, k3, k4 = jax.lax.scan(stage, x, jnp.array([0.0, 0.5, 0.5, 1.0], x.dtype))[1]
         end = x + dt / 6 * (k1 + 2 * (k2 + k3) + k4)
         return end.at[QUATERNION].set(normalise(end[QUATERNION]))
 
 
-# Traced once for all calls of a program, not once for each; the compiler inlines it again.
+# Traced once for all calls of a program; the compiler inlines it again.
 _derivative = eqx.filter_jit(Quadrotor.derivative)
 
 

@@ -27,11 +27,11 @@ DT = pilot.PERIOD  # s
 AXIS = "flights"
 CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), at any phase of the wind
 
-# Bounds of a sound flight of the Iris; those of other vehicles are scaled.
+# Bounds of a valid flight of the Iris; they are scaled for other vehicles.
 MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
-RECIPE = 1  # increment when the same configuration no longer gives the same flights
+RECIPE = 1  # increment it when the same configuration no longer gives the same flights
 SECONDS = 11.0  # length of a flight
-SPARE = 2  # fly this many times the requested windows, so that few of those kept are neighbours
+SPARE = 2  # flown over requested windows, so that few windows are neighbours
 
 
 class Flights(NamedTuple):
@@ -75,7 +75,7 @@ def random_flights(domain: Domain, flights: int, seconds: float, key: PRNGKeyArr
     with jax.enable_x64(True), jax.default_device(cpus[0]):
         vehicles = domain.quadrotor(), parameters_of(domain.nominal)
         shared = jax.device_put((*vehicles, key), NamedSharding(mesh, PartitionSpec()))
-        # Chunks of one size share one compilation.
+        # Chunks of equal size share one compilation.
         chunks = [jax.device_put(chunk, NamedSharding(mesh, PartitionSpec(AXIS))) for chunk in numbers]
         parts = [_fly_chunk(shared, chunk, steps, domain.nominal, mesh) for chunk in chunks]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
@@ -186,14 +186,14 @@ def make_dataset(
 
 
 def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[Trajectories, Counter[str]]:
-    """Shuffled, non-overlapping windows of as many flights as needed; or the first ones of some whole flights."""
+    """Return shuffled, non-overlapping windows of as many flights as needed, or the first windows of whole flights."""
     key_flights, key_order = jax.random.split(key)
     tally, parts = Counter[str](), []
     each = spec.windows // spec.flights if spec.flights else 0
     while tally["windows"] < SPARE * spec.windows if not spec.flights else len(parts) < spec.flights:
         flights = random_flights(domain, CHUNK, SECONDS, jax.random.fold_in(key_flights, tally["flights"]))
         found = cut(flights, spec.steps, tally, domain.nominal)
-        whole = round(SECONDS / DT) // spec.steps  # windows of a flight of which none is dropped
+        whole = round(SECONDS / DT) // spec.steps  # windows of a flight if no window is dropped
         parts += [part[:each] for part in found if len(part) == whole] if spec.flights else found
         if not parts:
             raise ValueError(f"domain {domain.name}: all {tally['flights']} flights left the bounds; use weaker forces")
@@ -204,7 +204,7 @@ def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[T
 
 
 def permutation(key: PRNGKeyArray, n: int) -> Int[np.ndarray, " n"]:
-    """`jax.random.permutation(key, n)` without compiling two programs for every n, which takes half a second."""
+    """Return `jax.random.permutation(key, n)` without compiling two programs for every n, which takes half a second."""
     order = np.arange(n)
     for _ in range(math.ceil(3 * math.log(max(n, 1)) / math.log(2**32 - 1))):
         # The first numbers are the same however many are drawn (jax_threefry_partitionable).
@@ -220,7 +220,7 @@ def _drawn(key: PRNGKeyArray, n: int) -> tuple[PRNGKeyArray, UInt[Array, " n"]]:
 
 
 def cut(flights: Flights, steps: int, tally: Counter[str], vehicle: Vehicle = IRIS) -> list[Trajectories]:
-    """The valid windows of the valid flights (float32); the tally counts flights, windows and dropped ones."""
+    """Return the valid windows of the valid flights (float32); count flights, windows and dropped ones in the tally."""
     parts, wrong = [], gone_wrong(flights.states, vehicle)
     tally.update(flights=len(wrong), dropped_flights=int(wrong.sum()))
     for states, inputs, lowest in zip(*(leaf[~wrong] for leaf in flights[:3]), strict=True):

@@ -48,7 +48,7 @@ def parameters_of(vehicle: Vehicle, drag_coefficient: float = DRAG_COEFFICIENT) 
         "rotor_positions": [(x, y, 0.0) for x, y in vehicle.rotor_positions],
         "drag_coefficient": drag_coefficient,
     }
-    # By NumPy first: JAX would compile a program for the conversion of each shape.
+    # NumPy converts first, because JAX would compile a program for each shape.
     precision = jnp.result_type(float)
     return Parameters(*(jnp.asarray(np.asarray(numbers[field.name], precision)) for field in fields(Parameters)))
 
@@ -57,20 +57,20 @@ Force = Callable[[State, Input, Scalar, Parameters], Wrench]
 
 
 def drag(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
-    """D = −C_D v, linear in the velocity [m/s, world]."""
+    """Return the drag D = −C_D v, linear in the velocity [m/s, world]."""
     velocity = x[VELOCITY]
     return Wrench(-parameters.drag_coefficient * velocity, jnp.zeros_like(velocity))
 
 
 def wind(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
-    """The gust of experiment 2, [0, −4 + sin(⅔ π t), 0] N, t [s]."""
+    """Return the wind of experiment 2, [0, −4 + sin(⅔ π t), 0] N at time t [s]."""
     sideways = WIND_MEAN + WIND_AMPLITUDE * jnp.sin(WIND_ANGULAR_FREQUENCY * t)
-    none = jnp.zeros_like(x[VELOCITY])
-    return Wrench(none.at[1].set(sideways), none)
+    zeros = jnp.zeros_like(x[VELOCITY])
+    return Wrench(zeros.at[1].set(sideways), zeros)
 
 
 def ground_effect(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
-    """The thrust that ground effect adds to k u² of each rotor, and its torque (Eq. 11)."""
+    """Return the thrust that ground effect adds to k u² of each rotor, and its torque (Eq. 11)."""
     gain = thrust_gain(rotor_altitudes(x, parameters.rotor_positions), parameters.rotor_radius)
     excess = (gain - 1) * parameters.thrust_coefficient * u**2
     q = normalise(x[QUATERNION])
@@ -79,7 +79,7 @@ def ground_effect(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wren
 
 
 def thrust_gain(altitude: Float[Array, "*rotors"], rotor_radius: Scalar) -> Float[Array, "*rotors"]:
-    """T/T∞ = 1 / (1 − (R / 4h)²) of rotors at altitude h [m] (Cheeseman and Bennett 1955), with h at least R/2."""
+    """Return T/T∞ = 1 / (1 − (R / 4h)²) of rotors at altitude h ≥ R/2 [m] (Cheeseman and Bennett 1955)."""
     height = jnp.maximum(altitude, rotor_radius / 2)
     return 1 / (1 - (rotor_radius / (4 * height)) ** 2)
 

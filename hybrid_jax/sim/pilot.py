@@ -12,7 +12,7 @@ from hybrid_jax.rotation import Vector, body_z, conjugate, from_axis_angle, mult
 from hybrid_jax.sim.forces import Parameters, Scalar
 from hybrid_jax.vehicle import BODY_RATES, IRIS, POSITION, QUATERNION, VELOCITY, Input, State, Vehicle
 
-PERIOD = 0.01  # s, one decision
+PERIOD = 0.01  # s between decisions
 FASTEST = 1 / 3  # scale of time below which the rate loop would be too fast for PERIOD
 
 # Waypoints: a box around home, each held for a while and approached at its own speed.
@@ -31,23 +31,23 @@ TONES = 5
 BAND = (1.0, 5.0)  # Hz
 DITHER = (5.0, 5.0, 2.5, 1.0)  # rms, rad/s² and m/s²
 
-# Gains of the cascade and limits of what is asked of the vehicle.
+# Gains of the cascade and limits of its commands.
 POSITION_GAIN, VELOCITY_GAIN, INTEGRAL_GAIN = 4.0, 3.2, 1.2  # 1/s², 1/s, 1/s³
 INTEGRAL_LIMIT = 4.0  # m/s²
 ATTITUDE_GAIN = (9.0, 9.0, 4.0)  # 1/s
 RATE_GAIN = (20.0, 20.0, 10.0)  # 1/s
 MAX_TILT = 0.62  # rad
 GENTLE = 2.0  # m/s²
-CLEARANCE = 0.07  # m: no descent goes on below this
-ASTRAY, SAFE_ALTITUDE = 13.0, 1.5  # m from home, m: beyond the one go up to the other, where tilting is safe
-DIP, ARM = 0.12, 0.26  # near the ground a rotor this far out [m] dips by no more than this share of the altitude
+CLEARANCE = 0.07  # m: every descent ends above this
+ASTRAY, SAFE_ALTITUDE = 13.0, 1.5  # m: beyond the first, from home, climb to the second, where tilting is safe
+DIP, ARM = 0.12, 0.26  # near the ground, a rotor at the distance ARM [m] dips by at most DIP of the altitude
 
 
 class Scale(NamedTuple):
     """Ratios of a vehicle's quantities to the Iris's, by Froude scaling.
 
     Flights are geometrically similar at the same tilt and thrust over weight, with times proportional to the root of
-    lengths. A small vehicle is slowed down to what 100 Hz can control.
+    lengths. Small vehicles fly more slowly, so that 100 Hz suffice to control them.
     """
 
     length: float
@@ -57,7 +57,7 @@ class Scale(NamedTuple):
 
 
 def scale_of(vehicle: Vehicle) -> Scale:
-    """The scale of a vehicle, from the distance of its outermost rotor."""
+    """Return the scale of a vehicle, from the distance of its outermost rotor."""
     arm, arm_of_iris = (max(math.hypot(x, y) for x, y in each.rotor_positions) for each in (vehicle, IRIS))
     length = arm / arm_of_iris
     time = max(math.sqrt(length), FASTEST)
@@ -98,9 +98,9 @@ def _shorten(velocity: Float[Array, "4"], fastest: Vector) -> Float[Array, "4"]:
 
 
 def _draw_waypoints(steps: int, scale: Scale, key: PRNGKeyArray) -> tuple[Float[Array, "t 4"], Float[Array, "t 3"]]:
-    """Waypoint (x, y, z, heading) and limits (cruise, climb, turn) at each decision."""
+    """Return the waypoint (x, y, z, heading) and limits (cruise, climb, turn) at each decision."""
     count = int(steps * PERIOD / (HOLD[0] * scale.time)) + 2
-    # One draw for all, because each call of a random function takes a third of a second to compile.
+    # One draw for all numbers, because each call of a random function takes a third of a second to compile.
     draw = jax.random.uniform(key, (9, count))
     low, high = (_between(bounds, draw[3], scale.length) for bounds in (LOW, HIGH))
     altitude = jnp.where(draw[2] < LOW_SHARE, low, high)
@@ -128,7 +128,7 @@ def _draw_dither(steps: int, scale: Scale, key: PRNGKeyArray) -> Float[Array, "t
 def act(
     integral: Vector, x: State, course: Course, nominal: Parameters, vehicle: Vehicle, scale: Scale
 ) -> tuple[Vector, Input]:
-    """Feasible rotor speeds [rad/s] for the current entry of the course, and the new integral [m/s², world frame]."""
+    """Return the new integral [m/s², world frame] and feasible rotor speeds [rad/s] for an entry of the course."""
     # Raise the reference to a safe altitude if wind has blown the vehicle far away.
     far, place = jnp.linalg.norm(x[POSITION][:2]) > ASTRAY * scale.length, course.position
     place = place.at[2].set(jnp.where(far, jnp.maximum(place[2], SAFE_ALTITUDE * scale.length), place[2]))
@@ -147,14 +147,14 @@ def act(
 
 
 def _flare(wanted: Scalar, altitude: Scalar, climb: Scalar, scale: Scale):
-    """At least the vertical acceleration [m/s²] that stops the descent above ground, once that exceeds GENTLE."""
+    """Raise the vertical acceleration [m/s²] to what stops the descent above ground, once that exceeds GENTLE."""
     sink = jnp.minimum(climb, 0.0)
     needed = sink**2 / (2 * jnp.maximum(altitude - CLEARANCE * scale.length, 0.03 * scale.length))
     return jnp.where(needed > GENTLE * scale.acceleration, jnp.maximum(wanted, needed), wanted)
 
 
 def _limit_tilt(lift: Vector, altitude: Scalar, gravity: Scalar, scale: Scale) -> Vector:
-    """Limit the commanded acceleration [m/s², world frame] to upward thrust and tilts with rotors off the ground."""
+    """Limit the acceleration [m/s², world frame] to upward thrust, and to tilts with all rotors off the ground."""
     up = jnp.clip(lift[2], 0.5 * gravity, 1.7 * gravity)
     lowest = jnp.arcsin(jnp.clip(DIP * altitude / (ARM * scale.length), 0.05, 1.0))
     sideways = jnp.linalg.norm(lift[:2]) + 1e-9
@@ -163,7 +163,7 @@ def _limit_tilt(lift: Vector, altitude: Scalar, gravity: Scalar, scale: Scale) -
 
 
 def _angular_acceleration(x: State, lift: Vector, heading: Scalar, scale: Scale) -> Vector:
-    """The angular acceleration [rad/s², body frame] that turns thrust towards lift and the nose to heading [rad]."""
+    """Return the angular acceleration [rad/s², body] that turns thrust towards lift and the nose to heading [rad]."""
     yaw = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), heading)
     dx, dy, dz = lift / jnp.linalg.norm(lift)
     tilt = normalise(jnp.stack([1 + dz, -dy, dx, jnp.zeros_like(dz)]))  # the shortest turn of world z to lift
@@ -174,12 +174,12 @@ def _angular_acceleration(x: State, lift: Vector, heading: Scalar, scale: Scale)
 
 
 def _allocate(thrust: Scalar, torque: Vector, vehicle: Vehicle) -> Input:
-    """Rotor speeds [rad/s] for a thrust [N] and a torque [N m, body frame], clipped to their limits."""
+    """Return rotor speeds [rad/s] for a thrust [N] and a torque [N m, body frame], clipped to their limits."""
     wrench = jnp.concatenate([thrust[None], torque])
     mixer, rotors = jnp.asarray(vehicle.mixer, wrench.dtype), vehicle.rotors
-    if rotors <= 4:  # three rotors leave yaw alone
+    if rotors <= 4:  # three rotors cannot control yaw
         squared = jnp.linalg.solve(mixer[:rotors], wrench[:rotors])
-    else:  # the smallest squares of many that give the wrench; rows scaled, as they differ by far
+    else:  # the smallest squares that give the wrench; rows are scaled, because they differ by far
         size = jnp.linalg.norm(mixer, axis=1)
         mixer = mixer / size[:, None]
         squared = mixer.T @ jnp.linalg.solve(mixer @ mixer.T, wrench / size)
@@ -187,7 +187,7 @@ def _allocate(thrust: Scalar, torque: Vector, vehicle: Vehicle) -> Input:
 
 
 def starting_state(course: Course, scale: Scale, key: PRNGKeyArray) -> State:
-    """A random state near the start of a course, slightly tilted, drifting and turning."""
+    """Draw a random state near the start of a course, slightly tilted, drifting and turning."""
     draw = jax.random.normal(key, (3, 3))
     level = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), course.heading[0])
     tilted = multiply(level, from_axis_angle(draw[0] / jnp.linalg.norm(draw[0]), jnp.asarray(0.05)))

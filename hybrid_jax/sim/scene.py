@@ -1,6 +1,6 @@
 """The vehicle in MuJoCo and in MJX: iris.xml with the constants of a vehicle."""
 
-# MuJoCo's compiled modules carry no type stubs.
+# MuJoCo's compiled modules have no type stubs.
 # pyright: reportAttributeAccessIssue=false
 
 import contextlib
@@ -22,7 +22,7 @@ from hybrid_jax.vehicle import IRIS, Input, State, Vehicle
 
 
 def build_model(vehicle: Vehicle) -> mujoco.MjModel:
-    """The scene for C MuJoCo: one free body whose controls are the squared rotor speeds [(rad/s)²]."""
+    """Build the scene for C MuJoCo: one free body whose controls are the squared rotor speeds [(rad/s)²]."""
     spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name("iris.xml")))
     spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
     body = spec.body("vehicle")
@@ -43,7 +43,7 @@ def build_model(vehicle: Vehicle) -> mujoco.MjModel:
 
 
 def traced_model(p: Parameters) -> mjx.Model:
-    """The scene for MJX, in the current precision, with the parameters of a vehicle, which may be traced."""
+    """Build the scene for MJX, in the current precision, with the parameters of a vehicle, which may be traced."""
     # Concrete even while tracing, so that MJX sees the model's structure as constants.
     with jax.ensure_compile_time_eval():
         places, spin = ((each * len(p.spin))[: len(p.spin)] for each in (IRIS.rotor_positions, IRIS.spin))
@@ -63,7 +63,7 @@ def traced_model(p: Parameters) -> mjx.Model:
 
 
 def accelerations(p: Parameters, x: State, u: Input, applied: Float[Array, "6"]) -> Float[Array, "6"]:
-    """v̇ and ω̇ for rotor speeds u [rad/s] and an additional force [N] and torque [N m]."""
+    """Return v̇ and ω̇ for rotor speeds u [rad/s] and an additional force [N] and torque [N m]."""
     model = traced_model(p)
     forces = jnp.stack([jnp.zeros_like(applied), applied])
     data = mjx.make_data(model).replace(qpos=x[:7], qvel=x[7:], ctrl=u**2, xfrc_applied=forces)

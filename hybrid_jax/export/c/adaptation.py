@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from hybrid_jax.dynamics.base import in_double
 from hybrid_jax.export.c.files import CFile
 from hybrid_jax.export.program import Size, sizes_of
 from hybrid_jax.runtime import entry
@@ -30,7 +30,7 @@ def export_adaptation_c(
 ) -> tuple[Path, Path]:
     """Write the filter of an `OnlineAdaptation` as C99: NAME.h and NAME.c with NAME_begin and NAME_update.
 
-    The functions do what the methods with these names do. It raises the errors of `export_c`.
+    The functions are equivalent to the methods with these names. Errors are raised as by `export_c`.
 
     Args:
         folder: where the files are written; it is created if it does not exist.
@@ -45,11 +45,11 @@ def export_adaptation_c(
     """
     file, (d, m) = CFile(name, double), sizes_of(adaptation.field, state_size, input_size)
     with jax.enable_x64(True):
-        exact = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, adaptation)
+        exact = in_double(adaptation)
         first = exact.begin(jnp.zeros(d))
         flat, unravel = ravel_pytree(first)
 
-        def in_turn(one: Callable) -> Callable:  # a loop in the place of `jax.vmap` makes the C code small
+        def in_turn(one: Callable) -> Callable:  # a loop instead of `jax.vmap` makes the C code small
             return lambda *stacked: jax.lax.map(lambda row: one(*row), stacked)
 
         def update(state, x, u, periods):

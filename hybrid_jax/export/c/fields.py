@@ -46,7 +46,7 @@ def export_c(
 
     NAME.c has NAME_derivative, NAME_step, NAME_derivative_jacobian and NAME_step_jacobian, and NAME.h describes their
     arguments. They use only the stack, and you can call them from several threads. For a field from `fit_disturbance`
-    there is NAME_observe, too, which returns the state that you carry after each sample.
+    there is also NAME_observe, which returns the state after each sample, for you to pass on.
 
     Args:
         folder: where the files are written; it is created if it does not exist.
@@ -81,11 +81,10 @@ def export_c(
 
         derivative = file.add("derivative", "dx/dt at the state x under the input u.", fused, inputs, ["xdot"])
         file.add("step", STEP, lambda x, u: _step(derivative, x, u, dt), inputs, ["next"])
-        linearize = file.add(
-            "derivative_jacobian", "As derivative, with its Jacobians.", linearized, inputs, ["xdot", *jacobians]
-        )
+        about, slopes = "As derivative, with its Jacobians.", ["xdot", *jacobians]
+        linearize = file.add("derivative_jacobian", about, linearized, inputs, slopes)
 
-        def along(state, u):  # the state, and its derivatives by where the step began and by u
+        def along(state, u):  # the state, and its derivatives by the start of the step and by u
             slope, dx, du = linearize(state[0], u)
             return slope, dx @ state[1], dx @ state[2] + du
 
@@ -94,9 +93,7 @@ def export_c(
 
         file.add("step_jacobian", "As step, with its Jacobians.", step_jacobian, inputs, ["next", *jacobians])
         if isinstance(field, DisturbanceModel):
-            shapes: dict[str, tuple[int, ...]] = dict(
-                zip(OBSERVED, (*inputs.values(), (d - field.hidden,)), strict=True)
-            )
+            shapes = inputs | {OBSERVED[-1]: (d - field.hidden,)}
             likes = [jax.ShapeDtypeStruct(shape, float) for shape in shapes.values()]
             about = OBSERVE.format(d - field.hidden, field.hidden)
             file.add("observe", about, program_of(field, likes, dt, smooth), shapes, ["next"])
@@ -109,7 +106,7 @@ def export_c(
 
 
 def _step(derivative: Callable, start, u, dt: float):
-    """A step of RK4 from a tree of arrays, as a loop over its stages with one call of the derivative."""
+    """Make a step of RK4 from a tree of arrays, as a loop over its stages with one call of the derivative."""
 
     def moved(start, factor, slope):
         return jax.tree.map(lambda a, b: a + factor * b, start, slope)

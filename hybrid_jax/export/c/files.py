@@ -1,4 +1,4 @@
-"""A header and a source of C99 with functions that are translated from JAX: no dependency but math.h, no allocation."""
+"""A header and a source of C99 with functions translated from JAX, which need only math.h and do not allocate."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -48,7 +48,7 @@ class CFile:
     """NAME.h and NAME.c, to which functions of arrays are added one by one."""
 
     def __init__(self, name: str, double: bool):
-        # math.h is the one header that a source includes.
+        # A file math.h would hide the header that the source includes.
         if not isinstance(name, str) or not re.fullmatch("[a-z][a-z0-9_]*", name) or name == "math":
             raise ValueError(f"name must be a lower-case C identifier, got {checks.short_repr(name)}")
         self.name, self.type = name, "double" if double else "float"
