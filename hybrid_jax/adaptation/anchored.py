@@ -83,24 +83,24 @@ def fit_anchored(found: Subspace, noise: Float[Array, ""], error: Float[Array, "
     away, counts = of_blocks - jnp.mean(of_blocks, axis=0), values > 2e-6 * values[-1]
     variance = jnp.sum(jnp.where(counts, jnp.square(away) / values, 0.0)) / jnp.sum(counts)
     variance = jnp.maximum(variance * len(places) / max(len(places) - 1, 1), jnp.maximum(noise, TINY))
-    information, told = values / variance, jnp.sum(along, axis=0) / variance
+    information, pull = values / variance, jnp.sum(along, axis=0) / variance
 
     def evidence(size: Float[Array, " r"]) -> Float[Array, ""]:
         spread = 1 + size * information
-        return 0.5 * jnp.sum(size * jnp.square(told) / spread - jnp.log(spread))
+        return 0.5 * jnp.sum(size * jnp.square(pull) / spread - jnp.log(spread))
 
     penalties = jnp.asarray(PENALTIES, gram.dtype)
     sizes = jnp.broadcast_to(1 / (penalties * information[-1]), (len(values), len(penalties))).T
     apparent = error / values  # each direction could explain the whole error
-    told_of = jax.vmap(evidence)(jnp.concatenate([sizes + apparent, sizes, apparent[None]]))
-    with_both, naive = jnp.split(told_of[:-1], 2)
+    evidences = jax.vmap(evidence)(jnp.concatenate([sizes + apparent, sizes, apparent[None]]))
+    with_both, naive = jnp.split(evidences[:-1], 2)
     best = jnp.argmax(with_both)
     held, share = penalties[best] * values[-1], sizes[best] / (sizes[best] + apparent)
     step = -vectors @ (share * jnp.sum(along, axis=0) / (values + held))
     held = held * jnp.eye(len(basis), dtype=gram.dtype)
     without = left_out_steps(NormalEquations(gram, score, score[:, 0]), held, jnp.zeros_like(step), left_out)
     without = (without @ vectors * share) @ vectors.T
-    odds, naive = jnp.exp(jnp.minimum(jnp.stack([with_both[best] - told_of[-1], jnp.max(naive)]), 80.0))
+    odds, naive = jnp.exp(jnp.minimum(jnp.stack([with_both[best] - evidences[-1], jnp.max(naive)]), 80.0))
     return Anchored(step @ basis, without @ basis, odds, naive)
 
 

@@ -157,9 +157,9 @@ def spread(equations: NormalEquations, free: Bool[Array, " p"], of_source: Float
     """Propagate the covariance of the parameters that are not free to the fitted ones."""
     gram = jnp.sum(equations.gram, axis=0)
     fitted = inverse(jnp.sum(masked(equations, free).gram, axis=0)).matrix * free * free[:, None]
-    told = jnp.isfinite(jnp.diagonal(of_source))
-    effect = jnp.where(free | ~told, 0.0, fitted @ gram)
-    found = effect @ jnp.where(told & told[:, None], of_source, 0.0) @ effect.T
+    known = jnp.isfinite(jnp.diagonal(of_source))
+    effect = jnp.where(free | ~known, 0.0, fitted @ gram)
+    found = effect @ jnp.where(known & known[:, None], of_source, 0.0) @ effect.T
     return found + jnp.diag(jnp.maximum(-jnp.diagonal(found), 0.0))  # rounding
 
 

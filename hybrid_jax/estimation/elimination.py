@@ -123,22 +123,22 @@ def covariance(
     gram = np.asarray(equations.gram)
     meat = gram if meat is None else meat
     own = inverses(jnp.asarray(gram[:, p:, p:]))
-    back, own_told = np.asarray(own.matrix), np.asarray(own.told)
+    back, own_identified = np.asarray(own.matrix), np.asarray(own.identified)
     slope = back @ gram[:, p:, :p]
-    theta, told = np.zeros((p, p)), np.ones(p, bool)
+    theta, identified = np.zeros((p, p)), np.ones(p, bool)
     if p:
         found = inverse(jnp.asarray((gram[:, :p, :p] - gram[:, :p, p:] @ slope).sum(axis=0)))
-        theta, told = np.asarray(found.matrix), np.asarray(found.told)
+        theta, identified = np.asarray(found.matrix), np.asarray(found.identified)
     through = np.concatenate([np.broadcast_to(np.eye(p), (len(gram), p, p)), -slope], axis=1)
     half = theta @ through.swapaxes(1, 2) @ meat  # (n, p, q)
     cov = (half @ through).sum(axis=0) @ theta
-    told = told & (np.diagonal(cov) >= 0)  # few pieces may give a negative variance
-    cov = np.where(told[:, None] & told, cov, 0.0)
+    identified = identified & (np.diagonal(cov) >= 0)  # few pieces may give a negative variance
+    cov = np.where(identified[:, None] & identified, cov, 0.0)
     across = np.einsum("nsp,npt,nts->ns", slope, half[..., p:], back)
     variance = np.einsum("nsp,pq,nsq->ns", slope, cov, slope) - 2 * across
     variance += np.einsum("nst,ntu,nus->ns", back, meat[:, p:, p:], back)
     size = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 0.0))
     total = np.sqrt((size[:, :p] ** 2).sum(axis=0))
-    leak = np.abs(slope[..., ~told]) * size[:, p:, None] / np.where(total > 0, total, 1.0)[~told]
-    lost = ~own_told | (leak > np.sqrt(np.finfo(float).eps)).any(axis=2)
-    return cov + np.diag(np.where(told, 0.0, np.inf)), np.where(lost, np.inf, np.maximum(variance, 0.0))
+    leak = np.abs(slope[..., ~identified]) * size[:, p:, None] / np.where(total > 0, total, 1.0)[~identified]
+    lost = ~own_identified | (leak > np.sqrt(np.finfo(float).eps)).any(axis=2)
+    return cov + np.diag(np.where(identified, 0.0, np.inf)), np.where(lost, np.inf, np.maximum(variance, 0.0))

@@ -78,7 +78,7 @@ class Inverse(NamedTuple):
     """The pseudo-inverse of JᵀJ: zero along directions that change no prediction by more than rounding."""
 
     matrix: Float[Array, "*n p p"]
-    told: Bool[Array, "*n p"]  # the identifiable parameters, which do not contribute to such a direction
+    identified: Bool[Array, "*n p"]  # the identifiable parameters, which do not contribute to such a direction
     rank: Int[Array, "*n"]  # number of the other directions
 
 

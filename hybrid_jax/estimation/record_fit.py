@@ -226,7 +226,7 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
     found = inverse(jnp.sum(sums[0].gram, axis=0))
     step = found.matrix @ jnp.sum(sums[1].score - sums[0].score, axis=0)
     error = jnp.sqrt(jnp.diagonal(found.matrix))
-    return float(jnp.max(jnp.where(found.told, jnp.abs(step) / jnp.where(error > 0, error, 1), 0.0)))
+    return float(jnp.max(jnp.where(found.identified, jnp.abs(step) / jnp.where(error > 0, error, 1), 0.0)))
 
 
 def _covariance(search: record_search.Search, end: End, errors):

@@ -30,7 +30,7 @@ from hybrid_jax.trajectories import Trajectories
 
 # Times machine epsilon. Rounding errors of many windows cancel, so this is less than for a step: the yaw of a small
 # quadrotor, for example, distinguishes its rotors by 100 times the rounding.
-TOLD = 8
+EPSILONS = 8
 
 
 class Interval(NamedTuple):
@@ -99,13 +99,13 @@ def covariance_of(
 @jit_by_size(UNOPTIMISED)
 def _covariance(equations: NormalEquations, p: Int[Array, ""] | int, cluster: int, n: Int[Array, ""] | int):
     gram, score, _ = equations
-    bread = inverse(jnp.sum(gram, axis=0), TOLD)
-    told = bread.told
+    bread = inverse(jnp.sum(gram, axis=0), EPSILONS)
+    identified = bread.identified
     if cluster > 1:
         clusters, of = -(-len(score) // cluster), np.arange(len(score)) // cluster
         gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
-        without = inverses(jnp.sum(gram, axis=0) - gram, TOLD)
-        told = told & without.told.all(axis=0)
+        without = inverses(jnp.sum(gram, axis=0) - gram, EPSILONS)
+        identified = identified & without.identified.all(axis=0)
         # Changes of θ_p without each cluster.
         moves = jnp.einsum("gpq,gq->gp", without.matrix, score - jnp.mean(score, axis=0))
         moves = moves - jnp.mean(moves, axis=0)
@@ -113,7 +113,7 @@ def _covariance(equations: NormalEquations, p: Int[Array, ""] | int, cluster: in
     else:
         half = score @ bread.matrix  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
         found = n / jnp.maximum(n - p, 1) * half.T @ half
-    return found + jnp.diag(jnp.where(told, 0.0, jnp.inf))
+    return found + jnp.diag(jnp.where(identified, 0.0, jnp.inf))
 
 
 def sandwich(equations: NormalEquations, fitted: int, cluster: int = 1) -> Float[Array, "p p"]:

@@ -25,16 +25,16 @@ def changes(
         before, restored = ravel_parameters(field)
         difference = np.asarray(ravel_parameters(found.field)[0]) - np.asarray(before)
         both = np.asarray(covariance) + np.asarray(found.covariance)
-        told = np.flatnonzero(np.isfinite(np.diagonal(both)))
-        weight = np.linalg.pinv(both[np.ix_(told, told)])
-        pulls, names = weight @ difference[told], [*named_parameters(field)]
-        shares = pulls**2 / np.diagonal(weight) / max(pulls @ difference[told], 1e-30)
+        identified = np.flatnonzero(np.isfinite(np.diagonal(both)))
+        weight = np.linalg.pinv(both[np.ix_(identified, identified)])
+        pulls, names = weight @ difference[identified], [*named_parameters(field)]
+        shares = pulls**2 / np.diagonal(weight) / max(pulls @ difference[identified], 1e-30)
         changed = {}
         for place in np.argsort(-shares):
             shift, half = pulls[place] / weight[place, place], REACH / weight[place, place] ** 0.5
             shifts = (0.0, shift, shift - half, shift + half)
-            moves = [np.eye(len(before))[told[place]] * each for each in shifts]
-            old, *new = (float(named_parameters(restored(before + move))[names[told[place]]]) for move in moves)
+            moves = [np.eye(len(before))[identified[place]] * each for each in shifts]
+            old, *new = (float(named_parameters(restored(before + move))[names[identified[place]]]) for move in moves)
             if shares[place] > LEAST and abs(shift) > SURE * half and abs(new[0] - old) > ALIKE * abs(old):
-                changed[names[told[place]]] = (float(shares[place]), *new)
+                changed[names[identified[place]]] = (float(shares[place]), *new)
     return changed

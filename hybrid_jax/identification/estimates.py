@@ -229,11 +229,11 @@ def _terms(found: Estimate, places: np.ndarray) -> str:
 
 
 def _actuator(found: Estimate, mass: float, thrust: float) -> str:
-    curve, told = [0.0, 0.0, thrust], "hover only, assuming that thrust is proportional to the squared command"
+    curve, origin = [0.0, 0.0, thrust], "hover only, assuming that thrust is proportional to the squared command"
     if found.curve is not None:
-        curve, told = mass * found.curve, "the accelerometer"
+        curve, origin = mass * found.curve, "the accelerometer"
     lines = [
-        f'gives = "thrust"  # of a rotor [N], of the command from 0 to 1; from {told}',
+        f'gives = "thrust"  # of a rotor [N], of the command from 0 to 1; from {origin}',
         f"curve = [{', '.join(f'{each:.5g}' for each in curve)}]",
     ]
     if found.placed and found.lag:
@@ -257,5 +257,5 @@ def _turning(found: Estimate, thrust: float, places: np.ndarray):
     ix, iy = found.inertia(thrust, places)
     sure = "" if found.correlations[2] > 0.3 else "; PLACEHOLDER: yaw hardly moves, check it"
     torque = (ix + iy) * float(np.abs(found.effect[2]).mean()) / thrust
-    told = f"{why}; Iz = Ix + Iy, as for a flat body", f"with that Iz{sure}"
-    return (ix, iy, ix + iy), torque, found.spin(), (*told, f"sign of each rotor's reaction torque about z, up{sure}")
+    known = f"{why}; Iz = Ix + Iy, as for a flat body", f"with that Iz{sure}"
+    return (ix, iy, ix + iy), torque, found.spin(), (*known, f"sign of each rotor's reaction torque about z, up{sure}")

@@ -140,8 +140,8 @@ def _search(
     for name in (each.name for each in recordings if volts and "voltage" not in each.signals):
         mend = "leave nominal_voltage and voltage_exponent out of [actuator], or leave this log out"
         raise ValueError(f"{name}: has no battery voltage, which the actuator depends on; {mend}")
-    told = "command" if commanded else "rotor_speed"
-    windows, axes, root = cut(recordings, layout, told, measured, most, volts)
+    motor = "command" if commanded else "rotor_speed"
+    windows, axes, root = cut(recordings, layout, motor, measured, most, volts)
     model = in_double(Multirotor(with_hidden(physics, RandomWalk(PUSHED)), axes, layout.ahead))
     scale = {}
     for name, there in windows.segments.there.items():  # the spread of each channel in time

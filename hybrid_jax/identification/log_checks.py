@@ -99,8 +99,8 @@ def unlearned_drag(logs: Sequence[Recording]) -> str:
     if share > -DRAGGED:
         return ""
     slope = force @ velocity / (velocity @ velocity)
-    told = f"specific force across the thrust is {slope:.2g} v (correlation {share:.2f})"
-    return f"{told}: drag, which is not learned, so lag and inertia absorb it: learn drag as well"
+    found = f"specific force across the thrust is {slope:.2g} v (correlation {share:.2f})"
+    return f"{found}: drag, which is not learned, so lag and inertia absorb it: learn drag as well"
 
 
 def _across(log: Recording) -> tuple[np.ndarray, np.ndarray] | None:

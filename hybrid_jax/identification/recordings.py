@@ -68,31 +68,31 @@ class Windows(NamedTuple):
 
 
 def cut(
-    recordings: Sequence[Recording], layout: Layout, told: str, measured: Sequence[str], most: int, volts: bool = False
+    recordings: Sequence[Recording], layout: Layout, motor: str, measured: Sequence[str], most: int, volts: bool = False
 ) -> tuple[Windows, dict[str, tuple[int, ...]], Float[np.ndarray, "m k"]]:
     """Return windows in flight without gaps, the compared axes, and the root of `slow_commands`.
 
-    `told` is the input, "command" or "rotor_speed", whose last channel may be `volts`. ValueError if a recording lacks
+    `motor` is the input, "command" or "rotor_speed", whose last channel may be `volts`. ValueError if a recording lacks
     a quantity or no window is left.
     """
-    found = [name for name in MEASURED if name != told and all(name in each.signals for each in recordings)]
+    found = [name for name in MEASURED if name != motor and all(name in each.signals for each in recordings)]
     names = tuple(measured) or tuple(found)
-    for each, name in ((each, name) for each in recordings for name in (told, *names) if name not in each.signals):
+    for each, name in ((each, name) for each in recordings for name in (motor, *names) if name not in each.signals):
         raise ValueError(f"{each.name}: has no {name}, needed to identify; it has {', '.join(each.signals)}")
-    starts = [_starts(each, layout, told, names) for each in recordings]
+    starts = [_starts(each, layout, motor, names) for each in recordings]
     counts = [len(each) for each in starts]
     if not sum(counts):
-        span, needed = layout.dt * layout.steps, ", ".join((told, *names))
+        span, needed = layout.dt * layout.steps, ", ".join((motor, *names))
         past = f"after {max(layout.span, WARM):.3g} s of the past"
         raise ValueError(f"{recordings[0].name}: no {span:.3g} s in flight without a gap in {needed}, {past}")
     kept = np.unique(np.linspace(0, sum(counts) - 1, most).round().astype(int))
-    signals = [each.signals[told] for each in recordings]
+    signals = [each.signals[motor] for each in recordings]
     root = slow_commands.root(signals)
     most, parts, first = max(slow_commands.count(each, layout.dt * layout.steps) for each in signals), [], 0
     for each, own in zip(recordings, starts, strict=True):
         own, first = own[kept[(kept >= first) & (kept < first + len(own))] - first], first + len(own)
         if len(own):
-            parts.append(_windows(each, layout, told, names, own, most, volts))
+            parts.append(_windows(each, layout, motor, names, own, most, volts))
     axes = {name: _columns_of(name, recordings) for name in names}
     return jax.tree.map(lambda *each: np.concatenate(each), *parts), axes, np.pad(root, ((0, volts), (0, 0)))
 
@@ -106,20 +106,20 @@ def _columns_of(name: str, recordings: Sequence[Recording]) -> tuple[int, ...]:
     return tuple(map(known.index, axes))
 
 
-def _starts(recording: Recording, layout: Layout, told: str, names) -> Float[np.ndarray, " n"]:
+def _starts(recording: Recording, layout: Layout, motor: str, names) -> Float[np.ndarray, " n"]:
     """Return the start times of consecutive windows [s] that are in flight, together with their past."""
     signals, length, before = recording.signals, layout.dt * layout.steps, max(layout.span, WARM)
-    first, last = (limit(signals[name].t[end] for name in (told, *names)) for limit, end in ((max, 0), (min, -1)))
+    first, last = (limit(signals[name].t[end] for name in (motor, *names)) for limit, end in ((max, 0), (min, -1)))
     starts = np.arange(first + before, last - length, length)
-    begin, end, flown = starts - before, starts + length, airborne(recording, told)
+    begin, end, flown = starts - before, starts + length, airborne(recording, motor)
     clear = np.any([(begin >= off) & (end <= landed) for off, landed in flown] or [np.zeros(len(begin))], axis=0)
-    for left, right in (gap for name in (told, *names) for gap in signals[name].gaps()):
+    for left, right in (gap for name in (motor, *names) for gap in signals[name].gaps()):
         clear &= (end < left) | (begin > right)
     return starts[clear]
 
 
-def _windows(recording: Recording, layout: Layout, told: str, names, starts, most: int, volts: bool) -> Windows:
-    signals, n, command = recording.signals, len(starts), recording.signals[told]
+def _windows(recording: Recording, layout: Layout, motor: str, names, starts, most: int, volts: bool) -> Windows:
+    signals, n, command = recording.signals, len(starts), recording.signals[motor]
     edges = starts[:, None] + layout.dt * np.arange(-layout.ahead, layout.steps + 1)
     area = integral(command, edges.ravel(), "linear" if slow_commands.is_slow(command) else "held")
     u = np.diff(area.reshape(*edges.shape, -1), axis=1) / layout.dt

@@ -173,7 +173,7 @@ class OnlineAdaptation(AbstractEstimator):
         sample, history = classify(x, u, elapsed, state.history, self.dt, self.tuning.gap)
         model = self._filter_model(sample, each)
         d, variances, tuning, periods = len(x), model.variances, self.tuning, self.dt / self.tuning.pace
-        belief, told, slope, correction = self._filtered(state, model, sample)
+        belief, excited, slope, correction = self._filtered(state, model, sample)
         part = np.where(self._varies(), PART, EAGER)
         test, opened = state.test.after(correction, sample, periods, tuning, PAUSE, part)
         opens = jnp.max(opened) > 0
@@ -192,7 +192,7 @@ class OnlineAdaptation(AbstractEstimator):
             x=belief.z[:d],
             theta=belief.z[d:],
             root=belief.root,
-            excitation=told,
+            excitation=excited,
             test=test,
             mixture=verdict.mixture,
             opened=opened,
@@ -269,7 +269,7 @@ class OnlineAdaptation(AbstractEstimator):
         self, state: OnlineState, model: FilterModel, sample: Sample
     ) -> tuple[Belief, Excitation, Array, Correction]:
         """Update the filter of all parameters along excited directions; also return the Jacobian of the next x."""
-        d, tuning, ones, told = len(state.x), self.tuning, jnp.ones_like(state.theta), state.excitation
+        d, tuning, ones, excited = len(state.x), self.tuning, jnp.ones_like(state.theta), state.excitation
         walk, periods = tuning.drift * jnp.exp(state.haste), self.dt / tuning.pace
         diffusion = periods * sample.elapsed * jnp.square(walk)
         diffusion = diffusion + state.opened * jnp.maximum(1 - jnp.sum(jnp.square(state.root[d:]), axis=1), 0.0)
@@ -277,7 +277,7 @@ class OnlineAdaptation(AbstractEstimator):
         # The disturbance absorbs directions that are not estimated. Hypotheses compete by likelihood, so they need all
         # of the uncertainty.
         alone = tuning.excitation and self._varies().any() and not self.hypotheses
-        part = told.estimated(share) if alone else None
+        part = excited.estimated(share) if alone else None
         belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted, part)
         predicted = kalman.reset_state(kalman.limit_covariance(belief, ones), sample, sample.restart, model.variances)
         belief, correction = kalman.correct(predicted, sample, model)
@@ -286,9 +286,9 @@ class OnlineAdaptation(AbstractEstimator):
             begun = jnp.sqrt(jnp.maximum(state.doubt - 1, 0.0) / MEMORY)
             breeze = jnp.maximum(jnp.minimum(begun, tuning.drift * tuning.gusts), BREEZE)
             walk = jnp.maximum(walk, breeze * varies)
-            told = excitation.after_sample(told, slope, correction, sample, walk, share, periods, tuning)
-            belief, correction = excitation.consider(predicted, belief, correction, told, share)
-        return kalman.triangular(belief, d), told, slope, correction
+            excited = excitation.after_sample(excited, slope, correction, sample, walk, share, periods, tuning)
+            belief, correction = excitation.consider(predicted, belief, correction, excited, share)
+        return kalman.triangular(belief, d), excited, slope, correction
 
     def _haste(self, state: OnlineState, sample: Sample, opens: Bool[Array, ""]) -> Float[Array, " p"]:
         """Update the log-scale of the random walk: of disturbances or, without one, of all parameters unless reset."""

@@ -84,10 +84,10 @@ def after_sample(
 
 
 def consider(
-    before: Belief, after: Belief, correction: Correction, told: Excitation, share: Float[Array, " p"]
+    before: Belief, after: Belief, correction: Correction, excited: Excitation, share: Float[Array, " p"]
 ) -> tuple[Belief, Correction]:
     """Correct θ on the condition that it does not move along considered directions; also return its new gains."""
-    d, considered = len(correction.white), told.considered()
+    d, considered = len(correction.white), excited.considered()
     gains, root = correction.gains[:, d:], before.root[d:]
     moves = jnp.eye(len(share), dtype=root.dtype)
     sizes = jnp.sum(jnp.square(root), axis=1)

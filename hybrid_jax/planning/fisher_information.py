@@ -26,8 +26,8 @@ class Information(NamedTuple):
     def covariance(self, free: Bool[Array, " p"]) -> Float[Array, "p p"]:
         """Return the least-squares covariance of the free parameters, infinite if not identifiable; else zero."""
         both = free & free[:, None]
-        bread, told, _ = inverse(jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0))))
-        return bread @ jnp.where(both, self.noise, 0.0) @ bread + jnp.diag(jnp.where(told, 0.0, jnp.inf))
+        bread, identified, _ = inverse(jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0))))
+        return bread @ jnp.where(both, self.noise, 0.0) @ bread + jnp.diag(jnp.where(identified, 0.0, jnp.inf))
 
 
 def information_of(

@@ -40,7 +40,7 @@ from hybrid_jax.vehicle import STATE_SIZE
 SPARE = 0.98  # largest used share of each limit, since limits are checked at samples only
 SHRUNK = 1 - np.arange(64) / 64  # factors on a series; the first that satisfies the limits is used
 PENALTY = 30.0, 3000.0  # on the mean squared excess over a limit, at the first and at the last step
-TOLD_APART = 1e-5  # smallest eigenvalue of the scaled information, ten times its rounding in float32
+DISTINCT = 1e-5  # smallest eigenvalue of the scaled information, ten times its rounding in float32
 RATE = 0.05  # of Adam, in units of the coefficients
 Starts = Float[Array, "s outputs harmonics 2"]
 
@@ -261,7 +261,7 @@ def _excited(search: _Search, begun, wanted: tuple[str, ...]) -> tuple[Bool[Arra
     grams = np.stack([np.where(np.outer(seen, seen), one.gram, np.diag(np.where(seen, 0.0, 1.0))) for one in each])
     sizes = np.sqrt(np.diagonal(grams, axis1=1, axis2=2))
     values, vectors = np.linalg.eigh(grams / (sizes[:, :, None] * sizes[:, None]))
-    if not (values[:, 0] > TOLD_APART).any():
+    if not (values[:, 0] > DISTINCT).any():
         alike = [name for name, share in zip(names, np.abs(vectors[0, :, 0]), strict=True) if share > 0.3]
         raise ValueError(f"parameters: no input distinguishes {' and '.join(alike)}; learn one of them")
     return asked, seen
