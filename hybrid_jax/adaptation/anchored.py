@@ -110,7 +110,7 @@ def with_change(field: AbstractVectorField, change: Float[Array, " w"]) -> Abstr
 
 
 def has_network(field: AbstractVectorField) -> bool:
-    """Whether a field is a hybrid with a trainable residual other than a disturbance."""
+    """Return whether a field is a hybrid with a trainable residual other than a disturbance."""
     learned = isinstance(field, Hybrid) and any(jax.tree.leaves(trainable(field.residual)))
     return learned and physics_of(field) is not field
 

@@ -161,7 +161,7 @@ _run, _fit_ridge = jit_by_size()(run), jit_by_size()(ridge.fit_ridge)
 
 @cache  # the same object for the same weight, so that its program is compiled once
 def held_at_start(weight: float) -> optax.GradientTransformation:
-    """Adam with a penalty weight / 2 · ‖θ − θ₀‖², θ₀ the parameters at the start (L2-SP; Li et al., ICML 2018)."""
+    """Return Adam with the penalty weight / 2 · ‖θ − θ₀‖², θ₀ the initial parameters (L2-SP; Li et al., ICML 2018)."""
 
     def pull(updates, state, params=None):
         return jax.tree.map(lambda g, p, start: g + weight * (p - start), updates, params, state), state

@@ -113,7 +113,7 @@ class Performance(eqx.Module):
     saturation: Scalar
 
 
-class Moment(eqx.Module):
+class LoopState(eqx.Module):
     """The state of a closed loop between two periods."""
 
     x: State  # true
@@ -138,8 +138,8 @@ class Loop(NamedTuple):
     hardware: Hardware
     estimator: Any
 
-    def begin(self, x0: State, plan: Plan, key: PRNGKeyArray) -> Moment:
-        """Return the first moment of a flight: the state x0, with the rotors at the speeds of the plan.
+    def begin(self, x0: State, plan: Plan, key: PRNGKeyArray) -> LoopState:
+        """Return the loop's state at the start of a flight: x0, with the rotors at the speeds of the plan.
 
         Args:
             x0: true state (13,).
@@ -148,11 +148,11 @@ class Loop(NamedTuple):
         key, now = jax.random.split(key)
         seen, speeds = self.hardware.measure(x0, now), self.controller.speeds(plan)[0].astype(x0.dtype)
         sent = jnp.tile(speeds, (self.hardware.delay(self.controller.period), 1))
-        return Moment(x0, seen, speeds, sent, plan, self.estimator.begin(seen), key)
+        return LoopState(x0, seen, speeds, sent, plan, self.estimator.begin(seen), key)
 
     def tick(
-        self, plant: Plant, reference: Float[Array, "n 13"], now: Moment, i: Int[Array, ""]
-    ) -> tuple[Moment, Input]:
+        self, plant: Plant, reference: Float[Array, "n 13"], now: LoopState, i: Int[Array, ""]
+    ) -> tuple[LoopState, Input]:
         """Simulate the i-th period; also return the command [rad/s].
 
         The controller plans from the predicted state at the arrival of the command.
@@ -176,7 +176,7 @@ class Loop(NamedTuple):
         x = plant(now.x, mean, i * period).astype(now.x.dtype)
         key, noise = jax.random.split(now.key)
         seen = self.hardware.measure(x, noise)
-        return Moment(x, seen, speeds, sent[1:], plan, estimator.update(now.estimate, seen, mean), key), u
+        return LoopState(x, seen, speeds, sent[1:], plan, estimator.update(now.estimate, seen, mean), key), u
 
 
 @entry

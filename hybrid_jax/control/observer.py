@@ -15,7 +15,7 @@ from hybrid_jax.vehicle import BODY_RATES, VELOCITY, State
 MOTION = slice(VELOCITY.start, BODY_RATES.stop)
 
 
-class Watched(eqx.Module):
+class ObserverState(eqx.Module):
     """State of an `Observer`."""
 
     disturbance: Float[Array, "*n 6"]  # acceleration [m/s², world] and angular acceleration [rad/s², body]
@@ -40,12 +40,12 @@ class Observer(AbstractEstimator):
     period: float = eqx.field(static=True)
 
     def begin(self, x):
-        return Watched(jnp.zeros_like(x, shape=6), x)
+        return ObserverState(jnp.zeros_like(x, shape=6), x)
 
     def update(self, state, x, u):
         before = RIGID_BODY_SPACE.canonical(state.x, state.x)
         error = (x - advance(self.model(state), before, u, self.period))[MOTION] / self.period
-        return Watched(state.disturbance - jnp.expm1(-self.bandwidth * self.period) * error, x)
+        return ObserverState(state.disturbance - jnp.expm1(-self.bandwidth * self.period) * error, x)
 
     def model(self, state):
         return Hybrid(self.field, ConstantDisturbance(state.disturbance))

@@ -38,7 +38,7 @@ class State(NamedTuple):
     converged: Bool[Array, ""]  # whether the last step was tried, or `SLOW` were slow
 
     @property
-    def goes_on(self) -> Bool[Array, ""]:
+    def running(self) -> Bool[Array, ""]:
         """Whether a point is left to try, regardless of the number of steps."""
         return ~self.converged & (self.damping <= LARGEST) & ((self.steps == 0) | jnp.isfinite(self.cost))
 
@@ -106,7 +106,7 @@ def minimise(
         best = jax.tree.map(partial(jnp.where, accepted), found, state.best)
         return aimed(state._replace(best=best), *aim(best, state.damping))
 
-    return loop(lambda state: state.goes_on & (state.steps < max_steps), step, state)
+    return loop(lambda state: state.running & (state.steps < max_steps), step, state)
 
 
 def corrected(
@@ -129,8 +129,8 @@ def corrected(
     return jax.lax.scan(attempt, (tried, tried, jnp.full((), jnp.inf)), length=2)[0][1:]
 
 
-def in_python(goes_on: Callable[[State], Bool[Array, ""]], step: Callable[[State], State], state: State) -> State:
-    while goes_on(state):
+def in_python(running: Callable[[State], Bool[Array, ""]], step: Callable[[State], State], state: State) -> State:
+    while running(state):
         state = step(state)
     return state
 

@@ -26,7 +26,7 @@ UNLIKELY = 0.5  # share of REJECT above which errors count as alarms, and as a b
 SETTLED = 0.5  # count of alarms below which an estimate is kept
 
 
-def believed(
+def update(
     state: OnlineState,
     verdict: Verdict,
     faults: tuple[RotorOrder | SensorSigns | None, ...],
@@ -39,32 +39,32 @@ def believed(
     at_bound = sample.measured & (jnp.max(jnp.abs(verdict.theta)) >= NEAR * BOUND)
     alarm, unlikely = jnp.where(verdict.changed, 1.0, 0.0), nis > UNLIKELY * REJECT
     added = alarm + jnp.where(at_bound | unlikely, PERSISTENT * periods, 0.0)
-    counted = state.doubt * jnp.exp(-periods * sample.elapsed / TRIAL) + added
+    counted = state.alarms * jnp.exp(-periods * sample.elapsed / TRIAL) + added
     # Once it is too large, it is doubled, so that it takes time to fall.
-    begins = (counted >= ALARMS) & (state.doubt < ALARMS)
+    begins = (counted >= ALARMS) & (state.alarms < ALARMS)
     for fault in filter(None, faults):
         begins = begins | fault.found
-    doubt = jnp.where(begins, 2 * ALARMS, jnp.minimum(counted, 2 * ALARMS))
+    alarms = jnp.where(begins, 2 * ALARMS, jnp.minimum(counted, 2 * ALARMS))
     # Hypotheses compare the estimates from before and after an alarm; a single filter cannot.
     moves = jnp.where(unlikely, PERSISTENT * periods, 0.0) + (alarm if state.mixture is None else 0.0)
     burst = state.burst * jnp.exp(-periods * sample.elapsed) + moves
-    good = (nis < REJECT) & (doubt < ALARMS) & (burst < BURST)
+    good = (nis < REJECT) & (alarms < ALARMS) & (burst < BURST)
     trusted = jnp.where(good, verdict.theta, state.settled)
     # `settled` is a mean, since the last value may belong to a gust or to a fault before its first alarm.
-    kept = doubt < SETTLED
+    kept = alarms < SETTLED
     for fault in filter(None, faults):
         # During a possible exchange or wrong sign, θ may be wrong.
         kept = kept & ~fault.possible
     rate = jnp.where(kept, -jnp.expm1(-periods / TRIAL), 0.0)
     settled = state.settled + rate * (trusted - state.settled)
-    return {"nis": nis, "doubt": doubt, "burst": burst, "trusted": trusted, "settled": settled}
+    return {"nis": nis, "alarms": alarms, "burst": burst, "trusted": trusted, "settled": settled}
 
 
-def sound(new: OnlineState, begun: OnlineState, old: OnlineState, variances: Float[Array, " d"]) -> OnlineState:
+def restarted(new: OnlineState, fresh: OnlineState, old: OnlineState, variances: Float[Array, " d"]) -> OnlineState:
     """Return the new state, or restart at the last good θ and the prior covariance if a number is not finite."""
     root = kalman.diagonal_root(variances, jnp.ones_like(old.theta))
-    kept = old.trusted, old.trusted, old.settled, root, old.doubt, old.changes, old.restarts + 1
-    again = eqx.tree_at(lambda s: (s.theta, s.trusted, s.settled, s.root, s.doubt, s.changes, s.restarts), begun, kept)
+    kept = old.trusted, old.trusted, old.settled, root, old.alarms, old.changes, old.restarts + 1
+    again = eqx.tree_at(lambda s: (s.theta, s.trusted, s.settled, s.root, s.alarms, s.changes, s.restarts), fresh, kept)
     parts = [new.root, new.x, new.theta, new.nis, new.excitation.sensitivity, new.excitation.root]
     if (mixture := again.mixture) is not None and new.mixture is not None:
         # The filter of all parameters is now used.

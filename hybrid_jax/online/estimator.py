@@ -39,7 +39,7 @@ from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, fl
 from hybrid_jax.online.tuning import BREEZE, HOLD, MEMORY, PAUSE, TAKEN, Tuning
 from hybrid_jax.runtime import entry
 
-RISE, FALL = 10.0, 0.2  # rates of `OnlineState.haste` [1/s]
+RISE, FALL = 10.0, 0.2  # rates of `OnlineState.log_walk` [1/s]
 
 
 class OnlineAdaptation(AbstractEstimator):
@@ -135,10 +135,10 @@ class OnlineAdaptation(AbstractEstimator):
             mixture=mixture,
             trusted=theta,
             settled=theta,
-            doubt=zero,
+            alarms=zero,
             burst=zero,
-            opened=theta,
-            haste=theta,
+            reset=theta,
+            log_walk=theta,
             nis=zero + 1,
             signs=SensorSigns.begin(state_space(self.field, len(x)), x),
             order=RotorOrder.begin(vehicle.rotors if (vehicle := vehicle_in(self.field)) else 0, len(x) + p, x.dtype),
@@ -175,19 +175,19 @@ class OnlineAdaptation(AbstractEstimator):
         d, variances, tuning, periods = len(x), model.variances, self.tuning, self.dt / self.tuning.pace
         belief, excited, slope, correction = self._filtered(state, model, sample)
         part = np.where(self._varies(), PART, EAGER)
-        test, opened = state.test.after(correction, sample, periods, tuning, PAUSE, part)
-        opens = jnp.max(opened) > 0
-        verdict = Verdict(None, belief.z[d:], jnp.square(correction.white), opens, opens)
+        test, reset = state.test.after(correction, sample, periods, tuning, PAUSE, part)
+        alarmed = jnp.max(reset) > 0
+        verdict = Verdict(None, belief.z[d:], jnp.square(correction.white), alarmed, alarmed)
         if state.mixture is not None:
             verdict = multiple_model.update(state.mixture, self._models(), model, sample, belief, correction)
             unexplained = verdict.unexplained & (test.quiet > HOLD)
-            test, opens = test.reset(unexplained, 0.0), opens | unexplained
-            opened = jnp.where(unexplained, 1.0, opened)
+            test, alarmed = test.reset(unexplained, 0.0), alarmed | unexplained
+            reset = jnp.where(unexplained, 1.0, reset)
         if (order := state.order) is not None:
-            order = order.after(state.joint, self._rates, slope, belief, correction, sample, opens, model)
+            order = order.after(state.joint, self._rates, slope, belief, correction, sample, alarmed, model)
         signs = state.signs if state.signs is None else state.signs.after(slope, belief, sample, model)
         # After a change the state is reset too, since it has followed the wrong model.
-        belief = kalman.reset_state(belief, sample, opens, variances)
+        belief = kalman.reset_state(belief, sample, alarmed, variances)
         new = OnlineState(
             x=belief.z[:d],
             theta=belief.z[d:],
@@ -195,17 +195,17 @@ class OnlineAdaptation(AbstractEstimator):
             excitation=excited,
             test=test,
             mixture=verdict.mixture,
-            opened=opened,
-            haste=self._haste(state, sample, opens),
+            reset=reset,
+            log_walk=self._log_walk(state, sample, alarmed),
             order=order,
             signs=signs,
             history=history,
             changes=state.changes + jnp.where(verdict.changed, 1.0, 0.0),
             restarts=state.restarts,
-            **consistency.believed(state, verdict, (order, signs), sample, periods),
+            **consistency.update(state, verdict, (order, signs), sample, periods),
         )
-        begun = self.begin(jnp.where(jnp.abs(history.last) < HUGE, history.last, 0.0))
-        return consistency.sound(new, begun, state, variances)
+        fresh = self.begin(jnp.where(jnp.abs(history.last) < HUGE, history.last, 0.0))
+        return consistency.restarted(new, fresh, state, variances)
 
     @entry
     def estimate(self, state: OnlineState) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
@@ -270,9 +270,9 @@ class OnlineAdaptation(AbstractEstimator):
     ) -> tuple[Belief, Excitation, Array, Correction]:
         """Update the filter of all parameters along excited directions; also return the Jacobian of the next x."""
         d, tuning, ones, excited = len(state.x), self.tuning, jnp.ones_like(state.theta), state.excitation
-        walk, periods = tuning.drift * jnp.exp(state.haste), self.dt / tuning.pace
+        walk, periods = tuning.drift * jnp.exp(state.log_walk), self.dt / tuning.pace
         diffusion = periods * sample.elapsed * jnp.square(walk)
-        diffusion = diffusion + state.opened * jnp.maximum(1 - jnp.sum(jnp.square(state.root[d:]), axis=1), 0.0)
+        diffusion = diffusion + state.reset * jnp.maximum(1 - jnp.sum(jnp.square(state.root[d:]), axis=1), 0.0)
         varies, share = (jnp.asarray(np.where(self._varies(), *each), ones.dtype) for each in ((1, 0), (TAKEN, 1)))
         # The disturbance absorbs directions that are not estimated. Hypotheses compete by likelihood, so they need all
         # of the uncertainty.
@@ -283,18 +283,18 @@ class OnlineAdaptation(AbstractEstimator):
         belief, correction = kalman.correct(predicted, sample, model)
         if tuning.excitation:
             # Each alarm after the first in 10 s counts as a step of a random walk by the prior, as in a beginning gust.
-            begun = jnp.sqrt(jnp.maximum(state.doubt - 1, 0.0) / MEMORY)
-            breeze = jnp.maximum(jnp.minimum(begun, tuning.drift * tuning.gusts), BREEZE)
+            steps = jnp.sqrt(jnp.maximum(state.alarms - 1, 0.0) / MEMORY)
+            breeze = jnp.maximum(jnp.minimum(steps, tuning.drift * tuning.gusts), BREEZE)
             walk = jnp.maximum(walk, breeze * varies)
             excited = excitation.after_sample(excited, slope, correction, sample, walk, share, periods, tuning)
             belief, correction = excitation.consider(predicted, belief, correction, excited, share)
         return kalman.triangular(belief, d), excited, slope, correction
 
-    def _haste(self, state: OnlineState, sample: Sample, opens: Bool[Array, ""]) -> Float[Array, " p"]:
+    def _log_walk(self, state: OnlineState, sample: Sample, alarmed: Bool[Array, ""]) -> Float[Array, " p"]:
         """Update the log-scale of the random walk: of disturbances or, without one, of all parameters unless reset."""
         varies, tuning = self._varies(), self.tuning
         pulled = state.test.pulled / EAGER - 1
         rise = jnp.where(pulled > 0, RISE * jnp.minimum(pulled, 4.0), -FALL)
         rise = self.dt / tuning.pace * jnp.where(sample.measured, rise, 0.0)
-        haste = jnp.clip(state.haste + rise + jnp.where(opens & (pulled > 0), 1.0, 0.0), 0.0, math.log(tuning.gusts))
-        return jnp.asarray(varies, haste.dtype) * haste if varies.any() else jnp.where(opens, 0.0, haste)
+        walk = jnp.clip(state.log_walk + rise + jnp.where(alarmed & (pulled > 0), 1.0, 0.0), 0, math.log(tuning.gusts))
+        return jnp.asarray(varies, walk.dtype) * walk if varies.any() else jnp.where(alarmed, 0.0, walk)

@@ -42,7 +42,7 @@ class FilterModel(NamedTuple):
     tuning: Tuning
     each: Each
 
-    def tidy(self, belief: Belief) -> Belief:
+    def project(self, belief: Belief) -> Belief:
         """Normalise the quaternion and clip a to its bounds."""
         z, d = belief.z, len(self.variances)
         return Belief(jnp.concatenate([self.unit(z[:d]), jnp.clip(z[d:], -BOUND, BOUND)]), belief.root)
@@ -143,7 +143,7 @@ def correct(belief: Belief, sample: Sample, model: FilterModel) -> tuple[Belief,
         gains.append(gain)
     errors, white, sizes, gains = map(jnp.stack, (errors, white, sizes, gains))
     correction = Correction(errors, white, sizes, gains, likelihood)
-    return model.tidy(Belief(z, root)), correction
+    return model.project(Belief(z, root)), correction
 
 
 def limit_covariance(belief: Belief, prior: Float[Array, " k"]) -> Belief:

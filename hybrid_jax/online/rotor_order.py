@@ -63,7 +63,7 @@ class RotorOrder(eqx.Module):
         after: Belief,
         correction: Correction,
         sample: Sample,
-        opens: Bool[Array, ""],
+        alarmed: Bool[Array, ""],
         model: FilterModel,
     ) -> "RotorOrder":
         """Update after a sample, given the first filter's belief before and after it and the Jacobian of the next x."""
@@ -83,8 +83,8 @@ class RotorOrder(eqx.Module):
             away = away + added[:, None] * correction.gains[i, None]
         theta = after.z[None, d:]
         bounded = jnp.clip(theta + away[:, d:], -BOUND, BOUND) - theta
-        away = jnp.concatenate([jnp.where(opens, 0.0, away[:, :d]), bounded], axis=1)
+        away = jnp.concatenate([jnp.where(alarmed, 0.0, away[:, :d]), bounded], axis=1)
         evidence = self.evidence + jnp.clip(ratio, -most, most)
-        goes_on = evidence > -REJECT  # false if it is NaN
-        evidence = jnp.where(goes_on, jnp.minimum(evidence, 2 * ACCEPT), -CLEAR)
-        return RotorOrder(jnp.where(goes_on[:, None], away, 0.0), evidence, self.orders)
+        kept = evidence > -REJECT  # false if it is NaN
+        evidence = jnp.where(kept, jnp.minimum(evidence, 2 * ACCEPT), -CLEAR)
+        return RotorOrder(jnp.where(kept[:, None], away, 0.0), evidence, self.orders)

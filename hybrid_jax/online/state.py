@@ -38,10 +38,10 @@ class OnlineState(eqx.Module):
         mixture: the filters of the hypotheses and their weights; None without hypotheses.
         trusted: the last consistent θ, which the model uses.
         settled: their mean over the last 10 s without alarms, restored if alarms or unlikely errors persist.
-        doubt: number of alarms in the last 10 s.
+        alarms: number of alarms in the last 10 s.
         burst: number of unlikely errors in the last second and, without hypotheses, of alarms.
-        opened: 1 for each parameter whose variance rises to its prior before the next sample, after an alarm; else 0.
-        haste: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.
+        reset: 1 for each parameter whose variance rises to its prior before the next sample, after an alarm; else 0.
+        log_walk: logarithm of the factor on `Tuning.drift` for each parameter, for example for a disturbance in gusts.
         nis: mean normalised innovation squared, 1 if noise and model are correct.
         order: how likely an exchange of two rotors is; None without rotors.
         signs: how likely a wrong sign of a disturbed state is; None if unknown which states are disturbed.
@@ -58,10 +58,10 @@ class OnlineState(eqx.Module):
     mixture: Mixture | None
     trusted: Float[Array, "*n p"]
     settled: Float[Array, "*n p"]
-    doubt: Float[Array, "*n"]
+    alarms: Float[Array, "*n"]
     burst: Float[Array, "*n"]
-    opened: Float[Array, "*n p"]
-    haste: Float[Array, "*n p"]
+    reset: Float[Array, "*n p"]
+    log_walk: Float[Array, "*n p"]
     nis: Float[Array, "*n"]
     order: RotorOrder | None
     signs: SensorSigns | None
@@ -115,7 +115,7 @@ def flags_of(state: OnlineState, tuning: Tuning) -> Flags:
         frozen=state.history.equal >= FROZEN,
         gap=state.history.silent > tuning.gap,
         changed=test.quiet < 1,
-        inconsistent=(state.nis >= REJECT) | (state.doubt >= ALARMS) | (state.burst >= BURST),
+        inconsistent=(state.nis >= REJECT) | (state.alarms >= ALARMS) | (state.burst >= BURST),
         exchanged=jnp.zeros((*state.nis.shape, 0), bool) if state.order is None else state.order.exchanged,
         reversed=jnp.zeros(state.x.shape, bool) if state.signs is None else state.signs.reversed,
         unexcited=jnp.diagonal(considered, axis1=-2, axis2=-1) > TAKES_PART,

@@ -50,7 +50,7 @@ def hovering(adaptation, noise, key, steps, change=0.0, sensor=1.0, turned=1.0, 
         return (v, y, gust, state), (state, errors)
 
     zero = jnp.zeros(())
-    begun = eqx.tree_at(lambda state: state.doubt, adaptation.begin(zero[None]), jnp.asarray(alarms))
+    begun = eqx.tree_at(lambda state: state.alarms, adaptation.begin(zero[None]), jnp.asarray(alarms))
     given = jnp.arange(steps), jax.random.normal(key, (steps, 2))
     return jax.lax.scan(step, (zero, zero, zero, begun), given)[1]
 
