@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 def in_chunks(function: Callable[[Any], Any], values: Any, size: int, distinct: Any = None) -> Any:
     """Evaluate `function` on n stacked values, `size` at a time, so that memory does not grow with n.
 
-    If the values repeat the first `distinct` of them in order, only these are evaluated. This number may be traced.
+    If the values repeat the first `distinct` of them in order, only these are evaluated. The number may be traced.
     """
     n = len(jax.tree.leaves(values)[0])
     size = -(-n // -(-n // size))  # at most `size`, with few left over

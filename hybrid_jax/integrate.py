@@ -149,14 +149,14 @@ def rollout(
 ) -> Float[Array, "t d"]:
     """Integrate a field in inference mode: x[i] is the state (i + 1) dt after x0, and u[i] the input before it.
 
-    A trajectory continues as infinity or NaN if it diverges, or if an implicit solver finds no step; `Model.predict`
-    raises an error instead. If there are more than a thousand intervals, attitudes are normalised after each.
+    A trajectory continues as infinity or NaN if it diverges, or if an implicit solver finds no step. If you want an
+    error instead, you should use `Model.predict`. For more than 1000 intervals, attitudes are normalised after each.
 
     Args:
         field: ẋ = f(x, u), a vector field or any function of a state (d,) and an input (m,).
         x0: the initial state (d,).
         dt: length of an interval [s].
-        solver: a one-step ODE solver of diffrax; by default `RK4`, for example `RK4(substeps=4)`.
+        solver: a one-step ODE solver of diffrax; by default `RK4`. For a long dt, it should be `RK4(substeps=4)` or so.
 
     Raises:
         ValueError: an argument has the wrong shape or type, or is not finite; dt is not positive; the solver is

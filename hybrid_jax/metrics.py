@@ -56,7 +56,7 @@ def rollout_mse(
         field: ẋ = f(x, u), evaluated in inference mode.
         windows: the windows, each predicted from its initial state.
         every: number of intervals from one compared state to the next.
-        solver: a one-step method of diffrax; by default `RK4`.
+        solver: a one-step method of diffrax; by default `RK4`. It should be the one used in training.
 
     Raises:
         ValueError: if windows are malformed or do not match the field, or `every` is beyond their horizon.

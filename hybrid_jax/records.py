@@ -20,7 +20,7 @@ class Signal:
 
     Attributes:
         t: time of each sample [s], strictly increasing, from the start of the record.
-        values: the samples (n, k) in SI units, with a column for each axis.
+        values: the samples (n, k), with a column for each axis. They should be in SI units.
         axes: the names of the measured axes; by default "0", "1", …
         source: the topic, group or columns that it came from, for messages.
 
@@ -68,7 +68,7 @@ class Record:
 
     Attributes:
         name: what messages call the experiment, usually its file.
-        signals: the signals, by name. A signal that was not measured is absent.
+        signals: the signals, by name. You should leave out signals that were not measured.
         notes: what a reader omitted or had to assume, one sentence each.
         facts: metadata of the log, for example {"airframe": "4001"}.
     """

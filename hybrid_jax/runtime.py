@@ -52,12 +52,12 @@ _sizes: dict[str, set[Hashable]] = {}  # sizes of data of each function, since p
 
 
 def configure(folder: Path | None = None) -> None:
-    """Configure JAX. Call this before you create the first array; afterwards devices and XLA options cannot change.
+    """Configure JAX. You should call this before you create the first array: later, devices and XLA options are fixed.
 
     Args:
         folder: folder for compiled programs, by default `programs` in the user's cache folder for hybrid_jax.
-            JAX_COMPILATION_CACHE_DIR takes precedence. Whoever can write into a folder that you name can run code as
-            you. Old programs are deleted only in the default folder.
+            JAX_COMPILATION_CACHE_DIR takes precedence. Others should not be able to write to a folder that you name,
+            because they could run code as you. Old programs are deleted only in the default folder.
 
     Warns if JAX has already started: its devices and XLA options stay as they are, and the rest is set.
 

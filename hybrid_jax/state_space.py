@@ -16,7 +16,7 @@ Change = Float[Array, " e"]  # of a state or a quantity, in the tangent space
 
 @dataclass(frozen=True)
 class Quantity:
-    """Numbers of a state that form one vector. You can write a subclass for a manifold of your own.
+    """Numbers of a state that form one vector. For a manifold of your own, you should write a subclass.
 
     Attributes:
         name: its name, for example "velocity".

@@ -31,7 +31,7 @@ class Trajectories(eqx.Module):
         x0: the initial state of each window (n, d). You should use SI units, and not scale it.
         u: the input (n, t, m), constant during each interval.
         x: state at the end of each interval (n, t, d): x[:, i] is (i + 1) dt after x0. For `fit`, `adapt` and least
-            squares, NaN means not measured.
+            squares, it should be NaN where nothing was measured.
         dt: length of an interval [s].
     """
 
@@ -145,14 +145,14 @@ def windows_of(
 ) -> Trajectories:
     """Cut one trajectory, states[i] → states[i + 1] under inputs[i], into windows of `steps` intervals.
 
-    Numbers that are not finite are accepted, so that you can remove windows with gaps afterwards; see `check`.
+    Numbers that are not finite are accepted. You should remove windows with gaps afterwards.
 
     Args:
         states: the state at the start and after each interval (t + 1, d).
         inputs: the input during each interval (t, m).
         dt: length of an interval [s].
         steps: number of intervals in each window.
-        stride: number of intervals between the starts of two windows; by default `steps`, so that none overlap.
+        stride: number of intervals between the starts of two windows; by default `steps`, so that they do not overlap.
 
     Raises:
         ValueError: if an array has the wrong shape or type, dt is not positive, or the trajectory is too short.

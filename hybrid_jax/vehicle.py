@@ -40,7 +40,7 @@ class Vehicle:
     """The constants of a multirotor. In its body frame x points forward, y left and z up.
 
     Attributes:
-        mass: mass [kg].
+        mass: mass [kg]. It should include the battery and a payload.
         inertia: principal moments (Ix, Iy, Iz) about the centre of mass [kg m²].
         thrust_coefficient: k [N/(rad/s)²]; the thrust of a rotor is k u².
         torque_coefficient: c_m [N m/(rad/s)²]; the reaction torque of a rotor is c_m u².
@@ -125,9 +125,9 @@ def input_names(rotors: int) -> tuple[str, ...]:
 
 
 def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
-    """Read the table `[vehicle]` of a TOML file. Its keys are the attributes of `Vehicle`.
+    """Read the table `[vehicle]` of a TOML file. Its keys should be the attributes of `Vehicle`.
 
-    Use `dynamics.vehicle_file.load_vehicle_model` to read and check the other tables as well.
+    To read and check the other tables, you should use `dynamics.vehicle_file.load_vehicle_model` instead.
 
     Args:
         path: the TOML file.

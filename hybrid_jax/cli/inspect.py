@@ -200,7 +200,7 @@ def _checks(logs: Sequence[Looked]) -> page.Table:
 
     every = dict.fromkeys((check.name for log in logs for check in log.checks), EMPTY)
     lines = [(log.name, *(every | {each.name: shown(each) for each in log.checks}).values()) for log in logs]
-    return page.Table("Checks (?: cannot tell; docs/howto/logs.md explains each)", ("log", *every), lines)
+    return page.Table("Checks (?: unknown; docs/howto/logs.md explains each)", ("log", *every), lines)
 
 
 @mpl.rc_context(page.STYLE)

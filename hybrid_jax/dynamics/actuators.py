@@ -40,7 +40,7 @@ class Actuator:
         gives: whether the curve gives the "speed" of a rotor [rad/s] or its "thrust" [N].
         time_constants: τ_up and τ_down, for speeding up and slowing down [s]; you can give one number for both.
         nominal_voltage: V₀, the battery voltage at which the curve is valid [V]; 0 if the voltage does not matter.
-        voltage_exponent: γ, for example 0 if the vehicle compensates for its voltage.
+        voltage_exponent: γ. It should be 0 if the vehicle compensates for its voltage, and else near 1.
         delay: the time between logging a command and its effect [s], constant over a log.
 
     Raises:

@@ -22,8 +22,8 @@ Columns = Float[Array, "d c"]  # derivatives of d numbers in c directions
 class AbstractVectorField(eqx.Module):
     """A vector field ẋ = f(x, u). Every inexact array inside is learned (see `trainable`).
 
-    Write `__call__` for one sample. The other methods evaluate a batch, features first: x (d, b), u (m, b). Their
-    defaults work for any field; you can override those that you can make faster.
+    You should write `__call__` for one sample. The other methods evaluate a batch, features first: x (d, b), u (m, b).
+    Their defaults work for any field; you can override those that you can make faster.
 
     Attributes:
         accepts_batch: whether `__call__` also accepts x (d, b) and u (m, b), for example if it only reads x[0], x[1], …

@@ -18,7 +18,7 @@ class ConstantDisturbance(AbstractVectorField):
     """A constant ẋ = d: the value at the disturbed states and zero at the others, for all x and u.
 
     Attributes:
-        value: d (k), one number for each disturbed state in its unit per second, or a scalar for every state.
+        value: d (k), one number for each disturbed state in its unit per second; instead, a scalar acts on every state.
         indices: the disturbed states; by default the last k.
         points: number of consecutive states that share each number, for a grid.
     """

@@ -28,7 +28,7 @@ class Grid:
     return arrays of shape (components, *shape, *b), as `fields` does.
 
     Attributes:
-        shape: points along each axis of space, at least three.
+        shape: points along each axis of space, which should be at least three.
         spacing: distance between neighbours along every axis [m].
         components: number of quantities at each point.
 
@@ -130,7 +130,7 @@ def check_grid(
 ) -> None:
     """Raise an error if windows are not on the grid, not periodic, or sampled too slowly for the solver's steps.
 
-    Data count as periodic if differences across an edge are at most three times as large as between neighbours.
+    You should call this before you fit. Differences across an edge may be three times as large as between neighbours.
 
     Args:
         grid: the grid of each state.

@@ -61,7 +61,7 @@ class Lag(AbstractHidden):
     Attributes:
         log_time_constant: ln τ of each lagged input (k,), with τ in seconds: the sum over the chain.
         places: indices of the lagged inputs.
-        order: number of lags in the chain; choose four for a delay.
+        order: number of lags in the chain. For a delay, you should choose four.
     """
 
     log_time_constant: Float[Array, " k"]

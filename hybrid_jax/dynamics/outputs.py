@@ -30,10 +30,10 @@ class StateSpaceModel(eqx.Module):
             function with a third argument also gets the field, for example for an accelerometer, which measures ẋ. You
             should not use a field from elsewhere, because its parameters would not follow the fitted ones.
         start: the expected initial state (d,).
-        spread: the standard deviation of the initial state about `start` (d,): 0 if you know it, infinite if you know
-            nothing about it. An attitude has three numbers here, its rotation [rad].
+        spread: the standard deviation of the initial state about `start` (d,). It should be 0 if you know it, infinite
+            if you know nothing about it. An attitude has three numbers here, its rotation [rad].
         process: the standard deviation of the process noise on each state, per square root of a second; by default 0.
-            It has the shape of `spread`. A state with process noise and no dynamics is a random walk.
+            It should have the shape of `spread`. A state with process noise and no dynamics is a random walk.
 
     Raises:
         ValueError: if sizes do not agree, or a deviation is negative.

@@ -59,7 +59,7 @@ def check_learned(learn: tuple[str, ...], actuator: Actuator | None = None) -> N
 
 
 def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleModel:
-    """Read a vehicle file: TOML with `[vehicle]`, `learn` and `[terms]`. Without `learn`, `LEARN` is learned.
+    """Read a vehicle file: TOML with `[vehicle]`, `learn` (above all tables, by default `LEARN`) and `[terms]`.
 
     Args:
         path: the TOML file.

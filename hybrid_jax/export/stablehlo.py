@@ -97,7 +97,7 @@ def export_program(
         state_size: d; by default from the field's vehicle or its attribute of this name.
         input_size: m; by default from the field's vehicle or its attribute of this name.
         batched: take x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
-        platforms: the platforms to export for, a subset of PLATFORMS; each makes the file longer.
+        platforms: the platforms to export for, from PLATFORMS. You should list only a few: each makes the file longer.
         smooth: see `casadi_function`.
         observe: see `casadi_function`.
         about: JSON values to store with the program.

@@ -52,7 +52,7 @@ def load_log(
     motor_order: Sequence[int] = (),
     dt: float | None = None,
 ) -> FlightLog:
-    """Read one log without checking it.
+    """Read one log. It is not checked; for this, you should use `check_recording` and `check_log`.
 
     Args:
         path: a log of any format that `read_recording` reads.
@@ -90,7 +90,7 @@ def load_logs(
         motor_order: see `load_windows`.
         dt: see `load_windows`.
         cleaning: changes to every log, by default none.
-        vehicle: the expected vehicle. Without it the motors are not checked.
+        vehicle: the expected vehicle. You should give it, because the motors are not checked otherwise.
         failed: whether a failed check raises an error ("refuse") or warns ("warn").
 
     Raises:

@@ -58,10 +58,10 @@ def load_windows(
         stride: number of samples between the starts of two windows.
         columns: TOML file that describes the columns of CSV logs, see `hybrid_jax.flights.formats.column_map`; by
             default the library's columns and units.
-        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for logs with commands (0 to 1) but no speeds.
+        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ. Logs with commands (0 to 1) but no speeds need it.
         topics: topics of a ROS bag by quantity: see `hybrid_jax.flights.formats.rosbag`.
         motor_order: index in the log of each rotor's motor, from 0.
-        motor_time_constant: first-order lag [s] of the rotors, for logs with commands instead of rotor speeds.
+        motor_time_constant: first-order lag [s] of the rotors. Logs with commands instead of rotor speeds need it.
         cleaning: changes to every log, for example `Cleaning(in_flight=True)`; by default none.
         failed: whether a failed check raises an error ("refuse") or warns ("warn").
 
@@ -94,7 +94,7 @@ def manoeuvre_of(log: FlightLog) -> str:
 
 
 def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[FlightLog], str] = flight_of) -> Split:
-    """Split flights into flights for training and held-out flights.
+    """Split flights into flights for training and held-out flights. You should do this before you cut windows.
 
     Args:
         logs: the flights.

@@ -43,7 +43,7 @@ class Model:
     ) -> Float[Array, "*n t d"]:
         """Predict the state at the end of each interval, for one window or for n, under piecewise constant inputs.
 
-        If some windows may diverge and you need the others, use `rollout_batch` instead.
+        If some windows may diverge and you need the others, you should use `rollout_batch` instead.
 
         Args:
             x0: the initial state of each window.

@@ -57,12 +57,12 @@ def portable(item: None = None, *, name: str | None = None) -> Callable[[Item], 
 def portable(item: Any = None, *, name: str | None = None) -> Any:
     """Decorate a class or function so that saved models refer to it by `name` instead of by its module.
 
-    An Equinox module needs this only if you want to move it to another module. A function in a field, or a dataclass
-    that is not an Equinox module, needs it to be loaded without `like`.
+    You should use this for an Equinox class that you may move to another module, and for functions in a field or other
+    dataclasses, which could otherwise only be loaded with `like`.
 
     Args:
         item: the class or function. Without it, as in `@portable(name="mine")`, the result is the decorator.
-        name: the unique name in files; by default its own.
+        name: the name in files, which should be unique; by default its own.
 
     Raises:
         ValueError: if another class or function already has the name.

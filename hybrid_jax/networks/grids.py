@@ -96,7 +96,7 @@ def grid_network(
     Args:
         grid: the grid of the state.
         input_size: m, the size of u, which the network reads at each point; 0 if it does not depend on u.
-        kernel: number of points along each axis that it reads, odd. For example, 1 is pointwise and 3 a convolution.
+        kernel: number of points along each axis that it reads. It should be odd, for example 3 for a convolution.
         hidden: number of hidden units at each point.
         activation: activation of the hidden units, by default smooth; see `residual_network`.
         norm: normalisation of the hidden units, by default none; see `residual_network`.

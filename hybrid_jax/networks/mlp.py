@@ -217,7 +217,7 @@ def residual_network(
         scaling: scaling of inputs and outputs; by default `hybrid_jax.fit` sets it from the training windows.
         norm: normalisation of the hidden units: "batch", "layer" or "none".
         outputs: size of the output, by default `state_size`.
-        activation: "relu" (paper), "softplus", "tanh" or "silu". For solvers that use derivatives, choose a smooth one.
+        activation: "relu" (paper), "softplus", "tanh" or "silu". For solvers with derivatives, it should be smooth.
 
     Raises:
         ValueError: if the norm or activation is unknown, a size is not a positive integer, or key is not a random key.

@@ -78,7 +78,7 @@ class Domain:
     """A simulated system: a vehicle and the forces on it beyond thrust and gravity.
 
     Attributes:
-        name: name of the system. Simulated flights depend on it.
+        name: name of the system. It should be unique, because simulated flights depend on it.
         vehicle: the true vehicle.
         drag_coefficient: C_D [kg/s]; by default the Iris's, scaled by the square of the vehicle's size.
         forces: functions of `hybrid_jax.sim.forces`, or of your own, that add to thrust and gravity.

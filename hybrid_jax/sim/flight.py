@@ -135,7 +135,7 @@ class SplitSpec:
     Attributes:
         windows: number of windows.
         steps: number of intervals of 0.01 s in each window.
-        flights: take the first windows of this many flights, in order; by default random windows of many flights.
+        flights: take the first windows of this many flights, in order, instead of random windows of many flights.
     """
 
     windows: int

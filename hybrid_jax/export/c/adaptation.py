@@ -36,7 +36,7 @@ def export_adaptation_c(
         folder: where the files are written; it is created if it does not exist.
         adaptation: the filter.
         name: name of the files and prefix of the definitions, see `export_c`.
-        double: compute in double precision, else in single.
+        double: compute in double instead of single precision.
         state_size: d; by default from the filter's field.
         input_size: m; by default from the filter's field.
 

@@ -53,7 +53,7 @@ def export_c(
         field: ẋ = f(x, u), for one state x (d,) and one input u (m,).
         dt: length of a step [s].
         name: name of the files and prefix of all definitions in the header; a lower-case C identifier.
-        double: compute in double precision, else in single.
+        double: compute in double instead of single precision.
         smooth: see `casadi_function`.
         state_size: d; by default from the field's vehicle or its attribute of this name.
         input_size: m; by default from the field's vehicle or its attribute of this name.

@@ -15,7 +15,7 @@ from hybrid_jax.flights.checks.motor_response import respond
 from hybrid_jax.flights.log import FlightLog, gaps, repeats
 from hybrid_jax.vehicle import QUATERNION, STATE_NAMES, VELOCITY, Vehicle, input_names
 
-OK, WARNS, FAILS, UNKNOWN = "ok", "warns", "fails", "cannot tell"
+OK, WARNS, FAILS, UNKNOWN = "ok", "warns", "fails", "unknown"
 GROUND = "cut it out: in_flight=True"
 MORE_FLIGHT = "check on a flight with more motion"
 CLOCK = "the time is in ms, µs or ns: declare its unit"
@@ -59,10 +59,10 @@ class Check:
 
     Attributes:
         name: name of the check, for example the two records compared.
-        value: the result in `unit`; NaN if the verdict is "cannot tell".
+        value: the result in `unit`; NaN if the verdict is "unknown".
         unit: unit of value and limit, for example "s" or "relative error".
         limit: the maximum of the value, or for correlations the minimum.
-        verdict: "ok", "warns", "fails" or "cannot tell".
+        verdict: "ok", "warns", "fails" or "unknown".
         suggestion: what you should correct, if anything; for example the sign of an axis.
     """
 
@@ -78,7 +78,7 @@ def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
     """Check whether a log is consistent with itself and, if you give one, with its vehicle.
 
     Args:
-        log: the flight.
+        log: the flight, which should contain manoeuvres.
         vehicle: constants to compare the motion with.
 
     Raises:

@@ -25,8 +25,8 @@ def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: fl
 
     Args:
         recording: the log as it was read.
-        vehicle: the expected vehicle. Without it the number of rotors and the largest speed are not checked.
-        dt: the interval that you want between samples [s]. Without it the rates of signals are not checked.
+        vehicle: the expected vehicle. You should give it to check the number of rotors and the largest speed.
+        dt: the interval that you want between samples [s]. You should give it to check the rates of signals.
     """
     damage, missing = recording.facts.get("damage", ""), missing_states(recording)
     motors = motors_of(recording) if recording.signals.keys() & ROTOR_UNITS.keys() else None
