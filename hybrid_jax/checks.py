@@ -120,7 +120,6 @@ def not_negative(name: str, value: Any) -> None:
 
 
 def count(name: str, value: Any, least: int = 1) -> None:
-    """Require an integer of at least `least`."""
     if is_traced(value):
         return
     found = value.item() if isinstance(value, Numbers) and value.ndim == 0 else value

@@ -220,7 +220,6 @@ def checked(
 
 
 def check_solver(solver) -> None:
-    """Require a one-step diffrax solver for ODEs of one term."""
     if not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver must be one of diffrax or of hybrid_jax.SOLVERS, got {checks.short_repr(solver)}")
     # Each step starts at time zero, so a multistep method would remember wrong times.

@@ -27,7 +27,6 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """Return q̄, the inverse rotation of a unit quaternion."""
     w, x, y, z = q
     return jnp.stack([w, -x, -y, -z])
 

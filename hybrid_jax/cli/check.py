@@ -81,7 +81,6 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
 
 
 def _worst(known: Known, flights: Flights, names: list[str], each: list[Float[np.ndarray, "n t 4"]]) -> list[tuple]:
-    """Return the moments of the largest errors relative to the typical error."""
     typical = np.sqrt(np.mean(np.concatenate([np.square(one[:, -1]) for one in each]), axis=0))
     ends = [
         (end, name, float(log.t[min(j * LONGER * known.steps, len(log) - 1)] - log.t[0]))

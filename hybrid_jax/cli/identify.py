@@ -57,7 +57,6 @@ def run(options: Any, path: Path, model: VehicleModel) -> int:
 
 
 def layout_of(fits: Mapping[str, Any]) -> Layout:
-    """Return the layout of windows from the options FITS."""
     return Layout(fits["dt"], fits["steps"], fits["windows"], disturbance=tuple(fits["disturbance"]))
 
 

@@ -124,7 +124,6 @@ def inspected(paths: Sequence[Path], vehicle: Vehicle | None, options: Any) -> l
 def write_vehicle(
     path: Path, logs: Sequence[Looked], folder: Path, mass: float | None = None, arm: float | None = None
 ) -> None:
-    """Write a vehicle file estimated from the logs of a folder."""
     write_atomic(path, vehicle_text(estimate(trusted(logs)), folder.resolve().stem, mass, arm))
     print(f"{path}: written; you should read its comments before you use it")
 

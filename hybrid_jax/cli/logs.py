@@ -97,8 +97,6 @@ class Flights(NamedTuple):
 
 
 class Looked(NamedTuple):
-    """A log that was checked."""
-
     name: str
     recording: Recording | None = None
     checks: Sequence[Check] = ()  # of its signals, except for what every verb corrects

@@ -38,8 +38,6 @@ img { filter: invert(1) hue-rotate(180deg); mix-blend-mode: screen } figcaption 
 
 
 class Table(NamedTuple):
-    """A titled table of texts."""
-
     title: str
     header: Sequence[str]
     lines: Sequence[Sequence[str]]

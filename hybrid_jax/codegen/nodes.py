@@ -79,8 +79,6 @@ Statement = Variable | Array | Assign | Loop | Call
 
 @dataclass(frozen=True)
 class Function:
-    """A function from arrays to arrays."""
-
     name: str
     inputs: tuple[Array, ...]
     outputs: tuple[Array, ...]
@@ -97,7 +95,6 @@ class Step:
 
     @cached_property
     def uses(self) -> frozenset[str]:
-        """The names that the statements read."""
         return names(self.code) - {self.makes}
 
 
@@ -109,7 +106,6 @@ def walk(node: Any) -> Iterator[Any]:
 
 
 def names(node: Any) -> frozenset[str]:
-    """Return the names of the variables and arrays in a node."""
     return frozenset(one.name for one in walk(node) if isinstance(one, Entry))
 
 

@@ -101,7 +101,6 @@ class CTranslation(Translation):
         return result
 
     def _loops(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Multiply A by B in loops."""
         (m, k), n = a.shape, b.shape[1]
         if m == 1 and n > 1:
             return self._loops(b.T, a.T).T

@@ -127,7 +127,6 @@ class CPrinter:
         return f"static const real {name}[{len(numbers)}] = {{\n    {lines}}};"
 
     def tables(self, tables: Tables, code: tuple) -> list[str]:
-        """Print the tables that code reads."""
         read = nodes.names(code)
         return [self.table(name, numbers) for name, numbers in tables.numbers.items() if name in read]
 

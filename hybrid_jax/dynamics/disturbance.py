@@ -113,7 +113,6 @@ def with_physics(field: AbstractVectorField, physics: AbstractVectorField) -> Ab
 
 
 def disturbance_of(field: AbstractVectorField) -> ConstantDisturbance | None:
-    """Return the constant disturbance of the field's physics, or None."""
     physics = physics_of(field)
     return physics.residual if isinstance(physics, Hybrid) else None  # pyright: ignore[reportReturnType]
 

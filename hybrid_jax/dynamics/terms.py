@@ -75,7 +75,6 @@ def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
 
 
 def shape_of(vehicle: Vehicle, name: str) -> tuple[int, ...]:
-    """Return the shape of a learnable parameter or correction of this vehicle."""
     return (vehicle.rotors,) if name in ("k_rotors", "efficiency") else (SHAPES | CORRECTIONS)[name]
 
 

@@ -124,7 +124,7 @@ def report(found: Sequence[tuple[str, Check]], failed: Failed) -> None:
         lines.get(check.verdict, []).append(f"{name}: {check.name}: {check.suggestion}")
     if lines[FAILS] and failed == "refuse":
         more = f" ({len(lines[FAILS]) - 1} more checks failed)" if len(lines[FAILS]) > 1 else ""
-        raise ValueError(f'{lines[FAILS][0]}{more}; failed="warn" continues nevertheless')
+        raise ValueError(f'{lines[FAILS][0]}{more}; to continue anyway, use failed="warn"')
     for line in (*lines[FAILS], *lines[WARNS]):
         checks.warn(line)
 

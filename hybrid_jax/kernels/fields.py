@@ -46,16 +46,13 @@ class Kernel:
     epsilon: float
 
     def weights(self, field: PyTree) -> Array:
-        """Concatenate the weights of a field."""
         return self.forward.joined(jax.tree.leaves(eqx.filter(field, _is_array)))
 
     def apart(self, weights: Array) -> list[Array]:
-        """Split the weights into arrays."""
         parts = zip(self.forward.places(), self.forward.shapes, strict=True)
         return [weights[begin : begin + one.size].reshape(one.shape) for begin, one in parts]
 
     def back_weights(self, weights: Array) -> Array:
-        """Compute the weights of the backward pass."""
         assert self.back is not None
         return self.back.joined(self.apart(weights))
 

@@ -25,7 +25,6 @@ class Split(NamedTuple):
         return np.cumsum([0, *(one.size for one in self.shapes)])[:-1].tolist()
 
     def joined(self, parameters: Sequence[Any]) -> jax.Array:
-        """Compute the weights, concatenated."""
         return jnp.concatenate([jnp.zeros(0, jnp.float32), *map(jnp.ravel, jaxpr_as_fun(self.weights)(*parameters))])
 
     def place(self, output: int) -> int:

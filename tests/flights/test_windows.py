@@ -43,7 +43,7 @@ def test_failed_checks_are_reported(tmp_path):
     write(tmp_path, [still])
     with pytest.warns(UserWarning, match=r"still.csv.gz: columns: u3 never changes"):
         hj.load_windows(tmp_path, IRIS, failed="warn")
-    refusal(lambda: hj.load_windows(tmp_path, IRIS), "still.csv.gz: ", 'failed="warn" continues nevertheless')
+    refusal(lambda: hj.load_windows(tmp_path, IRIS), "still.csv.gz: ", 'to continue anyway, use failed="warn"')
     refusal(lambda: hj.load_windows(tmp_path, IRIS, failed="no"), "failed must be")
 
 

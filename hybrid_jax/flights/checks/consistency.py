@@ -128,7 +128,7 @@ def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
         return Check(RATIO, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
     ratio = float(along.mean() / thrust.mean())
     possible = 1 / POSSIBLE < ratio < POSSIBLE
-    advice = f"multiply thrust_coefficient by {ratio:.3g}, or divide mass by it, whichever is less sure"
+    advice = f"multiply thrust_coefficient by {ratio:.3g}, or divide mass by it, whichever is less certain"
     advice += f"; {CHANGED}" * possible
     units = {"rpm": np.pi / 30, "rev/s": 2 * np.pi, "deg/s": np.pi / 180, "rad/s, read as rpm": 30 / np.pi}
     if ratio <= 0:

@@ -138,7 +138,6 @@ def middle(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n-1 d"]:
 
 
 def moving_mean(values: Float[np.ndarray, "n d"], width: int) -> Float[np.ndarray, "m d"]:
-    """Average each `width` consecutive rows."""
     total = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
     return (total[width:] - total[:-width]) / width
 

@@ -47,8 +47,8 @@ def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: fl
 def _airframe(recording: Recording) -> Check:
     kind, number = recording.facts.get("vehicle", "unknown"), recording.facts.get("airframe")
     if kind in ("unknown", "generic"):
-        return Check("airframe", np.nan, "", 0.0, UNKNOWN, "the log does not say what flew")
-    advice = f"{kind}{f' (SYS_AUTOSTART {number})' if number else ''}, no multirotor: leave the file out"
+        return Check("airframe", np.nan, "", 0.0, UNKNOWN, "the log does not name the type of vehicle")
+    advice = f"{kind}{f' (SYS_AUTOSTART {number})' if number else ''}, not a multirotor: leave the file out"
     return judged("airframe", 0.0, "", 0.0, "" if kind.startswith("multirotor") else advice)
 
 

@@ -92,12 +92,10 @@ class ColumnMap:
 
     @property
     def quantities(self) -> dict[str, Columns]:
-        """Return the columns of each given quantity, in the order of `SCALES`."""
         return {name: getattr(self, name) for name in SCALES if getattr(self, name) is not None}
 
     @property
     def names(self) -> list[str]:
-        """List all columns in the order of `SCALES`."""
         return [column for stated in self.quantities.values() for column in stated.columns]
 
 

@@ -201,7 +201,6 @@ def _numbers(message, field: str):
 
 
 def _motors(topic: str, field: str, messages) -> tuple[np.ndarray, str]:
-    """Return the numbers of all motors and the name of their field."""
     fields = field.split("|")
     name = next((name for name in fields if len(_numbers(messages[0], name))), fields[0])
     try:
