@@ -276,10 +276,9 @@ class StateSpace:
     def features(self, x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
         """Return, by name, the quantities that decide how alike samples are; by default each number of x and of u."""
         known = self.padded(x.shape[1]).quantities
-        labels = (
-            one.labels or [one.name if one.size == 1 else f"{one.name}[{i}]" for i in range(one.size)] for one in known
-        )
-        names = [*chain.from_iterable(labels), *(f"u[{i}]" for i in range(u.shape[1]))]
+        # A label alone may be that of two quantities, for example "left" of an angle and of its rate.
+        names = [one.name + f" {each}" * (one.size > 1) for one in known for each in one.labels or range(one.size)]
+        names += [f"u[{i}]" for i in range(u.shape[1])]
         return dict(zip(names, (*x.T, *u.T), strict=True))
 
     def _curved(self) -> Iterator[tuple[slice, Quantity]]:

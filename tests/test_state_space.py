@@ -47,6 +47,12 @@ def test_a_difference_leads_from_one_state_to_the_other(space):
         np.testing.assert_allclose(space.retract(x, 0 * change), x, atol=1e-12)
 
 
+def test_what_decides_how_alike_samples_are_has_names_of_its_own():
+    wheels = StateSpace((Angle("angle", 2, labels=("left", "right")), Quantity("rate", 2, labels=("left", "right"))))
+    found = wheels.features(np.arange(20.0).reshape(5, 4), np.zeros((5, 1)))
+    assert [*found] == ["angle left", "angle right", "rate left", "rate right", "u[0]"]
+
+
 def test_derivatives_are_those_of_the_tangent_space(space):
     x, _ = states(space)
     slope = jax.jacfwd(lambda change: space.difference(space.retract(x, change), x))(jnp.zeros(space.tangent_size))
