@@ -268,22 +268,25 @@ def _parameters(
     # `absorbed` is a bound, not an estimate from a sample, so its degrees are infinite (GUM, G.4.3).
     parts = np.stack([np.diag(covariance), np.diag(inherited), absorbed])
     degrees = satterthwaite(parts, np.array([own_degrees, of_source, np.inf]))
+    of_change = satterthwaite(parts[:2], np.array([own_degrees, of_source]))  # the source has the same network
     covariance = covariance + inherited
     if np.isnan(covariance).any():
         return {"parameters": found, "without_intervals": NOT_FINITE}
     whole = covariance + np.diag(absorbed)
     bounds = intervals(field, jnp.asarray(whole), level, degrees)
-    apart = intervals(field, jnp.asarray(covariance), level, degrees)  # of changes: the source has the same network
+    apart = intervals(field, jnp.asarray(covariance), level, of_change)
     scaled, moved = "efficiency" in np.array(groups)[free], dict[str, float]()
     for i, name in enumerate(values):
         value, low, high = jax.device_get(tuple(bounds[name]))
         if free[i]:
             _, *ends = jax.device_get(tuple(apart[name]))
-            if not ends[0] <= before[name] <= ends[1]:
-                moved[name] = float(abs(value - before[name]) / max(ends[1] - ends[0], TINY))
+            least, most = (float(end - before[name]) for end in ends)
+            if not least <= 0 <= most:
+                moved[name] = float(abs(value - before[name]) / max(most - least, TINY))
             reason = BY_NETWORK if vague[i] else BY_ROTORS if scaled and groups[i] == "theta" else None
             bound = {"effective": reason} if reason else {"low": float(low), "high": float(high)}
-            found[name] = replace(found[name], **bound)
+            change = {} if reason == BY_ROTORS else {"change": (least, most)}
+            found[name] = replace(found[name], **bound, **change)
     return {
         "parameters": found,
         "without_intervals": None,

@@ -21,10 +21,6 @@ SHOWN = 0.01  # less probable candidates are not reported
 NOT_CONFIRMED = "errors in windows that were left out of the fit do not confirm it"
 AS_LARGE = "the source's own errors may be as large without any change"
 UNLIKE = ", as its network is unknown outside of its training range"
-WITHIN = (
-    "Some intervals contain the value before: they include the network's uncertainty. The changes are more certain, "
-    "since the network is the same before and after, unless what it learned scales with a parameter that changed."
-)
 
 
 @dataclass(frozen=True)
@@ -39,6 +35,9 @@ class Parameter:
         effective: why the value predicts well but need not be the system's own, so that it has no interval; None if it
             is physical.
         before: the source's value, in `unit`; NaN if it has none.
+        change: the interval of `value` − `before`, in `unit`; NaN without a valid one. It is often narrower than that
+            of the value, because the network is the same before and after: what it learned instead of physics cancels,
+            unless that scales with a parameter that changed.
     """
 
     value: float
@@ -47,16 +46,12 @@ class Parameter:
     unit: str | None = None
     effective: str | None = None
     before: float = math.nan
+    change: tuple[float, float] = (math.nan, math.nan)
 
     @property
     def has_interval(self) -> bool:
         """Whether the parameter has a valid interval, which may be infinite."""
         return not math.isnan(self.low)
-
-    @property
-    def contains_before(self) -> bool:
-        """Whether the interval contains the source's value; False without an interval."""
-        return self.low <= self.before <= self.high
 
     def __str__(self) -> str:
         around = " (effective)" if self.effective else ""
@@ -168,10 +163,10 @@ class Adaptation:
             yield f"Parameters ({note}):"
             for name, one in self.parameters.items():
                 before = f", before {one.before:.4g}" if abs(one.value - one.before) > 0 else ""
-                yield f"  {name:<{width}}  {one}{before}"
+                change = ", change {:.3g} to {:.3g}".format(*one.change) if np.isfinite(one.change).all() else ""
+                yield f"  {name:<{width}}  {one}{before}{change}"
             if self.changed:
                 yield f"Significantly different from the source: {', '.join(self.changed)}."
-                yield from [WITHIN] * any(self.parameters[name].contains_before for name in self.changed)
             effective = [name for name, one in self.parameters.items() if one.effective]
             same = [name for name, one in self.parameters.items() if one.value == one.before]
             kept = [name for name in same if not self.parameters[name].has_interval and name not in effective]

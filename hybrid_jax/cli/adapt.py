@@ -8,7 +8,6 @@ import numpy as np
 import tyro
 
 from hybrid_jax.adaptation import Adaptation
-from hybrid_jax.adaptation.results import WITHIN
 from hybrid_jax.cli import errors, identify, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
 from hybrid_jax.cli.identify import KEEP
@@ -70,6 +69,10 @@ def run(options: Options) -> int:
     return 0 if different else NOTHING_CHANGED
 
 
+def _range(low: float, high: float) -> str:
+    return f"{low:.3g} to {high:.3g}" if np.isfinite([low, high]).all() else ""
+
+
 def _page(
     options: Options, known: Known, flights: Flights, field: AbstractVectorField, found: Adaptation, different: bool
 ) -> page.Page:
@@ -94,20 +97,19 @@ def _page(
     title = "What changed" if changed else "Parameters, none of which clearly changed"
     moved = [each for each in changes if each[1] != each[2].value] or changes
     main = ([*own, *lacked] or moved)[:SHOWN]
-    rows = [(name, str(one), f"{value:.4g} {one.unit or ''}".rstrip()) for name, value, one in main]
+    rows = [(name, str(one), f"{value:.4g}", _range(*one.change)) for name, value, one in main]
     was = known.about.get("expected", {}).get("velocity")  # of a model that `fit` wrote
     expected = f", where {was[0]:.3g} m/s was expected on a new flight" if was else ""
     unseen = [each["velocity"] for each in [*found.expected.values()][:1] if different]
     return page.Page(
         f"What changed in {page.counted(flights.logs, 'flight')} of {options.after} ({flights.seconds:.0f} s)?",
         answer,
-        page.Table(f"{title} (95 % intervals)", ("parameter", "after", "before"), rows) if rows else None,
+        page.Table(f"{title} (95 % intervals)", ("parameter", "after", "before", "change"), rows) if rows else None,
         [(f"RMSE on these flights{TAUGHT * different}", errors.figure(curves, known.dt))],
         [
             f"{error} was {old}; it is now {new[0]}." if new else f"{error} is {old}{expected}.",
             *[f"On new flights you should expect {v:.3g} m/s ({low:.3g} to {high:.3g})." for v, low, high in unseen],
             *([f"Of the model before {ALONE}"] if found.physics_only else []),
-            *[WITHIN] * any(one.contains_before for *_, one in own),
             *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
             *errors.unknown(found),
             *(f"The values of {', '.join(names)} are effective: {why}." for why, names in effective.items() if why),

@@ -144,6 +144,8 @@ def test_an_interval_is_as_wide_as_the_network_s_possible_share(share, widest):
     assert found.changed == ("log_length",)
     assert one.low < np.log(LENGTH) < one.high
     assert share / 10 < one.high - one.low < widest
+    low, high = one.change  # does not depend on the share
+    assert low < one.value - one.before < high < min(0.0, low + 0.005)
 
 
 def test_an_effect_on_one_state_says_nothing_of_a_parameter_that_another_determines():
