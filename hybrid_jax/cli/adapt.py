@@ -56,16 +56,16 @@ def run(options: Options) -> int:
     known = known_of(options.source, model)
     flights = flights_for(known, options.after, options, changed=True)
     x0, u, x = (np.asarray(known.about["windows"][part], "f4") for part in ("x0", "u", "x"))
-    with step("adapting") as told:
+    with step("adapting") as done:
         field, found = adapted(known.field, flights.logs, Trajectories(x0, u, x, known.dt))
-        told(f"{found.windows} windows, chose {found.chosen}")
+        done(f"{found.windows} windows, chose {found.chosen}")
     different = bool(found.changed) or found.physics_only or found.candidates["source"] < UNLIKELY
     if different:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
         save(options.output, field, json_value(about))
-    told = found.to_dict() | {"model": options.output if different else None}
-    page.write(options.out, "adapt", _page(options, known, flights, field, found, different), told)
+    record = found.to_dict() | {"model": options.output if different else None}
+    page.write(options.out, "adapt", _page(options, known, flights, field, found, different), record)
     return 0 if different else NOTHING_CHANGED
 
 
@@ -119,5 +119,5 @@ def _page(
         ],
         [todo],
         [errors.parameter_table(found)],
-        [*flights.said, *found.report().splitlines()],
+        [*flights.notes, *found.report().splitlines()],
     )

@@ -39,13 +39,13 @@ def run(options: Options) -> int:
         return identify.check(options, model)
     known = known_of(options.model, model)
     flights = flights_for(known, options.flights, options, changed=False)
-    with step("predicting") as told:
+    with step("predicting") as done:
         others = {"thrust, rates frozen": FrozenRates(rigid_body(known.vehicle)), "no forces": Kinematics()}
         steps = LONGER * known.steps
         each = [errors_of(known.field, log, steps) for log in flights.logs]
         curves = {"model": np.stack([rmse(one) for one in each])}
         curves |= {name: rmse_by_flight(field, flights.logs, steps) for name, field in others.items()}
-        told(f"{sum(map(len, each))} windows")
+        done(f"{sum(map(len, each))} windows")
     places = {"short": known.steps - 1, "long": -1}
     ends = {name: {end: found[:, at] for end, at in places.items()} for name, found in curves.items()}
     for end in ends.values():  # over all flights
@@ -76,7 +76,7 @@ def _page(options: Options, known: Known, flights: Flights, curves: dict[str, An
             page.Table("When it is most wrong", ("flight", "at", *header[1:]), _worst(known, flights, names, each)),
             page.Table("RMSE on each flight", ("flight", *header[1:]), by_flight),
         ],
-        flights.said,
+        flights.notes,
     )
 
 

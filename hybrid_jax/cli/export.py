@@ -99,7 +99,7 @@ def run(options: Options) -> int:
     learned: dict[str, Any] = {"state_size": measured, "input_size": m}
     programs = [("field", "f", None, {}), ("step", "F", dt, {})]
     programs += [("observe", "F", dt, {"observe": True})] * (alone is not field)
-    said = [PAST.format(field.hidden)] * (alone is not field)
+    meaning = [PAST.format(field.hidden)] * (alone is not field)
     adaptation = _filter(options, alone, dt, measured) if "c" in options.to else ""
     written: list[Path] = []
     with step(f"writing {', '.join(options.to)}"):
@@ -110,9 +110,9 @@ def run(options: Options) -> int:
             written += export_adaptation_c(options.output, adaptation, name=name, double=options.double, **learned)
             groups = ", ".join(dict.fromkeys(each.partition("[")[0] for each in adaptation.names))
             of = ", of the model without its past" * (alone is not field)
-            said.append(f"{name} adapts {groups}{of}, with a sample every {adaptation.dt:g} s.")
+            meaning.append(f"{name} adapts {groups}{of}, with a sample every {adaptation.dt:g} s.")
         elif adaptation:
-            said.append(f"No filter is written: {adaptation}.")
+            meaning.append(f"No filter is written: {adaptation}.")
         for kind, letter, length, more in programs:
             if "stablehlo" in options.to:
                 written.append(options.output / f"{kind}.npz")
@@ -121,14 +121,14 @@ def run(options: Options) -> int:
                 written.append(options.output / f"{kind}.casadi")
                 casadi_function(field, length, name=letter, **own, **more).save(str(written[-1]))
     if options.smooth is not None:
-        said.append(_change(alone, options.smooth))
-    told = {"files": list(map(str, written)), "dt": dt}
-    page.write(options.out, "export", _page(options, field, dt, written, said), told)
+        meaning.append(_change(alone, options.smooth))
+    record = {"files": list(map(str, written)), "dt": dt}
+    page.write(options.out, "export", _page(options, field, dt, written, meaning), record)
     return 0
 
 
 def _page(
-    options: Options, field: AbstractVectorField, dt: float, written: Sequence[Path], said: Sequence[str]
+    options: Options, field: AbstractVectorField, dt: float, written: Sequence[Path], meaning: Sequence[str]
 ) -> page.Page:
     rigid = state_space(without_past(field)) == RIGID_BODY_SPACE and not isinstance(field, Actuated)
     rows = [(str(path), f"{path.stat().st_size / 1024:.0f} KB") for path in written]
@@ -139,7 +139,7 @@ def _page(
         f"{len(written)} files in {options.output}: ẋ = f(x, u), and a step of {dt:g} s.",
         page.Table("Files", ("file", "size"), rows),
         _response(field, dt),
-        [*([STATES] if rigid else []), *said],
+        [*([STATES] if rigid else []), *meaning],
         todo or ["docs/howto/export.md explains how to read them."],
     )
 
@@ -158,8 +158,8 @@ def _response(field: AbstractVectorField, dt: float) -> list[tuple[str, Figure]]
         panel.plot(dt * np.arange(steps + 1), states[:, part], label=("x", "y", "z"))
         panel.set(xlabel="time [s]", ylabel=name)
         panel.legend()
-    told = f"From rest at 1 m with {vehicle.hover_speed:.4g} rad/s, and the first rotor {FASTER - 1:.0%} faster"
-    return [(f"{told}: the result of step", figure)]
+    start = f"From rest at 1 m with {vehicle.hover_speed:.4g} rad/s, and the first rotor {FASTER - 1:.0%} faster"
+    return [(f"{start}: the result of step", figure)]
 
 
 def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> OnlineAdaptation | str:
@@ -195,5 +195,5 @@ def _change(field: AbstractVectorField, beta: float) -> str:
     before, after = (np.asarray(eqx.filter_jit(one.infer_batch)(*columns)) for one in (field, smoothed(field, beta)))
     off = np.abs(after - before).max(axis=1)
     entry = int(off.argmax())
-    told, rms = f"ẋ changes by at most {off[entry]:.2g}, in entry {entry}", np.sqrt(np.mean(np.square(before[entry])))
-    return f"With smooth {beta:g}, {told}, whose RMS is {rms:.2g}, at {len(motion)} training states."
+    change, rms = f"ẋ changes by at most {off[entry]:.2g}, in entry {entry}", np.sqrt(np.mean(np.square(before[entry])))
+    return f"With smooth {beta:g}, {change}, whose RMS is {rms:.2g}, at {len(motion)} training states."

@@ -92,14 +92,14 @@ def run(options: Options) -> int:
     if flights.still and not options.ignore_checks:
         raise ValueError(f"{options.before}: no flight excites a parameter; fly manoeuvres, or use --ignore-checks")
     model, left = learnable(model, flights.seconds, STEPS * dt)
-    with step(f"learning from {len(flights.logs)} flights") as told:
+    with step(f"learning from {len(flights.logs)} flights") as done:
         found = learn(model, flights.logs, options.seed)
-        told(f"{found.chosen} predicts them best")
+        done(f"{found.chosen} predicts them best")
     about = _about(options, model, flights, found) | {"dt": dt}
     save(options.output, found.field, json_value(about))
-    told = {name: each for name, each in about.items() if name not in OF_MODEL}
-    told |= {"model": options.output, "adaptation": found.physics.to_dict()}
-    page.write(options.out, "fit", _page(options, flights, found, dt, left), told)
+    record = {name: each for name, each in about.items() if name not in OF_MODEL}
+    record |= {"model": options.output, "adaptation": found.physics.to_dict()}
+    page.write(options.out, "fit", _page(options, flights, found, dt, left), record)
     return 0
 
 
@@ -166,5 +166,5 @@ def _page(options: Options, flights: Flights, found: Learned, dt: float, left: s
             errors.parameter_table(found.physics),
             page.Table(f"Error on each held-out flight relative to {FROZEN}", ("flight", *CANDIDATES), by_flight),
         ],
-        flights.said,
+        flights.notes,
     )

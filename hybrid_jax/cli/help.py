@@ -24,7 +24,7 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
 
     It has the first paragraph of the program's description, and the first sentence of each option's.
     """
-    said, hints = _documented(kind), get_type_hints(kind, include_extras=True)
+    texts, hints = _documented(kind), get_type_hints(kind, include_extras=True)
     every = [each for each in fields(cast(Any, kind)) if tyro.conf.Suppress not in _marks(hints[each.name])]
     options: list[tuple[int, str, str]] = []
     for each in every:
@@ -33,27 +33,27 @@ def short_help(kind: type, program: str, about: str, default: Any, common: Colle
             continue
         value = each.default if default is None else getattr(default, each.name)
         typed, more, _ = values(hints[each.name]).partition(" …")
-        told = re.split(r"(?<=\.)\s", " ".join(said[each.name].split()))[0].removesuffix(".")
+        sentence = re.split(r"(?<=\.)\s", " ".join(texts[each.name].split()))[0].removesuffix(".")
         shown = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
         if len(typed) > LONG:
-            told, typed = f"{told}: {typed.replace('|', ', ')}", "NAME"
+            sentence, typed = f"{sentence}: {typed.replace('|', ', ')}", "NAME"
         elif not (value is None or isinstance(value, bool) or value in ((), MISSING)):
-            told += f" [{shown}]"
+            sentence += f" [{shown}]"
         named = f"--{'no-' * (value is True)}{option_of(each.name, marks)} {typed}{more}".rstrip()
         aliases = [alias for mark in marks for alias in getattr(mark, "aliases", None) or ()]
         needed = value is MISSING and each.default_factory is MISSING
         place = 0 if tyro.conf.Positional in marks else 1 if needed else 2 + (each.name not in kind.__annotations__)
-        options.append((place, ", ".join([*aliases, named]) if place else each.name.upper(), told))
+        options.append((place, ", ".join([*aliases, named]) if place else each.name.upper(), sentence))
     options.sort(key=lambda option: option[0])  # arguments, needed options, own ones, inherited ones
     width = min(shutil.get_terminal_size().columns, WIDEST) - 1
     needs = [name.partition(", ")[2] or name for place, name, _ in options if place < 2]
     summary = textwrap.wrap(about.partition("\n\n")[0], width)
     text = [f"usage: {' '.join([program, *needs])} [OPTIONS]", "", *summary, ""]
-    for _, name, told in options:
+    for _, name, sentence in options:
         head = f"  {name}".ljust(INDENT)
         text += [head.rstrip()] * (len(head) > INDENT)
         first = " " * INDENT if len(head) > INDENT else head
-        text += textwrap.wrap(told, width, initial_indent=first, subsequent_indent=" " * INDENT)
+        text += textwrap.wrap(sentence, width, initial_indent=first, subsequent_indent=" " * INDENT)
     left = len(every) - len(options)
     lists = f", and lists {left} more option{'s' * (left > 1)}" * (left > 0)
     return "\n".join([*text, "", f"--help-all explains more{lists}."])
@@ -73,9 +73,9 @@ def _documented(kind: type) -> dict[str, str]:
     found: dict[str, str] = {}
     for each in filter(is_dataclass, reversed(kind.__mro__)):
         (body,) = ast.parse(textwrap.dedent(inspect.getsource(cast(Any, each)))).body
-        for field, said in pairwise(cast(ast.ClassDef, body).body):
-            if isinstance(field, ast.AnnAssign) and isinstance(said, ast.Expr):
-                found[ast.unparse(field.target)] = ast.literal_eval(said.value)
+        for field, text in pairwise(cast(ast.ClassDef, body).body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                found[ast.unparse(field.target)] = ast.literal_eval(text.value)
     return found
 
 

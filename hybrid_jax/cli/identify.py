@@ -63,8 +63,8 @@ def layout_of(fits: Mapping[str, Any]) -> Layout:
 def checked(options: Any, path: Path, model: VehicleModel) -> tuple[Flights, Any]:
     """Read the logs of a folder, except those that fail checks unless --ignore-checks; also make a field."""
     if LAG in model.learn:
-        mend = _learn(model.learn, (LAG,))
-        raise ValueError(f"{path}: learn: {LAG} is for rotor speeds, not for commands: {mend}")
+        advice = _learn(model.learn, (LAG,))
+        raise ValueError(f"{path}: learn: {LAG} is for rotor speeds, not for commands: {advice}")
     start = partial(_field_of, path, model, (options.dt or Layout.dt) * options.steps)
     return read_checked(options.before, options, model.vehicle, model.learn, start)
 
@@ -73,7 +73,7 @@ def read_checked(
     folder: Path, options: Any, vehicle: Vehicle, learn: Sequence[str], start: Callable[..., tuple[Any, str]]
 ) -> tuple[Flights, Any]:
     """Read and check logs as `checked` does; `start` makes a field for them, and a line on what it does not learn."""
-    raws, contents, said = recordings_of(folder, options)
+    raws, contents, notes = recordings_of(folder, options)
     failed: list[tuple[str, str, str]] = []  # a log, a check and its suggestion
 
     def require(checks_of: Callable[[Recording], list[Check]]) -> None:
@@ -89,18 +89,18 @@ def read_checked(
     field, left = start([*raws.values()])
     require(lambda log: compared(log, field, learn))
     lines = [in_flags(": ".join(each)) for each in failed]
-    said += [f"{name}: {note}" for name, log in raws.items() for note in log.notes] + lines
+    notes += [f"{name}: {note}" for name, log in raws.items() for note in log.notes] + lines
     for line in lines:
         print(f"  {line}", file=sys.stderr)
     warnings = [IGNORED.format(len(lines))] * (bool(lines) and options.ignore_checks) + [left] * bool(left)
-    return Flights([*raws.values()], contents, said, warnings), field
+    return Flights([*raws.values()], contents, notes, warnings), field
 
 
 def identified(field: Any, logs: Sequence[Recording], layout: Layout) -> Identified:
     """Identify the parameters, beginning with the field's; with commands, thrust comes before rotation."""
-    with step(f"identifying from {page.counted(logs, 'log')}") as told:
+    with step(f"identifying from {page.counted(logs, 'log')}") as done:
         found = (identify_in_turn if isinstance(field, Actuated) else identify)(field, logs, layout)
-        told(f"{found.windows} windows, {found.seconds:.4g} s of flight")
+        done(f"{found.windows} windows, {found.seconds:.4g} s of flight")
     return found
 
 
@@ -124,8 +124,8 @@ def _field_of(path: Path, model: VehicleModel, window: float, logs: Sequence[Rec
         return model.commanded(), left
     for log in logs:
         if "rotor_speed" not in log.signals:
-            mend = f"leave out {speeds_alone[0]}" if speeds_alone else "give it a table [actuator]; see --help"
-            raise ValueError(f"{path}: {log.name} has commands and no rotor speeds: {mend}")
+            advice = f"leave out {speeds_alone[0]}" if speeds_alone else "give it a table [actuator]; see --help"
+            raise ValueError(f"{path}: {log.name} has commands and no rotor speeds: {advice}")
     if lost := [name for name in model.learn if name in NAMES]:
         why = f"need commands, and {speeds_alone[0]} has only rotor speeds"
         raise ValueError(f"{path}: learn: {', '.join(lost)}: {why}: {_learn(model.learn, lost)}")
@@ -155,7 +155,7 @@ def _page(options: Any, found: Identified, read: Flights, layout: Layout, values
             *([page.Table("All parameters, with 95 % intervals", header, lines)] * (len(lines) > LINES)),
             page.Table("RMS of the errors over the windows fitted", ("quantity", "unit", "x, y, z …"), fitted),
         ],
-        read.said,
+        read.notes,
     )
 
 
@@ -250,10 +250,10 @@ def adapt(options: Any, model: Model) -> int:
             page.Table("All parameters", HEADER, lines),
             *(predicted(each, layout, name) for name, each in errors.items()),
         ],
-        read.said,
+        read.notes,
     )
-    told = {"parameters": after, "changed": changed, "model": options.output if changed else None}
-    page.write(options.out, "adapt", shown, told)
+    record = {"parameters": after, "changed": changed, "model": options.output if changed else None}
+    page.write(options.out, "adapt", shown, record)
     return 0 if changed else NOTHING_CHANGED
 
 
@@ -272,7 +272,7 @@ def check(options: Any, model: Model) -> int:
         read.warnings,
         [f"If it is wrong: hybrid-jax adapt {options.model} {options.flights} -o adapted.npz."],
         [predicted(one, layout, name) for name, one in zip(read.contents, each, strict=True)],
-        read.said,
+        read.notes,
     )
     rmse = {name: error for name, _, _, error in whole.lines}
     page.write(options.out, "check", shown, {"flights": list(read.contents), "rmse": rmse})
@@ -285,9 +285,9 @@ def _like(options: Any, folder: Path, model: Model) -> tuple[Flights, Any]:
     body = field.body if isinstance(field, Actuated) else field
     learned = tuple(name.partition("[")[0] for name in model.about["parameters"])
     read, _ = read_checked(folder, options, body.vehicle, learned, lambda _: (field, ""))
-    told = "command" if isinstance(field, Actuated) else "rotor_speed"
+    motors = "command" if isinstance(field, Actuated) else "rotor_speed"
     for log in read.logs:
-        if told not in log.signals:
-            raise ValueError(f"{log.name}: has no {told}, which the model needs; leave it out")
+        if motors not in log.signals:
+            raise ValueError(f"{log.name}: has no {motors}, which the model needs; leave it out")
     require_unseen(model.about["learned_from"], read.contents)
     return read, field

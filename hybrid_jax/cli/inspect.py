@@ -90,11 +90,11 @@ def run(options: Options) -> int:
 def result_of(log: Looked) -> str:
     """Return the result: not read, FAILS, no flight, or ready."""
     if log.recording is None:
-        return f"not read: {log.refusal}"
+        return f"not read: {log.problem}"
     if more := log.failed:
         rest = f" (and {len(more) - 1} more)" if len(more) > 1 else ""
         return f"FAILS {more[0].name}: {more[0].suggestion}{rest}"
-    return f"no flight: {log.refusal}" if log.refusal else READY
+    return f"no flight: {log.problem}" if log.problem else READY
 
 
 def warned(log: Looked) -> str:
@@ -111,13 +111,13 @@ def inspected(paths: Sequence[Path], vehicle: Vehicle | None, options: Any) -> l
         try:
             raw = read_recording(path, **options.reading)
         except ValueError as error:
-            found.append(Looked(name, refusal=printable(in_flags(str(error).removeprefix(f"{path}: ")))))
+            found.append(Looked(name, problem=printable(in_flags(str(error).removeprefix(f"{path}: ")))))
             continue
         one = look(path, raw, vehicle, options.dt, options)
-        told = [replace(each, suggestion=in_flags(each.suggestion)) for each in one.checks]
+        results = [replace(each, suggestion=in_flags(each.suggestion)) for each in one.checks]
         same = first.setdefault(content_of(raw), name)
-        refusal = in_flags(one.refusal) if same == name else f"the same flight as {same}; leave one of the two out"
-        found.append(one._replace(name=name, checks=told, refusal=refusal))
+        problem = in_flags(one.problem) if same == name else f"the same flight as {same}; leave one of the two out"
+        found.append(one._replace(name=name, checks=results, problem=problem))
     return found
 
 
@@ -142,7 +142,7 @@ def trusted(logs: Sequence[Looked]) -> list[Recording]:
 def _page(options: Options, logs: Sequence[Looked], left: Sequence[str]) -> page.Page:
     ready = sum(result_of(log) == READY for log in logs)
     mends = [(log.name, c.name, c.suggestion) for log in logs for c in log.checks if c.verdict in (FAILS, WARNS)]
-    mends += [(log.name, "no flight", log.refusal) for log in logs if log.refusal and not log.failed]
+    mends += [(log.name, "no flight", log.problem) for log in logs if log.problem and not log.failed]
     learn = f"Learn from them: hybrid-jax fit {options.folder} -o source.npz --vehicle {options.vehicle or 'v.toml'}"
     read = [(log, log.recording) for log in logs if log.recording is not None]
     failed = {log.name: {check.name for check in log.failed} for log in logs}
@@ -175,8 +175,8 @@ def _facts(log: Looked) -> list[tuple[str, ...]]:
     if (found := log.recording) is None:
         return []
     known = {"vehicle": "unknown vehicle", **found.facts}
-    told = (str(known.get(key, EMPTY)) for key in ("format", "vehicle", "airframe", "program"))
-    return [(*told, f"{found.duration:.1f}", str(found.rotors))]
+    facts = (str(known.get(key, EMPTY)) for key in ("format", "vehicle", "airframe", "program"))
+    return [(*facts, f"{found.duration:.1f}", str(found.rotors))]
 
 
 def _signals(logs: Sequence[Looked]) -> page.Table:

@@ -86,7 +86,7 @@ class Flights(NamedTuple):
 
     logs: list[Any]  # the logs that passed: flights in the air, or recordings
     contents: dict[str, str]  # digests by name
-    said: list[str]  # lines on logs that were read, left out or cut
+    notes: list[str]  # lines on logs that were read, left out or cut
     warnings: Sequence[str] = ()  # of checks
     still: bool = False  # whether no log has enough motion to be checked against itself
 
@@ -100,7 +100,7 @@ class Looked(NamedTuple):
     name: str
     recording: Recording | None = None
     checks: Sequence[Check] = ()  # of its signals, except for what every verb corrects
-    refusal: str = ""  # why it cannot be read, or is not a flight
+    problem: str = ""  # why it cannot be read, or is not a flight
     notes: Sequence[str] = ()  # what was repaired and cut
     log: FlightLog | None = None  # airborne
 
@@ -148,7 +148,7 @@ def recordings_of(folder: Path, options: LogOptions) -> tuple[dict[str, Recordin
 
     An unreadable log is left out with a line, but ValueError if all are unreadable.
     """
-    paths, said = paths_of(folder)
+    paths, notes = paths_of(folder)
     found, unread, reading = {}, [], options.reading
     for path in paths:
         try:
@@ -161,7 +161,7 @@ def recordings_of(folder: Path, options: LogOptions) -> tuple[dict[str, Recordin
         print(f"  {printable(in_flags(line))}", file=sys.stderr)
     contents = {name: content_of(log) for name, log in found.items()}
     require_distinct([*contents.items()])
-    return found, contents, said + unread
+    return found, contents, notes + unread
 
 
 def read_flights(
@@ -172,7 +172,7 @@ def read_flights(
     With `changed`, thrust may differ; with `lagging`, motors may lead the gyro, because the model includes their lag.
     """
     with step(f"reading {folder}") as done:
-        raws, contents, said = recordings_of(folder, options)
+        raws, contents, notes = recordings_of(folder, options)
         logs: list[FlightLog] = []
         failed: list[tuple[str, str, str]] = []  # a log, a check and its suggestion
         warned: list[tuple[str, str, str]] = []
@@ -180,9 +180,9 @@ def read_flights(
         for name, raw in raws.items():
             one = look(Path(raw.name), raw, vehicle, dt, options, changed, lagging)
             lines = [(name, each.name, each.suggestion) for each in one.failed]
-            failed += (lines := lines or [(name, "no flight", one.refusal)] * bool(one.refusal))
-            told = *one.notes, *(f"{check}: {why}" for _, check, why in lines)
-            said += [f"{name}: {in_flags(line)}" for line in told]
+            failed += (lines := lines or [(name, "no flight", one.problem)] * bool(one.problem))
+            own = *one.notes, *(f"{check}: {why}" for _, check, why in lines)
+            notes += [f"{name}: {in_flags(line)}" for line in own]
             if one.log is not None and (options.ignore_checks or not lines):
                 logs.append(one.log)
                 warned += [(name, each.name, each.suggestion) for each in one.checks if each.verdict == WARNS]
@@ -196,7 +196,7 @@ def read_flights(
             raise ChecksFailed(*short, f"no log passed its checks; correct them, or use --ignore-checks{why}")
         for line in short:
             print(f"  {printable(in_flags(line))}", file=sys.stderr)
-        found = Flights(logs, contents, said, list(map(in_flags, grouped(warned))), not moving)
+        found = Flights(logs, contents, notes, list(map(in_flags, grouped(warned))), not moving)
         done(f"{len(logs)} of {len(raws)} flights, {found.seconds:.0f} s in the air")
     return found
 
@@ -204,8 +204,8 @@ def read_flights(
 def grouped(lines: Sequence[tuple[str, str, str]]) -> list[str]:
     """Return a line for each check that logs failed: the suggestion for the first, and the number of others."""
     checks: dict[str, list[str]] = {}
-    for name, check, told in lines:
-        checks.setdefault(check, []).append(f"{name}: {check}: {told}")
+    for name, check, suggestion in lines:
+        checks.setdefault(check, []).append(f"{name}: {check}: {suggestion}")
     return [first + f" (and {len(more)} more of the logs)" * bool(more) for first, *more in checks.values()]
 
 
@@ -219,7 +219,7 @@ def look(
     lagging: bool = False,
 ) -> Looked:
     """Check a log and cut it to its flight; if the vehicle cannot be used, the log is only compared with itself."""
-    checks, notes, log, refusal = check_recording(raw, vehicle, dt), [], None, ""
+    checks, notes, log, problem = check_recording(raw, vehicle, dt), [], None, ""
     scaled = "rotor_speed" in raw.signals or bool(options.polynomial)
     try:
         log = flight_at(raw, dt, options.polynomial if scaled else ONE_TO_ONE)
@@ -232,11 +232,11 @@ def look(
         if not scaled:
             flight_at(raw, dt)  # raises an error that names what is missing
     except ValueError as error:
-        log, refusal = None, str(error).removeprefix(f"{path}: ")
+        log, problem = None, str(error).removeprefix(f"{path}: ")
     borne = {RATIO: changed, GYRO: lagging}
     excused = [each for each in checks if each.name in CUT or (borne.get(each.name) and BORNE[each.name](each.value))]
     kept = [each for each in checks if each not in excused]
-    return Looked(path.name, raw, kept, refusal, [*raw.notes, *notes], log)
+    return Looked(path.name, raw, kept, problem, [*raw.notes, *notes], log)
 
 
 class Known(NamedTuple):
@@ -273,6 +273,6 @@ def unlike(known: Known, flights: Flights) -> list[str]:
     learned = {name: np.asarray(values) for name, values in known.about["motion"].items()}
     x, u = (np.concatenate([getattr(log, part) for log in flights.logs]) for part in ("x", "u"))
     shares = shares_outside(learned, RIGID_BODY_SPACE.features(x, u))
-    told = ", ".join(f"{name.partition(' [')[0]} {share:.0%}" for name, share in shares.items() if share > WARN)
+    listed = ", ".join(f"{name.partition(' [')[0]} {share:.0%}" for name, share in shares.items() if share > WARN)
     more = "of the time; errors there may be larger than expected."
-    return [f"These flights have motion that the training flights did not have: {told} {more}"] if told else []
+    return [f"These flights have motion that the training flights did not have: {listed} {more}"] if listed else []

@@ -90,14 +90,14 @@ def run(options: Options) -> int:
     lines = [HEADER, *(",".join(f"{number:.5g}" for number in row) for row in points)]
     write_atomic(options.output, ("\n".join(lines) + "\n").encode())
     values = {name: float(value) for name, value in named_parameters(field).items()}
-    said = [CHANGING] * isinstance(model.field, DisturbanceModel)
-    said += [str(each.message).removeprefix("excitation: ") for each in caught]
-    told = {"standard_errors": found.standard_errors, "margins": found.margins, "set_points": options.output}
-    page.write(options.out, "plan", _page(options, found, points, values, field.parameter_units, said), told)
+    meaning = [CHANGING] * isinstance(model.field, DisturbanceModel)
+    meaning += [str(each.message).removeprefix("excitation: ") for each in caught]
+    record = {"standard_errors": found.standard_errors, "margins": found.margins, "set_points": options.output}
+    page.write(options.out, "plan", _page(options, found, points, values, field.parameter_units, meaning), record)
     return 0
 
 
-def _page(options: Options, found: Excitation, points: np.ndarray, values, units, said) -> page.Page:
+def _page(options: Options, found: Excitation, points: np.ndarray, values, units, meaning) -> page.Page:
     halves = {name: HALF * error for name, error in found.standard_errors.items()}
     shares = {name: half / abs(values[name]) if values[name] else np.inf for name, half in halves.items()}
     named = {name: f"{values[name]:.4g} {units.get(name.partition('[')[0], '')}" for name in halves}
@@ -112,7 +112,7 @@ def _page(options: Options, found: Excitation, points: np.ndarray, values, units
         f"{options.output} determines {within} of {len(rows)} parameters to ± {WELL:.0%} or better; {least}.",
         page.Table("Expected 95 % intervals", header, rows[:MAIN]),
         [("The flight: from above, and over time", _figure(found, points))],
-        [MEANS, *said],
+        [MEANS, *meaning],
         [
             "Fly these set points, first at a height where an error costs nothing, and log the flight.",
             f"Then: hybrid-jax adapt {options.model} LOGS -o adapted.npz.",

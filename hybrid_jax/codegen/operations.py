@@ -125,7 +125,7 @@ class CTranslation(Translation):
         """Call a function for each row in a loop; the first results of a call are inputs of the next."""
         inner, rows, shared, carried = (equation.params[key] for key in ("jaxpr", "length", "num_consts", "num_carry"))
         if equation.params["reverse"]:
-            raise self._refusal(equation, " from the end")
+            raise self._unsupported(equation, " from the end")
         whole = self.tables.name("a")  # the carry, the next carry, and the results of all rows
         begin = np.concatenate([objects(one).ravel() for one in (np.zeros(0), *inputs[shared : shared + carried])])
         inside, given = self._passed(inputs, shared, carried, whole)

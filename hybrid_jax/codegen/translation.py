@@ -39,7 +39,7 @@ class Translation(ABC):
 
     def scan(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Apply a program to each row of arrays; by default unsupported."""
-        raise self._refusal(equation)
+        raise self._unsupported(equation)
 
     def run(self, program: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Translate a program and return its results; raise ValueError for an unknown operation."""
@@ -81,21 +81,21 @@ class Translation(ABC):
             return [self.fold(FOLDS[name], rows.reshape(-1, int(np.prod(shape)))).reshape(shape)]
         if name == "dot_general":
             return [self._product(equation.params["dimension_numbers"], *map(objects, inputs))]
-        raise self._refusal(equation)
+        raise self._unsupported(equation)
 
-    def _refusal(self, equation: JaxprEqn, why: str = "") -> ValueError:
+    def _unsupported(self, equation: JaxprEqn, why: str = "") -> ValueError:
         name = equation.primitive.name
         return ValueError(f"field: its operation {name!r}{why} has no counterpart in {self.language}")
 
     def _entrywise(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> np.ndarray:
         name, first = equation.primitive.name, equation.invars[0].aval.dtype  # type: ignore
         if name in ("and", "or", "not") and first.kind != "b":
-            raise self._refusal(equation, " of integers")
+            raise self._unsupported(equation, " of integers")
         if name == "select_n" and len(inputs) != 3:
-            raise self._refusal(equation, f" of {len(inputs) - 1} cases")
+            raise self._unsupported(equation, f" of {len(inputs) - 1} cases")
         if name == "convert_element_type":
             if not jnp.issubdtype(equation.params["new_dtype"], jnp.floating):
-                raise self._refusal(equation, f" to {equation.params['new_dtype']}")
+                raise self._unsupported(equation, f" to {equation.params['new_dtype']}")
             if first.kind != "b":
                 return inputs[0]
         return self.entrywise(name, *map(objects, inputs))
@@ -108,17 +108,17 @@ class Translation(ABC):
             sent[i] = places.reshape(inputs[i].shape)
             entries += objects(inputs[i]).ravel().tolist()
         if any(map(depends, sent)):
-            raise self._refusal(equation, " at a place that depends on x or u")
+            raise self._unsupported(equation, " at a place that depends on x or u")
         moved, all_of_them = _evaluated(equation, sent), array_of(entries)
         if not all(np.isfinite(places).all() for places in moved):
-            raise self._refusal(equation, " beyond the end of an array")
+            raise self._unsupported(equation, " beyond the end of an array")
         return [all_of_them[places.astype(int).ravel()].reshape(places.shape) for places in moved]
 
     def _linear(self, equation: JaxprEqn, inputs: list[np.ndarray]) -> np.ndarray:
         """Translate operations that are linear in their data to products with matrices."""
         data = LINEAR[equation.primitive.name]
         if any(depends(value) for i, value in enumerate(inputs) if i not in data):
-            raise self._refusal(equation, " at a place that depends on x or u")
+            raise self._unsupported(equation, " at a place that depends on x or u")
         zeros = [jnp.zeros(value.shape) if i in data else jnp.asarray(value) for i, value in enumerate(inputs)]
 
         def part(i: int) -> np.ndarray:

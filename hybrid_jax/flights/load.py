@@ -139,9 +139,9 @@ def format_of(path: str | Path) -> tuple[str, str]:
     head, name = _head(path), path.name.lower()
     if is_crazyflie(head):
         return CRAZYFLIE, ""
-    for mark, told in (MAGICS | UNREAD | SUFFIXES).items():
+    for mark, kind in (MAGICS | UNREAD | SUFFIXES).items():
         if head.startswith(mark) if isinstance(mark, bytes) else name.endswith(mark):
-            return ("", told.replace("FILE", path.name)) if mark in UNREAD else (told, "")
+            return ("", kind.replace("FILE", path.name)) if mark in UNREAD else (kind, "")
     return "", OTHER if head or path.stat().st_size else "empty"
 
 

@@ -142,8 +142,8 @@ def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) 
     for name in sorted(expected.keys() | arrays.keys()):
         if found.get(name) != wanted.get(name):
             where = "" if origin is None else f"{origin}: "
-            said = f"is {found.get(name, 'absent')}, expected {wanted.get(name, 'none')}"
-            raise ValueError(f"{where}array {name!r} {said}")
+            difference = f"is {found.get(name, 'absent')}, expected {wanted.get(name, 'none')}"
+            raise ValueError(f"{where}array {name!r} {difference}")
     dynamic, rest = eqx.partition(like, eqx.is_array)
     leaves, structure = jax.tree.flatten(dynamic)
     filled = [from_numpy(arrays[path], array_type(leaf)) for path, leaf in zip(expected, leaves, strict=True)]

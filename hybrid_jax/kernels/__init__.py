@@ -2,7 +2,7 @@
 
 import os
 
-from hybrid_jax.kernels.fields import REFUSED
+from hybrid_jax.kernels.fields import UNSUPPORTED
 from hybrid_jax.kernels.library import SWITCH, obstacle
 from hybrid_jax.kernels.rollout import predicted as predicted
 from hybrid_jax.kernels.rollout import serves_training as serves_training
@@ -21,4 +21,4 @@ def status() -> str:
     """Return whether this process uses kernels ("used" or why not), with a line for each unsupported field."""
     if (reason := obstacle()) is not None:
         return f"not used: {reason}"
-    return "\n".join(["used", *(f"not for {name}: {why}" for name, why in sorted(REFUSED.items()))])
+    return "\n".join(["used", *(f"not for {name}: {why}" for name, why in sorted(UNSUPPORTED.items()))])

@@ -23,7 +23,7 @@ from hybrid_jax.kernels.trace import Shape, Split, split, traced
 from hybrid_jax.networks.normalisation import AbstractNorm, BatchNorm
 
 MOST = 20_000  # weights; more would take long to translate
-REFUSED: dict[str, str] = {}  # name of a field → why it has no kernel
+UNSUPPORTED: dict[str, str] = {}  # name of a field → why it has no kernel
 
 
 class Sizes(NamedTuple):
@@ -58,7 +58,7 @@ class Kernel:
 
 
 def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
-    """Return the kernel of a field with d states and m inputs, or None with the reason in `REFUSED`."""
+    """Return the kernel of a field with d states and m inputs, or None with the reason in `UNSUPPORTED`."""
     shapes = jax.tree.map(lambda leaf: Shape(jnp.shape(leaf), leaf.dtype) if _is_array(leaf) else leaf, field)
     leaves, structure = jax.tree.flatten(shapes)
     key = *leaves, structure, d, m
@@ -72,7 +72,7 @@ def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
             known = _KNOWN[*key, training]
     except Exception as error:  # a user's code may raise anything, or not be hashable
         reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        REFUSED[_name(field)] = reason.removeprefix("field: ").partition("\n")[0]
+        UNSUPPORTED[_name(field)] = reason.removeprefix("field: ").partition("\n")[0]
         return None
     return known
 

@@ -87,13 +87,13 @@ def begun(source: str) -> str:
 
     def run() -> None:
         ways: list[Any] = [None, None]
-        said = ""
+        problem = ""
         try:
             library = ctypes.CDLL(str(_checked_library(source)))
             ways = [getattr(library, one, None) for one in ("forward", "backward")]
         except BaseException as error:  # ends the program that calls the kernel
-            said = f"a kernel cannot be used: {error}; you can disable kernels with {SWITCH}=0"
-        entry.publish(name.encode(), said.encode(), *(ctypes.cast(one, ctypes.c_void_p) for one in ways))
+            problem = f"a kernel cannot be used: {error}; you can disable kernels with {SWITCH}=0"
+        entry.publish(name.encode(), problem.encode(), *(ctypes.cast(one, ctypes.c_void_p) for one in ways))
 
     threading.Thread(target=run, daemon=True).start()  # Python does not wait for it to exit
     return name
@@ -151,8 +151,8 @@ def _run_compiler(arguments: list[str]) -> None:
         options = {"capture_output": True, "errors": "replace", "timeout": LONGEST, "start_new_session": True}
         subprocess.run(watched, check=True, stdin=inside, env=environment, **options)
     except subprocess.SubprocessError as error:
-        said = [line for line in (getattr(error, "stderr", None) or "").splitlines() if "error" in line]
-        raise Unusable(f"it could not be compiled: {(said or [f'{command[0]} fails'])[0]}") from error
+        errors = [line for line in (getattr(error, "stderr", None) or "").splitlines() if "error" in line]
+        raise Unusable(f"it could not be compiled: {(errors or [f'{command[0]} fails'])[0]}") from error
     finally:
         os.close(inside)
         os.close(held)

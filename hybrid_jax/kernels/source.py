@@ -29,7 +29,7 @@ class SampleTranslation(CTranslation):
     _cheap: dict[Any, Expression] = field(default_factory=dict)  # shape and entry of an array → its value
 
     def scan(self, equation, inputs):
-        raise self._refusal(equation)
+        raise self._unsupported(equation)
 
     def _mapped(self, value, shape):
         """Store a value in an array, but compute cheap ones again in loops over entries instead of reading them."""

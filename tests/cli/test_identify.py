@@ -136,7 +136,7 @@ def test_a_log_that_fails_is_left_out_where_another_passes(folder):
     write(folder / "logs", [SWAPPED, LOGS[1]])
     read, _ = checked(Options(folder / "logs", folder / "m.npz"), folder / "v.toml", VehicleModel(IRIS))
     assert [*read.contents] == ["chirp_run2.csv.gz"]
-    assert "motor order against roll and pitch" in read.said[-1]
+    assert "motor order against roll and pitch" in read.notes[-1]
 
 
 @pytest.mark.parametrize(("learn", "rest"), [("Ix,curve,delay", "Ix"), ("curve", "Ix Iy")])

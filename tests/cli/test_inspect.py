@@ -134,7 +134,7 @@ def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
     paths = [folder / "chirp_run1.csv.gz", folder / "chirp_run2.csv.gz"]
     options = Options(folder, columns=tmp_path / "map.toml")
     logs = inspected(paths, None, options)
-    assert ["has only motor commands" in log.refusal for log in logs] == [True, True]
+    assert ["has only motor commands" in log.problem for log in logs] == [True, True]
     assert "FAILS q̇ against ω: body rates are in degrees per second" in result_of(logs[1])
     assert [kept.name for kept in trusted(logs)] == [str(paths[0])]
     assert "left out of the vehicle file, as checks failed: chirp_run2.csv.gz" in capsys.readouterr().out
@@ -154,7 +154,7 @@ def test_of_a_folder_with_mistakes_what_is_sound_is_used(tmp_path, odd, called, 
     """A file that cannot be read is left out; a flight under two names, and of another vehicle, is refused."""
     flights = read_flights(odd, IRIS, DT, FlightOptions())
     assert [len(flights.logs), flights.still] == [2, False]
-    assert any("left out: " in line for line in flights.said)
+    assert any("left out: " in line for line in flights.notes)
     assert r"broken\udcff.csv: row 1, field py" in capsys.readouterr().err
     with pytest.raises(ChecksFailed) as failed:
         read_flights(odd, replace(IRIS, mass=9 * IRIS.mass), DT, FlightOptions())

@@ -28,9 +28,9 @@ def anew(monkeypatch):
     for function in (library.obstacle, library.begun):
         monkeypatch.setattr(library, function.__name__, functools.cache(function.__wrapped__))
     monkeypatch.setattr(fields, "_KNOWN", {})
-    monkeypatch.setattr(fields, "REFUSED", {})
+    monkeypatch.setattr(fields, "UNSUPPORTED", {})
     monkeypatch.setattr(kernels, "obstacle", library.obstacle)
-    monkeypatch.setattr(kernels, "REFUSED", fields.REFUSED)
+    monkeypatch.setattr(kernels, "UNSUPPORTED", fields.UNSUPPORTED)
 
 
 @pytest.fixture

@@ -14,14 +14,14 @@ CLEAR = 0.2  # m above where the vehicle stood before its motors turned
 MARGIN = 0.5  # s left out before and after idle motors if the height is unknown
 
 
-def airborne(recording: Recording, told: str = "command") -> list[tuple[float, float]]:
+def airborne(recording: Recording, signal: str = "command") -> list[tuple[float, float]]:
     """Find the start and end [s] of each time in the air, from commands or rotor speeds.
 
     Motors that idle for half a second end a flight. After such a rest, a flight begins once the vehicle is `CLEAR`
     above the height at which it stood or, without a height, once `MARGIN` has passed and the power has reached its
     median.
     """
-    inputs, position = recording.signals[told], recording.signals.get("position")
+    inputs, position = recording.signals[signal], recording.signals.get("position")
     power = (np.asarray(inputs.values) ** 2).sum(axis=1)
     if position is None or "z" not in position.axes:
         return _flights(inputs.t, power)

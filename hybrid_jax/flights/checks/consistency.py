@@ -177,10 +177,10 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     # A lag of some samples makes predictions worse, but learned parameters are still right.
     lagging = replace(lagging, verdict=WARNS) if limit < abs(lag) <= FATAL_LAG else lagging
     if SAMPLED[0] < found.lag / log.dt < SAMPLED[1]:
-        told = f"motors are samples, not held or means over the interval, and change by {100 * found.change:.0f} %"
-        told += " in it, which hides their lag and falsifies inertia: log commands or means,"
-        told += f" or take means of two: delay={found.lag:.4f}"
-        lagging = replace(lagging, verdict=WARNS, suggestion=told)
+        sampled = f"motors are samples, not held or means over the interval, and change by {100 * found.change:.0f} %"
+        sampled += " in it, which hides their lag and falsifies inertia: log commands or means,"
+        sampled += f" or take means of two: delay={found.lag:.4f}"
+        lagging = replace(lagging, verdict=WARNS, suggestion=sampled)
     return [
         judged(ORDER, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if ordered else advice),
         _spin(log, vehicle, found.yaw_sign * found.correlations[2]),

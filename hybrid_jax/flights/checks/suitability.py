@@ -30,10 +30,10 @@ def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: fl
     """
     damage, missing = recording.facts.get("damage", ""), missing_states(recording)
     motors = motors_of(recording) if recording.signals.keys() & ROTOR_UNITS.keys() else None
-    mend = f'{damage}; copy it again, or use what is whole: failed="warn"' if damage else ""
+    remedy = f'{damage}; copy it again, or use what is whole: failed="warn"' if damage else ""
     lacks = f"no {', no '.join(missing)}: {what_to_log(recording)}" if missing else ""
     return [
-        judged("whole file", bool(damage), "", 0.0, mend),
+        judged("whole file", bool(damage), "", 0.0, remedy),
         _airframe(recording),
         _flown(recording, motors, vehicle),
         judged("quantities", len(missing), "missing", 0.0, lacks),
@@ -58,14 +58,14 @@ def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
     expected = vehicle.rotors if vehicle is not None else stated[0] if stated else found
     if not found:
         return Check(ROTORS, 0.0, "motors", expected, UNKNOWN, "no motors")
-    mend = "log all motors"
+    remedy = "log all motors"
     if found > expected or found > MOST_ROTORS:
         signals = [recording.signals[name] for name in ROTOR_UNITS if name in recording.signals]
         moving = tuple(i for i in range(found) if any(np.ptp(signal.values[:, i]) > 0 for signal in signals))
         named = moving if vehicle is None and not stated else moving[:expected]
-        mend = f"name the motors that change: motor_order={named}"
+        remedy = f"name the motors that change: motor_order={named}"
     who = "the airframe" if vehicle is None else "the vehicle file"
-    advice = f"{found} motors are logged, {who} has {expected}: {mend}, or correct the vehicle file"
+    advice = f"{found} motors are logged, {who} has {expected}: {remedy}, or correct the vehicle file"
     fits = found == expected and found <= MOST_ROTORS
     return judged(ROTORS, found, "motors", expected, "" if fits else advice)
 
@@ -106,12 +106,12 @@ def _limits(recording: Recording, vehicle: Vehicle | None) -> Check:
         for row, column in np.argwhere(beyond)[:1].tolist():
             value = signal.values[row, column]
             wrap = name == "command" and -0.51 < signal.values.min() < 0 and signal.values.max() < 0.51
-            mend = "a 16-bit number wrapped: log it without sign" if wrap else "cut these samples out"
-            mend += " or raise max_rotor_speed of the vehicle file" if name == "rotor_speed" and value > 0 else ""
+            remedy = "a 16-bit number wrapped: log it without sign" if wrap else "cut these samples out"
+            remedy += " or raise max_rotor_speed of the vehicle file" if name == "rotor_speed" and value > 0 else ""
             if share > MOSTLY and not wrap:
-                mend = "most are: are they in another unit, for example PWM in µs? declare it"
+                remedy = "most are: are they in another unit, for example PWM in µs? declare it"
             where = f"{name} of motor {column} is {value:.4g} at {signal.t[row]:.4g} s, must be from 0 to {most:.4g}"
-            return judged("motors within limits", share, "share of samples", 0.0, f"{where}: {mend}")
+            return judged("motors within limits", share, "share of samples", 0.0, f"{where}: {remedy}")
     return judged("motors within limits", 0.0, "share of samples", 0.0, "")
 
 
@@ -128,11 +128,11 @@ def _flown(recording: Recording, motors: Signal | None, vehicle: Vehicle | None)
     climbed = float(np.ptp(position.values[:, -1])) if position is not None and position.axes[-1] == "z" else 0.0
     advice = ""
     if speeds and STILL < value < SLOW_ROTOR:
-        told = f"rotor speeds up to {value:.3g} rad/s ({value * 30 / np.pi:.4g} rpm) are too slow for flight"
-        advice = f"{told}: are they percent of a command, or rad/s or rev/s, read as rpm? correct their unit"
+        finding = f"rotor speeds up to {value:.3g} rad/s ({value * 30 / np.pi:.4g} rpm) are too slow for flight"
+        advice = f"{finding}: are they percent of a command, or rad/s or rev/s, read as rpm? correct their unit"
     elif value < limit and climbed > MOVED:
-        told = f"the motors of {motors.source} rest, and yet the height changes by {climbed:.2g} m"
-        advice = f"{told}: the vehicle's own are in another topic, instance or column: name or log those"
+        finding = f"the motors of {motors.source} rest, and yet the height changes by {climbed:.2g} m"
+        advice = f"{finding}: the vehicle's own are in another topic, instance or column: name or log those"
     elif value < limit:
         advice = "the motors rest throughout, so nothing flew: leave the file out"
     return judged(name, value, "rad/s" if speeds else "of the largest", limit, advice)

@@ -40,8 +40,8 @@ def read_blackbox(content: bytes) -> Parts:
             why.append(type(error).__name__)
     parser, rows, damage = max(flights, key=lambda flight: len(flight[1]), default=(None, np.zeros((0, 0)), ""))
     if parser is None:
-        said = f" ({why[0]})" if why else ""
-        raise ValueError(f"is not a blackbox log or is damaged; save it again{said}")
+        reason = f" ({why[0]})" if why else ""
+        raise ValueError(f"is not a blackbox log or is damaged; save it again{reason}")
     if not len(rows):
         raise ValueError("contains no frames; save the log again")
     columns = dict(zip(parser.field_names, rows.T, strict=False))

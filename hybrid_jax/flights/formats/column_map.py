@@ -135,10 +135,10 @@ def read_mapped(path: str | Path, column_map: ColumnMap | None) -> raw.Parts:
     t = named[clock.columns[0]] * SCALES["time"][clock.unit]
     for name, each in stated.items():
         values, source = np.stack([named[column] for column in each.columns], axis=1), " ".join(each.columns)
-        told = np.isfinite(t) & np.isfinite(values).all(axis=1)
-        partly = f"columns {source}: {told.sum()} of {len(t)} rows contain {name}"
-        notes += () if told.all() else (partly,)
-        values = of_unit(values[told], each.unit) if name == "motors" else values[told] * SCALES[name][each.unit]
+        given = np.isfinite(t) & np.isfinite(values).all(axis=1)
+        partly = f"columns {source}: {given.sum()} of {len(t)} rows contain {name}"
+        notes += () if given.all() else (partly,)
+        values = of_unit(values[given], each.unit) if name == "motors" else values[given] * SCALES[name][each.unit]
         if each.polynomial:
             values = np.polynomial.polynomial.polyval(values, each.polynomial)
         if name == "attitude":
@@ -146,7 +146,7 @@ def read_mapped(path: str | Path, column_map: ColumnMap | None) -> raw.Parts:
         commands = each.unit in SHARES and not each.polynomial
         quantity = {"body_rates": "rates", "motors": "command" if commands else "rotor_speed"}.get(name, name)
         quantity = "body_velocity" if name == "velocity" and frames.velocity == "body" else quantity
-        found[quantity] = raw.Samples(t[told], values, f"columns {source}")
+        found[quantity] = raw.Samples(t[given], values, f"columns {source}")
     return raw.turned(found, frames.world, frames.body), 1.0, notes, {"format": "CSV"}
 
 

@@ -93,29 +93,29 @@ def _numbers(lines: list[str], row: int, names, picked, delimiter: str) -> Float
     for at, line in enumerate(lines):
         if (count := line.count(delimiter) + 1) != len(names):
             found = f"{count} fields" if line.strip() else "a blank line"
-            mend = LISTS if "[" in line else "repair or cut the row out"
-            raise ValueError(f"row {row + at}: {found}, the header has {len(names)}; {mend}")
-    for told in (str, lambda line: delimiter.join(map(_told, line.split(delimiter)))):
+            advice = LISTS if "[" in line else "repair or cut the row out"
+            raise ValueError(f"row {row + at}: {found}, the header has {len(names)}; {advice}")
+    for convert in (str, lambda line: delimiter.join(map(_or_nan, line.split(delimiter)))):
         with contextlib.suppress(ValueError):
-            table = np.loadtxt(list(map(told, lines)), delimiter=delimiter, usecols=picked, comments=None, ndmin=2)
+            table = np.loadtxt(list(map(convert, lines)), delimiter=delimiter, usecols=picked, comments=None, ndmin=2)
             if table.shape == (len(lines), len(picked)):
                 return table
     for at, line in enumerate(lines):
         cells = line.split(delimiter)
         for column in picked:
-            if said := _bad_cell(cells[column].strip(), delimiter):
-                raise ValueError(f"row {row + at}, field {names[column]}: {said}")
+            if complaint := _bad_cell(cells[column].strip(), delimiter):
+                raise ValueError(f"row {row + at}, field {names[column]}: {complaint}")
     raise ValueError(f"rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again")
 
 
-def _told(cell: str) -> str:
+def _or_nan(cell: str) -> str:
     return "nan" if cell.strip().lower() in NOTHING else cell
 
 
 def _bad_cell(cell: str, delimiter: str) -> str:
     """Explain why a cell is not a number and what to do; "" if it is one."""
     with contextlib.suppress(ValueError):
-        np.loadtxt([_told(cell)], delimiter=delimiter, comments=None)
+        np.loadtxt([_or_nan(cell)], delimiter=delimiter, comments=None)
         return ""
     if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell):
         advice = 'set format = {delimiter = ";", decimal = ","} in a column map, columns=…'

@@ -108,16 +108,16 @@ def record(
     """
     parts = {name: part for name, part in parts.items() if len(part.ticks)}
     if not parts:
-        said = "".join(f" ({note})" for note in notes)
-        raise ValueError(f"contains no quantity of a flight{said}; see docs/howto/logs.md for what to log")
-    said, signals, ordered = list(notes), {}, {}
+        remarks = "".join(f" ({note})" for note in notes)
+        raise ValueError(f"contains no quantity of a flight{remarks}; see docs/howto/logs.md for what to log")
+    remarks, signals, ordered = list(notes), {}, {}
     for name, part in parts.items():
         kept, lines = _in_order(part.source, part.ticks, tick)
         same = np.flatnonzero(np.diff(part.ticks) == 0)
         if (part.values[same + 1] != part.values[same]).any(axis=1).sum() > SHARED * len(part.ticks):
             raise ValueError(f"{part.source}: many samples share a time: {FEW_DIGITS}")
         ordered[name] = part._replace(ticks=part.ticks[kept], values=part.values[kept])
-        said += [f"{part.source}: {line}: left out" for line in lines]
+        remarks += [f"{part.source}: {line}: left out" for line in lines]
     start = min(part.ticks[0] for part in ordered.values())
     lost = _lost("attitude", ordered["attitude"]) if "attitude" in ordered else np.ones(1, bool)
     for name, part in ordered.items():
@@ -127,7 +127,7 @@ def record(
             gone |= lost if lost.mean() <= LOST else False  # a message without an attitude lacks the position, too
         if gone.any() and (name in OPTIONAL or gone.mean() <= LOST):
             why = f"{name} is not a {'rotation' if name == 'attitude' else 'number'} in {gone.sum()} samples"
-            said.append(f"{part.source}: {why}, the first at {t[gone][0]:.4g} s: left out")
+            remarks.append(f"{part.source}: {why}, the first at {t[gone][0]:.4g} s: left out")
             t, part = t[~gone], part._replace(values=part.values[~gone])
         elif gone.any():
             raise ValueError(f"{part.source}: {_wrong(name, part, int(gone.argmax()), t)}")
@@ -135,10 +135,10 @@ def record(
         if len(own) < len(t):
             apart = float(np.median(np.diff(own)))
             drawn = f"values repeated, or lines between samples {apart:.3g} s apart"
-            said.append(f"{part.source}: {drawn}: read as these samples")
+            remarks.append(f"{part.source}: {drawn}: read as these samples")
         if len(t):
             signals[name] = Signal(own, values, axes_of(name, values.shape[1]), part.source)
-    return Recording(str(path), signals, tuple(dict.fromkeys(said)), facts or {})
+    return Recording(str(path), signals, tuple(dict.fromkeys(remarks)), facts or {})
 
 
 def _lost(name: str, part: Samples) -> np.ndarray:

@@ -181,8 +181,8 @@ def _require(topic: str, types: Mapping[str, str], role: str = "", kinds: Collec
     kind = types[topic].split("/")[-1]
     if role and kind not in kinds:
         others = [other for other, readers in READERS.items() if kind in readers]
-        mend = f'; it can be {others[0]}: topics={{"{others[0]}": "{topic}"}}' if others else ""
-        raise ValueError(f"topics: {role} must be of type {', '.join(sorted(kinds))}; {topic} is {kind}{mend}")
+        advice = f'; it can be {others[0]}: topics={{"{others[0]}": "{topic}"}}' if others else ""
+        raise ValueError(f"topics: {role} must be of type {', '.join(sorted(kinds))}; {topic} is {kind}{advice}")
 
 
 def _stamps(messages) -> np.ndarray:
