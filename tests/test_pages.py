@@ -136,6 +136,8 @@ MEASURE = """(page, window) => {
     sideways: page.documentElement.scrollWidth > window.innerWidth,
     tables: frames.filter(frame => frame.getBoundingClientRect().right > right + 1).length,
     formulas: [...page.querySelectorAll("math")].filter(each => each.getBoundingClientRect().height < 3).length,
+    bars: [...page.querySelectorAll("math")].filter(
+      each => each.scrollHeight > each.clientHeight && window.getComputedStyle(each).overflowY == "auto").length,
     source: page.querySelectorAll(".arithmatex").length,
     styles: [...page.styleSheets].filter(each => each.href && !each.cssRules.length).length,
     pictures: [...page.images].filter(each => each.complete && !each.naturalWidth).length,
