@@ -287,11 +287,6 @@ def _parameters(
             bound = {"effective": reason} if reason else {"low": float(low), "high": float(high)}
             change = {} if reason == BY_ROTORS else {"change": (least, most)}
             found[name] = replace(found[name], **bound, **change)
-    return {
-        "parameters": found,
-        "without_intervals": None,
-        "covariance": whole,
-        "degrees": degrees,
-        "absorbed": absorbed,
-        "changed": tuple(sorted(moved, key=lambda name: -moved[name])),
-    }
+    changed = tuple(sorted(moved, key=lambda name: -moved[name]))
+    numbers = {"covariance": whole, "degrees": degrees, "absorbed": absorbed, "changed": changed}
+    return {"parameters": found, "without_intervals": None} | numbers

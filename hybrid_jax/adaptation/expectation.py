@@ -66,10 +66,8 @@ def expected_errors(
         rmse = np.sqrt(power.mean())
         return float(rmse), float(rmse * np.exp(-away)), float(rmse * np.exp(away))
 
-    return {
-        f"{seconds[horizon]:g} s": {one.name: around(part, one.scale, horizon) for part, one in space.parts}
-        for horizon in range(2 if seconds[1] > seconds[0] else 1)
-    }
+    horizons = range(2 if seconds[1] > seconds[0] else 1)
+    return {f"{seconds[i]:g} s": {one.name: around(part, one.scale, i) for part, one in space.parts} for i in horizons}
 
 
 def lines_of(expected: Expected, units: Mapping[str, str]) -> list[str]:
@@ -77,10 +75,8 @@ def lines_of(expected: Expected, units: Mapping[str, str]) -> list[str]:
         around = f"{low:.2g} to {high:.2g}" if high < FAR * value else NO_INTERVAL
         return f"{name} {value:.3g} ({around}) {units[name]}".rstrip()
 
-    return [
-        f"  after {horizon}: {', '.join(text(name, *errors) for name, errors in found.items())}"
-        for horizon, found in expected.items()
-    ]
+    texts = {horizon: [text(name, *errors) for name, errors in found.items()] for horizon, found in expected.items()}
+    return [f"  after {horizon}: {', '.join(found)}" for horizon, found in texts.items()]
 
 
 def errors_at_ends(

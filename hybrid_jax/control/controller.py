@@ -110,11 +110,10 @@ class Controller:
         checks.not_negative("rotor_lag", self.rotor_lag)
         if abs(self.stride * self.period - self.interval) > 1e-6 * self.interval:
             raise ValueError(f"interval must be a multiple of period {self.period}, got {self.interval}")
-        if not self.min_speed < self.vehicle.hover_speed < self.vehicle.max_rotor_speed:
-            raise ValueError(
-                f"vehicle: its hover speed {self.vehicle.hover_speed:.4g} must lie between min_speed {self.min_speed} "
-                f"and max_rotor_speed {self.vehicle.max_rotor_speed}"
-            )
+        low, hover, high = self.min_speed, self.vehicle.hover_speed, self.vehicle.max_rotor_speed
+        if not low < hover < high:
+            known = f"min_speed {low} and max_rotor_speed {high}"
+            raise ValueError(f"vehicle: its hover speed {hover:.4g} must be between {known}")
 
     @property
     def stride(self) -> int:

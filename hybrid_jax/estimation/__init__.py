@@ -16,5 +16,4 @@ from hybrid_jax.estimation.uncertainty import (
 )
 
 __all__ = ["DisturbanceSelection", "Interval", "LeastSquaresFit", "covariance_of", "fit_least_squares", "intervals"]
-__all__ += ["select_disturbance"]
-__all__ += ["RecordFit", "fit_disturbance", "fit_records", "observe", "predict", "simulate"]
+__all__ += ["RecordFit", "fit_disturbance", "fit_records", "observe", "predict", "select_disturbance", "simulate"]

@@ -106,12 +106,10 @@ def errors_after_one(
 ) -> Float[np.ndarray, "n t e"]:
     """Return a field's error after each interval, over its length [s], in the tangent space of the state."""
     before = np.concatenate([past.x0[:, None], past.x[:, :-1]], axis=1)
-    (n, t, d), m = before.shape, past.u.shape[-1]
+    n, t, _ = before.shape
     count = -(-n * t // CHUNK) * CHUNK  # so that all sequences share a program
-    rows = [
-        np.resize(each, (count, each.shape[-1]))
-        for each in (before.reshape(-1, d), past.u.reshape(-1, m), past.x.reshape(-1, d))
-    ]
+    flat = (part.reshape(n * t, part.shape[-1]) for part in (before, past.u, past.x))
+    rows = [np.resize(each, (count, each.shape[-1])) for each in flat]
     parts = [_one_step(field, [row[i : i + CHUNK] for row in rows], past.dt, solver) for i in range(0, count, CHUNK)]
     return np.concatenate(parts)[: n * t].reshape(n, t, -1)
 

@@ -66,13 +66,8 @@ def judged(state: State, cost: Float[Array, ""], tolerance: float = 0.0) -> tupl
     factor = jnp.where(first, 1, jnp.where(accepted, jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), 4))
     damping = jnp.maximum(state.damping * factor, SMALLEST)
     slow = jnp.where(accepted, jnp.where(~first & (-change < tolerance * state.cost), state.slow + 1, 0), state.slow)
-    return accepted, state._replace(
-        cost=jnp.where(accepted, cost, state.cost),
-        damping=damping,
-        steps=state.steps + 1,
-        slow=slow,
-        converged=state.last | (slow >= SLOW),
-    )
+    cost, ended = jnp.where(accepted, cost, state.cost), state.last | (slow >= SLOW)
+    return accepted, state._replace(cost=cost, damping=damping, steps=state.steps + 1, slow=slow, converged=ended)
 
 
 def aimed(state: State, tried: PyTree, expected: Float[Array, ""], least: Float[Array, ""] | float = 0.0) -> State:

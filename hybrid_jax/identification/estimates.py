@@ -232,17 +232,12 @@ def _actuator(found: Estimate, mass: float, thrust: float) -> str:
     curve, origin = [0.0, 0.0, thrust], "hover only, assuming that thrust is proportional to the squared command"
     if found.curve is not None:
         curve, origin = mass * found.curve, "the accelerometer"
-    lines = [
-        f'gives = "thrust"  # of a rotor [N], of the command from 0 to 1; from {origin}',
-        f"curve = [{', '.join(f'{each:.5g}' for each in curve)}]",
-    ]
+    gives = f'gives = "thrust"  # of a rotor [N], of the command from 0 to 1; from {origin}'
+    lines = [gives, f"curve = [{', '.join(f'{each:.5g}' for each in curve)}]"]
     if found.placed and found.lag:
         lines += [f"time_constants = {found.lag:.3g}  # s; the one that explains roll and pitch best"]
     if np.isfinite(found.voltage):
-        lines += [
-            f"nominal_voltage = {found.voltage:.4g}  # V in hover",
-            "# voltage_exponent = 1.0  # if commands are PWM",
-        ]
+        lines += [f"nominal_voltage = {found.voltage:.4g}  # V in hover", "# voltage_exponent = 1.0  # for PWM"]
     return "\n".join(["\n[actuator]", *lines, ""])
 
 

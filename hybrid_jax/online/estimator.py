@@ -125,26 +125,19 @@ class OnlineAdaptation(AbstractEstimator):
             checks.places("indices", indices, len(x))
         p, none, zero = ravel_parameters(self.field)[0].size, jnp.zeros_like(x), jnp.zeros((), x.dtype)
         theta, variances = jnp.zeros(p, x.dtype), self._variances(x)
-        mixture = multiple_model.initial(self._models(), x, variances) if self.hypotheses else None
+        zeros = dict.fromkeys(("theta", "trusted", "settled", "reset", "log_walk"), theta)
+        zeros |= dict.fromkeys(("alarms", "burst", "changes", "restarts"), zero)
         return OnlineState(
             x=x,
-            theta=theta,
             root=kalman.diagonal_root(variances, theta + 1),
             excitation=Excitation.begin(len(x), p, x.dtype),
             test=ChangeTest.begin(p, x.dtype),
-            mixture=mixture,
-            trusted=theta,
-            settled=theta,
-            alarms=zero,
-            burst=zero,
-            reset=theta,
-            log_walk=theta,
+            mixture=multiple_model.initial(self._models(), x, variances) if self.hypotheses else None,
             nis=zero + 1,
             signs=SensorSigns.begin(state_space(self.field, len(x)), x),
             order=RotorOrder.begin(vehicle.rotors if (vehicle := vehicle_in(self.field)) else 0, len(x) + p, x.dtype),
             history=SampleHistory(x, none, zero, none),
-            changes=zero,
-            restarts=zero,
+            **zeros,
         )
 
     @entry

@@ -274,9 +274,8 @@ def _result(search: _Search, best: Coefficients, wanted: tuple[str, ...], asked,
     theta, unravel = ravel_parameters(search.model)
     slopes = jax.jvp(lambda theta: named_parameters(unravel(theta)), (theta,), (jnp.ones_like(theta),))[1]
     own = np.flatnonzero(asked)
-    errors = dict.fromkeys(wanted, math.inf) | {
-        names[i]: abs(float(slopes[names[i]])) * math.sqrt(covariance[i, i]) for i in own
-    }
+    sizes = np.sqrt(np.diagonal(covariance)).tolist()
+    errors = dict.fromkeys(wanted, math.inf) | {names[i]: abs(float(slopes[names[i]])) * sizes[i] for i in own}
     left = 1 - np.asarray(design.uses(x, u)).max(axis=0, initial=0.0)
     return Excitation(
         reference=design.path(best),

@@ -217,11 +217,8 @@ def gather(tree: PyTree) -> PyTree:
     # As one array of bytes: each exchange takes milliseconds at any size, and JAX would truncate 64-bit numbers.
     rows = [np.ascontiguousarray(leaf).ravel().view(np.uint8) for leaf in leaves]
     found = _exchange(lambda: multihost_utils.process_allgather(np.concatenate(rows)))
-    parts = np.split(found, np.cumsum([len(row) for row in rows])[:-1], axis=1)
-    return structure.unflatten(
-        np.ascontiguousarray(part).view(leaf.dtype).reshape(-1, *leaf.shape[1:])
-        for part, leaf in zip(parts, leaves, strict=True)
-    )
+    both = zip(np.split(found, np.cumsum([len(row) for row in rows])[:-1], axis=1), leaves, strict=True)
+    return structure.unflatten(np.ascontiguousarray(a).view(b.dtype).reshape(-1, *b.shape[1:]) for a, b in both)
 
 
 def agreed(number: int) -> int:

@@ -159,9 +159,8 @@ def _loop(function, width: int, lanes: PyTree, chunks: Int[jax.Array, ""], share
 
     def body(i, results):
         part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, i * width, width), arrays)
-        return jax.tree.map(
-            lambda whole, new: jax.lax.dynamic_update_slice_in_dim(whole, new, i * width, 0), results, chunk(part)
-        )
+        put = partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * width, axis=0)
+        return jax.tree.map(put, results, chunk(part))
 
     shapes = jax.eval_shape(one, jax.tree.map(lambda leaf: leaf[0], arrays), shared)
     results = jax.tree.map(lambda s: jnp.zeros((count(lanes), *s.shape), s.dtype), shapes)
