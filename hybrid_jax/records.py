@@ -84,10 +84,8 @@ class Record:
 
         Args:
             name: what messages call the experiment.
-            signals: the times [s] (n,) and values (n,) or (n, k) of each signal. Samples with NaN are left out.
-
-        Raises:
-            ValueError: see `Signal`.
+            signals: the times [s] (n,) and values (n,) or (n, k) of each signal; ValueError as for `Signal`. Samples
+                with NaN are left out.
         """
         found = {}
         for label, (t, values) in signals.items():

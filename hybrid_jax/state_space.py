@@ -89,15 +89,11 @@ class Quantity:
         return path
 
     def check(self, name: str, x: Numbers, part: slice) -> None:
-        """Raise an error if this quantity is invalid in a state.
+        """Raise ValueError if this quantity is invalid in one of the states x (…, d).
 
         Args:
             name: what the message calls the states.
-            x: the states (…, d).
             part: which of their numbers belong to the quantity.
-
-        Raises:
-            ValueError: if a state is invalid.
         """
 
 
@@ -261,14 +257,10 @@ class StateSpace:
         return own
 
     def check(self, name: str, x: Numbers) -> None:
-        """Raise an error if a state is invalid, for example if a quaternion is not of unit length.
+        """Raise ValueError, with the index, if one of the states x (…, d) is invalid, for example has |q| ≠ 1.
 
         Args:
             name: what the message calls the states.
-            x: states (…, d).
-
-        Raises:
-            ValueError: if a state is invalid, with its index and what was expected.
         """
         for part, one in self._curved():
             one.check(name, x, part)

@@ -33,7 +33,7 @@ QUICKEST = 1e-3  # s, shortest time constant that is learned
 
 @dataclass(frozen=True)
 class Actuator:
-    """The map from command to rotor speed: the table `[actuator]` of a vehicle file.
+    """The map from command to rotor speed: the table `[actuator]` of a vehicle file. ValueError if a field is invalid.
 
     Attributes:
         curve: coefficients c0, c1, … of the polynomial Σ ci command^i, in the unit of `gives`.
@@ -42,9 +42,6 @@ class Actuator:
         nominal_voltage: V₀, the battery voltage at which the curve is valid [V]; 0 if the voltage does not matter.
         voltage_exponent: γ. It should be 0 if the vehicle compensates for its voltage, and else near 1.
         delay: the time between logging a command and its effect [s], constant over a log.
-
-    Raises:
-        ValueError: if a field is invalid.
     """
 
     curve: tuple[float, ...]

@@ -37,13 +37,10 @@ class ConstantDisturbance(AbstractVectorField):
         return jnp.broadcast_to(self.vector(len(x)).reshape(-1, *(1,) * (x.ndim - 1)), x.shape)
 
     def vector(self, d: int) -> Float[Array, " d"]:
-        """Return ẋ (d,), which is the same for all x and u.
+        """Return ẋ (d,), which is the same for all x and u; ValueError if an index is out of range.
 
         Args:
             d: size of the state.
-
-        Raises:
-            ValueError: if an index is out of range for d.
         """
         if self.value.ndim == 0:
             return jnp.broadcast_to(self.value, (d,))

@@ -199,10 +199,7 @@ def diffusion(grid: Grid, diffusivity: Sequence[float]) -> Diffusion:
 
     Args:
         grid: the grid of the state.
-        diffusivity: D [m²/s] of each component.
-
-    Raises:
-        ValueError: if a diffusivity is not positive, or there is not one for each component.
+        diffusivity: D [m²/s] of each component; ValueError if one is not positive, or their number differs.
     """
     if len(diffusivity) != grid.components:
         raise ValueError(f"diffusivity: {grid.components} expected, one for each component, got {len(diffusivity)}")

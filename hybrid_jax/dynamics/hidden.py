@@ -184,11 +184,8 @@ def with_hidden(field: AbstractVectorField, *parts: AbstractHidden) -> WithHidde
 
     Args:
         field: the field that the parts act on.
-        parts: for example `Lag`, `RandomWalk`, `Oscillator` and `LinearDynamics`. The first receives the
-            inputs, each further one the output of the one before.
-
-    Raises:
-        ValueError: if there is no part, or something is not a part.
+        parts: for example `Lag`, `RandomWalk`, `Oscillator` and `LinearDynamics`. The first receives the inputs, each
+            further one the output of the one before. ValueError if there is no part, or something is not a part.
     """
     return WithHidden(field, tuple(checks.list_of("parts", parts, AbstractHidden)))
 

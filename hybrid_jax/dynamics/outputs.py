@@ -72,7 +72,6 @@ class StateSpaceModel(eqx.Module):
 
         Args:
             x0: the unknown initial state (d,).
-            u: the inputs (t, m).
             dt: length of an interval [s].
         """
         return x0, u

@@ -25,6 +25,8 @@ NONE = (0.0, 0.0, 0.0)
 class Terms:
     """Nominal values of further terms of a `RigidBody`, in the body frame; all are absent by default.
 
+    ValueError if a term has another shape, or a number is not finite.
+
     Attributes:
         torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
         centre_of_mass: (x, y) in the frame of the rotors' positions [m].
@@ -35,9 +37,6 @@ class Terms:
         velocity_gain: S, the ratio of the position's derivative to the logged velocity.
         velocity_lag: λ, time constant of the estimated velocity for forces across the thrust [s].
         motor_time_constant: lag of the rotors behind logged motor values [s]; applied to logs, not by the field.
-
-    Raises:
-        ValueError: if a term has another shape, or a number is not finite.
     """
 
     torque_gain: Three = (1.0, 1.0, 1.0)

@@ -91,7 +91,7 @@ def load_logs(
         dt: see `load_windows`.
         cleaning: changes to every log, by default none.
         vehicle: the expected vehicle. You should give it, because the motors are not checked otherwise.
-        failed: whether a failed check raises an error ("refuse") or warns ("warn").
+        failed: give "warn" if a failed check should warn instead of raising an error.
 
     Raises:
         ValueError: if the folder has no logs, or one of them is invalid, with file, row, field and what to do.
@@ -156,10 +156,7 @@ def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
     """List the logs of a folder in alphabetical order, and its other files with the reasons for skipping them.
 
     Args:
-        folder: folder of logs. Hidden files are ignored, and a ROS bag is one log.
-
-    Raises:
-        ValueError: if the folder does not exist.
+        folder: folder of logs; ValueError if it does not exist. Hidden files are ignored, and a ROS bag is one log.
     """
     folder, logs, left = Path(folder), [], {}
     if not folder.is_dir():

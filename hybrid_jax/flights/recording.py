@@ -31,11 +31,7 @@ def axes_of(quantity: str, count: int) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Recording(Record):
-    """The signals of one log, named as in `QUANTITIES`. For the attributes see `hybrid_jax.records.Record`.
-
-    Raises:
-        ValueError: if a quantity or axis is unknown.
-    """
+    """The signals of one log, named as in `QUANTITIES`; ValueError for others. For the attributes see `Record`."""
 
     def __post_init__(self):
         for quantity, signal in self.signals.items():

@@ -63,7 +63,7 @@ def load_windows(
         motor_order: index in the log of each rotor's motor, from 0.
         motor_time_constant: first-order lag [s] of the rotors. Logs with commands instead of rotor speeds need it.
         cleaning: changes to every log, for example `Cleaning(in_flight=True)`; by default none.
-        failed: whether a failed check raises an error ("refuse") or warns ("warn").
+        failed: give "warn" if a failed check should warn instead of raising an error.
 
     Returns:
         Windows in float32: x0 (n, 13), u (n, steps, rotors) [rad/s], x (n, steps, 13), as in `hybrid_jax.vehicle`.

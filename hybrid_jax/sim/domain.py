@@ -33,12 +33,10 @@ class Quadrotor(eqx.Module):
     forces: tuple[Force, ...] = eqx.field(static=True)
 
     def derivative(self, x: State, u: Input, t: Scalar) -> State:
-        """Return ẋ for rotor speeds u [rad/s] at time t [s].
+        """Return ẋ for the state x (13,) and rotor speeds u [rad/s].
 
         Args:
-            x: state (13,).
-            u: rotor speeds [rad/s].
-            t: time [s], for time-dependent forces such as wind.
+            t: time [s], for time-dependent forces, for example wind.
         """
         # Imported here, because MJX takes as long to import as JAX, and cached programs do not need it.
         from hybrid_jax.sim import scene
@@ -49,11 +47,9 @@ class Quadrotor(eqx.Module):
         return jnp.concatenate([x[VELOCITY], turning, scene.accelerations(self.parameters, x, u, applied)])
 
     def step(self, x: State, u: Input, t: Scalar, dt: Scalar | float) -> State:
-        """Return the state after dt [s] with constant u from time t on, by one step of classical RK4.
+        """Return the state after one RK4 step from the state x (13,), with constant rotor speeds u [rad/s].
 
         Args:
-            x: state (13,).
-            u: rotor speeds [rad/s].
             t: time at the start [s].
             dt: length of the step [s].
         """

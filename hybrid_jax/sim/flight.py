@@ -59,7 +59,6 @@ def random_flights(domain: Domain, flights: int, seconds: float, key: PRNGKeyArr
         domain: the simulated system.
         flights: number of flights.
         seconds: length of each flight [s].
-        key: random key.
 
     Raises:
         ValueError: if flights or seconds are not positive, or key is not a random key.

@@ -43,14 +43,11 @@ class Cleaning:
 
 
 def clean(log: FlightLog, cleaning: Cleaning) -> tuple[FlightLog, list[str]]:
-    """Apply changes to a log. The second result describes each of them in one line.
+    """Apply changes to a log; ValueError if one is impossible. The second result describes each of them in one line.
 
     Args:
         log: the log to change.
         cleaning: the changes to make.
-
-    Raises:
-        ValueError: if a change is impossible.
     """
     resampling = cleaning.resample or log.dt, cleaning.longest_gap
     changes = ("in_flight", in_flight, ()), ("resample", resample, resampling), ("delay", delay, (cleaning.delay,))
