@@ -69,10 +69,7 @@ def report(record: Mapping[str, Any]) -> Report:
     return Report(record, draw(rows), made, conclusion(rows), verdicts, HEAD)
 
 
-ABOUT = (
-    "A partial differential equation from one trajectory: forecasts and parameters against published numbers, and "
-    "adaptation after a change. The default takes about 40 minutes on one core, quick 2 minutes."
-)
+ABOUT = "A partial differential equation from one trajectory: forecasts, parameters, and adaptation after a change."
 main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":

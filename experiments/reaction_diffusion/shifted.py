@@ -1,5 +1,6 @@
 """The second study: adapt to changed equations from a few trajectories, as in the paper's Figs. 3 and 5."""
 
+import warnings
 from functools import cache, partial
 from itertools import product
 from typing import Any
@@ -44,7 +45,8 @@ def by_parameters(field, data: hj.Trajectories, method: str) -> tuple[hj.Abstrac
     # one before it: of eight trajectories they would all be beginnings, which say little of what comes after.
     every, each = WINDOW * len(data), range(len(data))
     windows = joined([pieces(data[i : i + 1], every, WINDOW, WINDOW * i) for i in each])
-    result = hj.adapt(field, windows, method=method, settings=hj.Settings(solver=COARSE))
+    with warnings.catch_warnings(action="ignore"):  # the step is coarse for speed, and all errors count as changes
+        result = hj.adapt(field, windows, method=method, settings=hj.Settings(solver=COARSE))
     return result.field, result.chosen
 
 

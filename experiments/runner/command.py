@@ -24,6 +24,9 @@ from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
 Options = TypeVar("Options")
+# Of the full experiment on two cores, as the stages of the report in docs/reference took together.
+MINUTES = {"param_shift": 35, "external_force": 35, "changes": 35, "ablation": 160, "closed_loop": 90, "excitation": 9}
+MINUTES |= {"online": 5, "reaction_diffusion": 40}
 
 
 def run(
@@ -103,6 +106,7 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
     if chosen not in presets:
         raise ValueError(f"--preset must be one of {', '.join(presets)}, got {chosen!r}")
     kind = type(presets[chosen])
+    about += f" The full run takes about {MINUTES[name]} minutes on two cores." if name in MINUTES else ""
     description = "\n\n".join([about, *(cleandoc(each.__doc__ or "") for each in (kind, Run))])
     return parsed(kind, _program(name), arguments, presets[chosen], description, COMMON)
 

@@ -24,6 +24,7 @@ from experiments.identification import emps, record, tanks
 from experiments.paper.config import SMOKE
 from experiments.paper.lanes import physics_in
 from experiments.paper.study import placeholder, study
+from experiments.runner.command import MINUTES
 from hybrid_jax.sim import PARAMETER_SHIFT, SplitSpec
 from hybrid_jax.vehicle import IRIS
 
@@ -178,6 +179,13 @@ def test_help_has_a_screen_of_options_for_users(name, monkeypatch, capsys):
     assert 4 <= sum(line.startswith("  --") for line in said) <= 12
     assert sum(line.startswith("  ") for line in said) <= 20
     assert max(map(len, said)) <= 80
+
+
+@pytest.mark.parametrize("name", MINUTES)
+def test_help_says_how_long_the_full_run_took(name):
+    record = json.loads((ROOT / "docs/reference" / name / "report.json").read_text())
+    assert record["config"]["preset"] == "paper"
+    assert MINUTES[name] == pytest.approx(sum(record["environment"]["seconds"].values()) / 60, rel=0.15)
 
 
 def write(path, columns, t, u, y):
