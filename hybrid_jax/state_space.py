@@ -22,12 +22,10 @@ class Quantity:
         name: its name, for example "velocity".
         size: the number of entries of the state that it has.
         unit: the unit of its entries, for example "m/s"; empty without a unit.
-        labels: a short name of each entry, for example ("vx", "vy", "vz"); empty to use their indices.
+        labels: a short name of each entry, for example ("vx", "vy", "vz"); empty to use their indices. ValueError for
+            another number of them.
         scale: the norm of a typical small difference of the quantity, in its unit.
         uniform: whether its numbers are one quantity at many points, so that a constant disturbance is one number.
-
-    Raises:
-        ValueError: if the size is not a count, or the number of labels differs from it.
     """
 
     name: str

@@ -60,10 +60,8 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
     Args:
         field: physics, or a hybrid.
         indices: the disturbed states; by default given by the state space of the physics, for example v̇ and ω̇ of a
-            rigid body, or each component of physics on a `Grid` (one number for all points).
-
-    Raises:
-        ValueError: if the field already has a nonzero disturbance of other states.
+            rigid body, or each component of physics on a `Grid` (one number for all points). ValueError if the field
+            already has a nonzero disturbance of other states.
     """
     if (known := disturbance_of(field)) is not None:
         if indices is None or indices == known.indices:

@@ -128,9 +128,10 @@ def check_grid(
     substeps: int = 1,
     name: str = "windows",
 ) -> None:
-    """Raise an error if windows are not on the grid, not periodic, or sampled too slowly for the solver's steps.
+    """Raise ValueError if windows are not on the grid, not periodic, or sampled too slowly for the solver's steps.
 
     You should call this before you fit. Differences across an edge may be three times as large as between neighbours.
+    If samples are too slow, the message contains the number of substeps that you need.
 
     Args:
         grid: the grid of each state.
@@ -138,9 +139,6 @@ def check_grid(
         diffusivity: one or several D [m²/s], of which the largest bounds the step; 0 for no bound.
         substeps: number of solver steps in each interval of the windows.
         name: name of the windows in messages.
-
-    Raises:
-        ValueError: if one of these is true. For slow samples, the message contains the substeps that you need.
     """
     size = check(windows, name).x0.shape[-1]
     if size != grid.size:

@@ -52,7 +52,9 @@ def load_log(
     motor_order: Sequence[int] = (),
     dt: float | None = None,
 ) -> FlightLog:
-    """Read one log. It is not checked; for this, you should use `check_recording` and `check_log`.
+    """Read one log without checking it; for this, you should use `check_recording` and `check_log`.
+
+    If it cannot be read, the ValueError names file, row, field and what to do.
 
     Args:
         path: a log of any format that `read_recording` reads.
@@ -61,9 +63,6 @@ def load_log(
         topics: see `load_windows`.
         motor_order: see `load_windows`.
         dt: interval between samples [s] if the signals have times of their own, by default 0.01; otherwise ignored.
-
-    Raises:
-        ValueError: if the log is invalid, with file, row, field and what to do.
     """
     return flight_at(read_recording(path, columns, topics, motor_order), dt, polynomial)
 
@@ -178,16 +177,13 @@ def read_recording(
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
 ) -> Recording:
-    """Read one log of any supported format.
+    """Read one log of any supported format; ValueError, with file, topic or column, and time, if it is invalid.
 
     Args:
         path: a file, or the folder of a ROS bag.
         columns: see `load_windows`.
         topics: topics of a ROS bag by quantity: see `hybrid_jax.flights.formats.rosbag`.
         motor_order: index in the log of each rotor's motor; by default the vehicle's order.
-
-    Raises:
-        ValueError: if the log is invalid, with file, topic or column, time and what was expected.
     """
     column_map = load_column_map(columns) if columns is not None else None
     kind, why = format_of(path)

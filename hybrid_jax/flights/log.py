@@ -57,11 +57,7 @@ class FlightLog:
 
     @property
     def dt(self) -> float:
-        """The median interval between samples [s], rounded to nanoseconds so that logs of equal rate agree.
-
-        Raises:
-            ValueError: if the log has fewer than two samples.
-        """
+        """The median interval between samples [s], to nanoseconds; ValueError if there are fewer than two."""
         if len(self) < 2:
             raise ValueError(f"{self.name}: has {len(self)} samples; at least two are needed for an interval")
         return round(float(np.median(np.diff(self.t))), 9)

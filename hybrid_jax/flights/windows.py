@@ -44,7 +44,7 @@ def load_windows(
     cleaning: Cleaning | None = None,
     failed: Failed = "refuse",
 ) -> Trajectories:
-    """Read all logs of a folder, check them against the vehicle and cut them into windows.
+    """Read all logs of a folder, check them against the vehicle and cut them into windows; ValueError for invalid ones.
 
     Windows never cross a gap or a repeated sample. Motors are constant in each interval of a window, so faster motor
     signals are averaged. You get a warning of one line for each check that warns, for example for slow motor signals.
@@ -67,9 +67,6 @@ def load_windows(
 
     Returns:
         Windows in float32: x0 (n, 13), u (n, steps, rotors) [rad/s], x (n, steps, 13), as in `hybrid_jax.vehicle`.
-
-    Raises:
-        ValueError: if a file or argument is invalid.
     """
     checks.count("steps", steps)
     checks.count("stride", stride)
@@ -98,11 +95,8 @@ def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[Flig
 
     Args:
         logs: the flights.
-        names: the names of the flights to hold out.
+        names: the names of the flights to hold out; ValueError if one is unknown, or if none or all are named.
         of: function that names a flight, for example `flight_of` or `manoeuvre_of`.
-
-    Raises:
-        ValueError: if a name is unknown, or one side is empty.
     """
     known = sorted({of(log) for log in logs})
     for name in names:
@@ -122,12 +116,9 @@ def folds(
 
     Args:
         logs: the flights.
-        count: number of splits; by default one for each name.
+        count: number of splits; by default one for each name. ValueError unless it is from 2 to the number of names.
         of: function that names a flight, for example `flight_of` or `manoeuvre_of`.
         seed: random seed for assigning names to splits.
-
-    Raises:
-        ValueError: if count is less than 2 or more than the number of names.
     """
     names = sorted({of(log) for log in logs})
     count = len(names) if count is None else count

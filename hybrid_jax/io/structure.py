@@ -62,10 +62,7 @@ def portable(item: Any = None, *, name: str | None = None) -> Any:
 
     Args:
         item: the class or function. Without it, as in `@portable(name="mine")`, the result is the decorator.
-        name: the name in files, which should be unique; by default its own.
-
-    Raises:
-        ValueError: if another class or function already has the name.
+        name: the name in files; by default its own. It should be unique: ValueError if another one has it.
     """
     if item is None:
         return partial(portable, name=name)
