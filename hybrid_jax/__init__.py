@@ -12,5 +12,5 @@ from its logs).
 
 import lazy_loader
 
-# Names are imported when they are first used (Scientific Python's SPEC 1). To import all takes longer than JAX itself.
+# Names are imported when they are first used (Scientific Python's SPEC 1). Importing all takes longer than JAX itself.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -39,7 +39,7 @@ def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Flo
 
     Args:
         predicted: x̂, predicted states (n, t, d) or, for one window, (t, d).
-        truth: x, the true states, of the same shape.
+        truth: x, the true states, which should have the same shape.
     """
     if predicted.shape != truth.shape or predicted.ndim < 2 or 0 in predicted.shape[-2:]:
         raise ValueError(f"predicted and truth must both be (n, t, d), got shapes {predicted.shape} and {truth.shape}")

@@ -19,7 +19,7 @@ class Signal:
     """The n samples of one quantity.
 
     Attributes:
-        t: time of each sample [s], strictly increasing, from the start of the record.
+        t: time of each sample [s] from the start of the record, which should increase strictly.
         values: the samples (n, k), with a column for each axis. They should be in SI units.
         axes: the names of the measured axes; by default "0", "1", …
         source: the topic, group or columns that it came from, for messages.

@@ -266,7 +266,7 @@ class StateSpace:
     def features(self, x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
         """Return, by name, the quantities that decide how alike samples are; by default each number of x and of u."""
         known = self.padded(x.shape[1]).quantities
-        # A label alone may be that of two quantities, for example "left" of an angle and of its rate.
+        # Two quantities may have equal labels, for example "left" of an angle and of its rate.
         names = [one.name + f" {each}" * (one.size > 1) for one in known for each in one.labels or range(one.size)]
         names += [f"u[{i}]" for i in range(u.shape[1])]
         return dict(zip(names, (*x.T, *u.T), strict=True))

@@ -176,7 +176,7 @@ def concatenate(windows: Iterable[Trajectories]) -> Trajectories:
     """Join windows in their order; ValueError if there are none, or dt, horizon, or sizes of state or input differ.
 
     Args:
-        windows: parts with the same dt, horizon, and sizes of state and input.
+        windows: parts, which should have the same dt, horizon, and sizes of state and input.
     """
     parts = checks.list_of("windows", windows, Trajectories)
     if len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:

@@ -230,7 +230,7 @@ def rotor_speeds(
         field: the body with its actuators.
         t: times (n,) of the inputs [s]; each input is held until the next.
         commands: inputs u (n, m) of the field at these times, with the voltage [V] last if the field reads it.
-        edges: ascending edges (k,) of the intervals [s].
+        edges: edges (k,) of the intervals [s], which should ascend.
     """
     u = np.asarray(held_means(jnp.asarray(t), jnp.asarray(commands), jnp.asarray(edges), field.delay))
     targets = np.asarray(field.steady_speeds(jnp.asarray(u.T)).T)

@@ -96,7 +96,7 @@ class Grid:
 
         Args:
             fields: as returned by `fields`.
-            kernel: number of points along each side of the neighbourhood, odd.
+            kernel: number of points along each side of the neighbourhood, which should be odd.
         """
         if kernel == 1:
             return [fields]

@@ -20,7 +20,7 @@ class FlightLog:
     """The n samples of one flight. Quaternions are normalised, and continuous in sign, with w ≥ 0 in the first.
 
     Attributes:
-        t: time of each sample [s], strictly increasing.
+        t: time of each sample [s], which should increase strictly.
         x: state (n, 13) at that time, as in `hybrid_jax.vehicle`: z up, forward-left-up, SI units.
         u: rotor speeds (n, rotors) [rad/s], constant from this sample to the next.
         name: name of the flight in messages and reports, usually its file.

@@ -151,7 +151,7 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1, most: in
     """Cut logs into windows of `steps` intervals without gaps. Logs shorter than a window are skipped.
 
     Args:
-        logs: evenly sampled flights.
+        logs: flights, which should be evenly sampled.
         steps: number of intervals in each window.
         stride: number of samples between the starts of two windows.
         most: the largest number of windows to return, spread evenly; by default all.

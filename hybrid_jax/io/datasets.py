@@ -26,7 +26,7 @@ class Dataset:
 
     Attributes:
         splits: the windows of each split, by its name, for example "train".
-        metadata: JSON values. The entry `config` determines the windows; others describe them, for example "versions".
+        metadata: JSON values. The entry `config` should determine the windows; others may describe them.
     """
 
     splits: Mapping[str, Trajectories]

@@ -28,7 +28,7 @@ class GridNetwork(AbstractVectorField):
     Attributes:
         network: the network that is evaluated at each point.
         grid: the grid of the state.
-        kernel: number of points along each axis that the network reads, odd.
+        kernel: number of points along each axis that the network reads, which should be odd.
     """
 
     accepts_batch: ClassVar[bool] = True

@@ -15,7 +15,8 @@ from hybrid_jax.export.program import Size, sizes_of
 from hybrid_jax.runtime import entry
 
 UPDATE = """\
-After a sample x, NaN where nothing was measured, and the mean input u since the last update, periods of {}_DT ago."""
+The state after a sample x, NaN where nothing was measured. u is the mean input since the last update, which should be
+   periods times {}_DT ago."""
 
 
 @entry
@@ -86,7 +87,7 @@ def _about(names: Sequence[str], places: Mapping[str, tuple[int, int]]) -> str:
 A filter that adapts a model while it runs, written by hybrid_jax.
 
    state: {layout}.
-   theta holds the changes of {", ".join(map(_plain, names))},
+   theta contains the changes of {", ".join(map(_plain, names))},
    in the standard deviations of their prior.
    No function allocates or keeps a state; results must not overlap what is read."""
 

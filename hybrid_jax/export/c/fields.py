@@ -21,13 +21,13 @@ A model dx/dt = f(x, u), written by hybrid_jax.
 
    Matrices are in row-major order: dx[i][j] is the derivative of entry i of the result by x[j].
    No function allocates, keeps a state or changes what it reads; results must not overlap what is read.
-   A number that is not finite in x or u goes on into the result: test it there."""
+   If x or u is not finite, the result is not finite either: you should test it."""
 STEP = """\
-The state a step after x with u held: one step of the classical Runge-Kutta method of order 4.
+The state after a step from x with constant u, by the classical Runge-Kutta method of order 4.
    Quaternions are not normalised."""
 OBSERVE = """\
-The state a step after x with u held, where its first {} numbers were measured. The last {} are filtered errors of the
-   model: 0 at the first sample, and then what this function returns, which you carry on."""
+The state after a step from x with constant u, where its first {} numbers were measured. The last {} are filtered errors
+   of the model. They should be 0 at the first sample, and then what this function returns."""
 
 
 @entry
@@ -52,7 +52,7 @@ def export_c(
         folder: where the files are written; it is created if it does not exist.
         field: ẋ = f(x, u), for one state x (d,) and one input u (m,).
         dt: length of a step [s].
-        name: name of the files and prefix of all definitions in the header; a lower-case C identifier.
+        name: name of the files and prefix of all definitions. It should be a lower-case C identifier.
         double: compute in double instead of single precision.
         smooth: see `casadi_function`.
         state_size: d; by default from the field's vehicle or its attribute of this name.
@@ -81,7 +81,7 @@ def export_c(
 
         derivative = file.add("derivative", "dx/dt at the state x under the input u.", fused, inputs, ["xdot"])
         file.add("step", STEP, lambda x, u: _step(derivative, x, u, dt), inputs, ["next"])
-        about, slopes = "As derivative, with its Jacobians.", ["xdot", *jacobians]
+        about, slopes = "Like derivative, with its Jacobians.", ["xdot", *jacobians]
         linearize = file.add("derivative_jacobian", about, linearized, inputs, slopes)
 
         def along(state, u):  # the state, and its derivatives by the start of the step and by u
@@ -91,7 +91,7 @@ def export_c(
         def step_jacobian(x, u):
             return _step(along, (x, jnp.eye(d), jnp.zeros((d, m))), u, dt)
 
-        file.add("step_jacobian", "As step, with its Jacobians.", step_jacobian, inputs, ["next", *jacobians])
+        file.add("step_jacobian", "Like step, with its Jacobians.", step_jacobian, inputs, ["next", *jacobians])
         if isinstance(field, DisturbanceModel):
             shapes = inputs | {OBSERVED[-1]: (d - field.hidden,)}
             likes = [jax.ShapeDtypeStruct(shape, float) for shape in shapes.values()]

@@ -34,8 +34,7 @@ KINEMATICS_LIMIT = 0.5
 THRUST_LIMIT = 0.6
 AXIS_LIMIT = 0.8  # of a single axis, where noise is a larger share
 FEWEST = 20  # intervals to compare
-# s of moving average on both sides of an equation. A longer one is tried if no mistake explains a difference: it may be
-# noise.
+# s of moving average on both sides of an equation. A longer one is tried if no mistake explains a difference.
 SPANS = (0.05, 0.2, 0.8)
 GAIN_LIMIT = 1.25  # of one record regressed on the other
 THRUST_RATIO_LIMIT = 1.25
