@@ -245,7 +245,7 @@ def check_field(field, x: Array | jax.ShapeDtypeStruct, u: Array | jax.ShapeDtyp
         for part in (field.physics, field.residual) if isinstance(field, Hybrid) else ():
             check_field(part, x, u)  # names the part that does not accept them
         reason = f"{type(error).__name__}: {checks.first_line(error)}"
-        raise ValueError(f"field: {name} does not take {given}: {reason}") from error
+        raise ValueError(f"field: {name} does not accept {given}: {reason}") from error
     if getattr(slope, "shape", None) != x.shape or not jnp.issubdtype(slope.dtype, jnp.floating):
         found = f"{slope.dtype}{list(slope.shape)}" if hasattr(slope, "shape") else type(slope).__name__
         raise ValueError(f"field: {name} must return a derivative {x.shape} for {given}, returned {found}")

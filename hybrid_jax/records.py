@@ -155,7 +155,7 @@ def on_grid(
     begin = first if begin is None else begin
     steps = int(np.ceil((end - begin) / dt - 1e-6))  # the last one may end after the last sample
     if steps < 1:
-        raise ValueError(f"{record.name}: {', '.join((*inputs, *outputs))} share less than dt={dt:.3g} s")
+        raise ValueError(f"{record.name}: {', '.join((*inputs, *outputs))} overlap for less than dt={dt:.3g} s")
     edges = begin + dt * np.arange(steps + 1)
     areas = [integral(record.signals[name], edges, between) for name in inputs]
     u = np.diff(np.concatenate(areas, axis=1), axis=0) / dt if inputs else np.zeros((steps, 0))

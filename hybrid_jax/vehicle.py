@@ -90,7 +90,7 @@ class Vehicle:
         """Reject physically impossible values, and lengths and moments in another unit."""
         arm = max(math.hypot(*place) for place in self.rotor_positions)
         if len(set(self.rotor_positions)) < 2:
-            raise ValueError(f"rotor_positions must not all be one point, got {self.rotor_positions[0]} for each rotor")
+            raise ValueError(f"rotor_positions must not all be equal, got {self.rotor_positions[0]} for each rotor")
         if arm > LONGEST_ARM:
             raise ValueError(f"rotor_positions must be in m: a rotor is {arm:.4g} m from the centre; 1 mm is 0.001")
         largest = max(self.inertia)
@@ -101,7 +101,7 @@ class Vehicle:
         if not low <= largest <= high:
             units = "mass in kg, rotor_positions in m, inertia in kg m² (1 g cm² is 1e-7)"
             fits = f"{self.mass:.4g} kg with rotors {arm:.4g} m from the centre has {low:.2g} to {high:.2g} kg m²"
-            raise ValueError(f"inertia must fit to mass and rotor_positions, got {largest:.4g}: {fits}; give {units}")
+            raise ValueError(f"inertia must match mass and rotor_positions, got {largest:.4g}: {fits}; give {units}")
 
     @property
     def rotors(self) -> int:

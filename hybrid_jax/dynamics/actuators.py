@@ -68,7 +68,7 @@ class Actuator:
         for name in ("voltage_exponent", "delay"):
             require_numbers(name, getattr(self, name), (), "a finite number")
         if self.voltage_exponent and not self.nominal_voltage:
-            raise ValueError("nominal_voltage must be given, as voltage_exponent is not zero")
+            raise ValueError("nominal_voltage must be given, because voltage_exponent is not zero")
         object.__setattr__(self, "curve", as_tuple(np.asarray(self.curve, float).tolist()))
 
 
@@ -216,9 +216,9 @@ def check_actuator_names(learn: tuple[str, ...], actuator: Actuator, of_body: tu
             raise ValueError(f"learn must be names of {', '.join(NAMES)}, got {checks.short_repr(name)}")
         for other in EXCLUSIVE.get(name, ()):
             if other in (*learn, *of_body):
-                raise ValueError(f"learn must not name both {name} and {other}: a common factor is in both")
+                raise ValueError(f"learn must not name both {name} and {other}: both contain a common factor")
     if "voltage_exponent" in learn and not actuator.nominal_voltage:
-        raise ValueError("nominal_voltage must be given in [actuator], as voltage_exponent is to be learned")
+        raise ValueError("nominal_voltage must be given in [actuator], because voltage_exponent is learned")
 
 
 def rotor_speeds(

@@ -31,7 +31,7 @@ class ConstantDisturbance(AbstractVectorField):
 
     def __check_init__(self):
         if self.indices is not None and jnp.shape(self.value)[-1:] != (len(self.indices),):
-            raise ValueError(f"indices must fit a value of shape {jnp.shape(self.value)}, got {self.indices}")
+            raise ValueError(f"indices must match a value of shape {jnp.shape(self.value)}, got {self.indices}")
 
     def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         return jnp.broadcast_to(self.vector(len(x)).reshape(-1, *(1,) * (x.ndim - 1)), x.shape)

@@ -48,11 +48,11 @@ class StateSpaceModel(eqx.Module):
 
     def __check_init__(self):
         if not self.outputs:
-            raise ValueError("outputs: at least one is needed, such as {'angle': lambda x, u: x[0]}")
+            raise ValueError("outputs: at least one is needed, for example {'angle': lambda x, u: x[0]}")
         expected = self.space.tangent_size
         for name, numbers in (("spread", self.spread), ("process", self.process)):
             if len(numbers) not in ((0, expected) if name == "process" else (expected,)):
-                raise ValueError(f"{name} must have {expected} numbers, as a change of start has, got {len(numbers)}")
+                raise ValueError(f"{name} must have {expected} numbers, like a change of start, got {len(numbers)}")
             for number in numbers:
                 if not number >= 0:
                     raise ValueError(f"{name} must not be negative, got {number}")

@@ -68,7 +68,7 @@ def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
     if len(set(learn)) != len(learn):
         raise ValueError(f"learn must not name a parameter twice, got {', '.join(learn)}")
     if {"k", "k_rotors"} <= set(learn):
-        raise ValueError("learn must not name both k and k_rotors: a factor common to all rotors is in both")
+        raise ValueError("learn must not name both k and k_rotors: both contain the factor common to all rotors")
     if "mass" in learn and (other := {"k", "k_rotors"} & set(learn)):
         raise ValueError(f"learn must not name both mass and {other.pop()}: only their ratio is identifiable")
 

@@ -71,7 +71,7 @@ def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleM
     tables = read_tables(path)
     require_known(str(path), tables, TABLES)
     if isinstance(vehicle := tables.get("vehicle"), dict) and "learn" in vehicle:
-        raise ValueError(f"{path}: [vehicle]: learn must stand above all tables")
+        raise ValueError(f"{path}: [vehicle]: learn must be above all tables")
     parts: dict[str, Any] = {"vehicle": vehicle_of(tables, path, variant)}
     for name, kind in (("terms", Terms), ("actuator", Actuator)):
         if not isinstance(table := tables.get(name, {}), dict):

@@ -60,7 +60,7 @@ def casadi_function(
         advice = "CasADi would write out every number; use export_program"
         raise ValueError(f"state_size must be at most {MOST_STATES}, got {sizes[0]}: {advice}")
     if not isinstance(name, str) or not ca.Function.check_name(name):
-        raise ValueError(f"name must be one that CasADi accepts for a function, got {checks.short_repr(name)}")
+        raise ValueError(f"name must be a valid name of a CasADi function, got {checks.short_repr(name)}")
     names = list(OBSERVED[: len(sizes)])
     symbols = list(map(ca.SX.sym, names, sizes))
     # In double precision, so that the constants of the physics are not rounded.

@@ -67,9 +67,9 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
         raise ValueError(f"{recording.name}: {motors.source} has {motors.values.shape[1]} motors; {order}")
     first, last = max(signal.t[0] for signal in used), min(signal.t[-1] for signal in used)
     if last - first < dt:
-        raise ValueError(f"{recording.name}: the signals share less than {dt} s; log them at the same time")
+        raise ValueError(f"{recording.name}: the signals overlap for less than {dt} s; log them at the same time")
     if (last - first) / dt > MAX_ROWS:
-        raise ValueError(f"{recording.name}: {last - first:.4g} s are over {MAX_ROWS} samples of {dt} s; cut the log")
+        raise ValueError(f"{recording.name}: {last - first:.4g} s have over {MAX_ROWS} samples of {dt} s; cut the log")
     t = np.minimum(first + dt * np.arange(int((last - first) / dt + 1e-6) + 1), last)
     q = interpolate_attitude(t, signals["attitude"].t, signals["attitude"].values)
     p, omega = (interpolate(t, signals[name].t, signals[name].values) for name in ("position", "rates"))

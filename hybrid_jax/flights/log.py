@@ -129,7 +129,7 @@ def even_segments(log: FlightLog) -> list[slice]:
     if uneven.any():
         at, after = log.t[int(uneven.argmax()) :][:2]
         found = f"the interval at {at:.6g} s is {after - at:.6g} s, the median is {log.dt:.6g} s"
-        raise ValueError(f"{log.name}: {found}; put the samples on even times first: dt={log.dt:.6g}")
+        raise ValueError(f"{log.name}: {found}; resample the log first: dt={log.dt:.6g}")
     return segments(log)
 
 

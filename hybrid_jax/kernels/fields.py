@@ -93,7 +93,7 @@ def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
     arrays, rest = eqx.partition(field, lambda leaf: isinstance(leaf, Shape))
     (shapes, structure), norms = jax.tree.flatten(arrays), batch_norms(field) if training else []
     if len(norms) > 1 or not all(isinstance(norm, BatchNorm) for norm in norms):
-        raise ValueError("it has more than one batch normalisation, or another than BatchNorm")
+        raise ValueError("it has more than one batch normalisation, or another class than BatchNorm")
     epsilon, units = (norms[0].epsilon, norms[0].gain.size) if norms else (0.0, 0)  # pyright: ignore[reportAttributeAccessIssue]
     of_sample = [Shape((size,), jnp.float32) for size in (sizes.d, sizes.m, units)]
 

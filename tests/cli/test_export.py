@@ -108,7 +108,7 @@ def test_a_model_without_parameters_has_no_filter(tmp_path, called):
 @pytest.mark.parametrize(
     ("about", "options", "message"),
     [
-        ({"dt": 0.02}, ["--state-size", "12"], "field: RigidBody does not take"),
+        ({"dt": 0.02}, ["--state-size", "12"], "field: RigidBody does not accept"),
         ({"dt": 0.02}, ["--dt", "nan"], "--dt must be a positive number of seconds, got nan"),
         ({}, [], "--dt is needed"), ({"dt": 0.02}, ["--smooth", "-1"], "--smooth must be"),
         ({"dt": 0.02}, ["--name", "1"], "name must be a lower-case C identifier"),

@@ -51,8 +51,8 @@ REFUSED = {
     "another dt": (pendulum(), {"validation": replace(VALIDATION, dt=0.1)}, "validation: dt must be 0.05, .* got 0.1$"),
     "settings": (pendulum(), {"settings": "rk4"}, "settings must be a Settings, got 'rk4'"),
     "model": (Model(FIELD), {}, "field: must be a function .* got Model; pass its .field$"),
-    "inputs": (Hybrid(pendulum(), residual_network(2, 3, KEY)), {}, "train: field: ResidualNetwork does not take a"),
-    "rotors": (hj.rigid_body(hj.IRIS), {}, "train: field: RigidBody does not take .* 13 and 4 numbers, got 2 and 1$"),
+    "inputs": (Hybrid(pendulum(), residual_network(2, 3, KEY)), {}, "train: field: ResidualNetwork does not accept a"),
+    "rotors": (hj.rigid_body(hj.IRIS), {}, "train: field: RigidBody does not accept .* 13 and 4 numbers, got 2 and 1$"),
     "one output": (NARROW, {}, r"train: field: ResidualNetwork must return .* \(2,\) for .* returned float32\[1\]$"),
 }
 STAGES = {
