@@ -64,10 +64,7 @@ def test_malformed_constants_are_named(written, key):
 
 IMPOSSIBLE = {
     "mm": ({"rotor_positions": "[[100, -200], [-100, 200], [100, 200], [-100, -200]]"}, "rotor_positions must be in m"),
-    "one point": (
-        {"rotor_positions": "[[0, 0], [0, 0], [0, 0], [0, 0]]"},
-        "rotor_positions must not all be equal",
-    ),
+    "one point": ({"rotor_positions": "[[0, 0], [0, 0], [0, 0], [0, 0]]"}, "rotor_positions must not all be equal"),
     "g cm²": ({"inertia": "[2.9e5, 3.0e5, 5.5e5]"}, "inertia in kg m² (1 g cm² is 1e-7)"),
     "no body": ({"inertia": "[0.029, 0.03, 0.55]"}, "inertia must be (Ix, Iy, Iz) in kg m² of one body"),
 }

@@ -262,10 +262,7 @@ def test_the_mean_of_an_input_over_intervals_keeps_its_integral(between):
         ({"between": "cubic"}, "between must be one of held, linear, averaged, got 'cubic'"),
         ({"dt": 0.0}, "dt must be a positive number of seconds"),
         ({"segment": 9.0}, r"segment must be at most the .* s of the longest record, got 9"),
-        (
-            {"records": [Record.of("r", torque=([0, 1], [0, 1]), angle=([5, 6], [0, 1]))]},
-            "torque, angle overlap for less",
-        ),
+        ({"records": [Record.of("r", torque=([0, 1], [0, 1]), angle=([5, 6], [0, 1]))]}, "torque, angle overlap"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(records, wrong, said):
