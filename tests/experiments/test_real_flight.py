@@ -64,7 +64,7 @@ def test_invalid_options_are_refused(options, message):
         replace(CONFIG, **options)
 
 
-@pytest.mark.parametrize(("given", "said"), [([], "no logs at hand?"), (["--folds-by", "day"], "'day' for argument")])
+@pytest.mark.parametrize(("given", "said"), [([], "no logs at hand?"), (["--folds-by", "day"], "manoeuvre, got day")])
 def test_guide_is_printed_without_flights_but_a_wrong_option_is_named_first(given, said, capsys):
     with pytest.raises(SystemExit) as stop:
         main(given)
