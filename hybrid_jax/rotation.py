@@ -56,9 +56,8 @@ def body_z(q: Quaternion | Rows) -> Vector:
 def derivative(q: Quaternion | Rows, body_rates: Vector | Rows) -> Quaternion:
     """Return q̇ = ½ q ⊗ [0, ω]  [1/s] for body rates ω [rad/s]."""
     (w, x, y, z), (a, b, c) = q, body_rates
-    return 0.5 * jnp.stack(
-        [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
-    )
+    rows = -x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
+    return 0.5 * jnp.stack(rows)
 
 
 def normalise(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:

@@ -246,10 +246,7 @@ def adapt(options: Any, model: Model) -> int:
         [(f"Errors of predictions{' of the adapted model' * bool(changed)}", figure(kept, logs, layout.dt))],
         [*read.warnings, *[STOPPED] * (not found.converged), *alone[1:]],
         [f"On logs that were not used here: hybrid-jax check {options.output} LOGS." if changed else KEEP],
-        [
-            page.Table("All parameters", HEADER, lines),
-            *(predicted(each, layout, name) for name, each in errors.items()),
-        ],
+        [page.Table("All parameters", HEADER, lines), *(predicted(one, layout, name) for name, one in errors.items())],
         read.notes,
     )
     record = {"parameters": after, "changed": changed, "model": options.output if changed else None}

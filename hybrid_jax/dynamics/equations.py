@@ -90,9 +90,8 @@ def _velocity_error(constants: Constants, velocity, force):
 def _euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
     """Return ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
     (ix, iy, iz), (tx, ty, tz), (wx, wy, wz) = inertia, torque, omega
-    return jnp.stack(
-        [(tx - (iz - iy) * wy * wz) / ix, (ty - (ix - iz) * wz * wx) / iy, (tz - (iy - ix) * wx * wy) / iz]
-    )
+    rows = (tx - (iz - iy) * wy * wz) / ix, (ty - (ix - iz) * wz * wx) / iy, (tz - (iy - ix) * wx * wy) / iz
+    return jnp.stack(rows)
 
 
 def in_world(attitude, parts) -> Float[Array, " 3 *b"]:
@@ -126,6 +125,4 @@ def _columns_backward(of_rows, saved, d_derivative: Float[Array, "13 b"]):
     return jax.tree.unflatten(structure, leaves), jnp.stack(d_x), jnp.stack(d_u)
 
 
-evaluate_columns.defvjp(
-    lambda of_rows, theta, x, u: (of_rows(theta, tuple(x), tuple(u)), (theta, x, u)), _columns_backward
-)
+evaluate_columns.defvjp(lambda f, theta, x, u: (f(theta, tuple(x), tuple(u)), (theta, x, u)), _columns_backward)
