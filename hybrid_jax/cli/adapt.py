@@ -34,7 +34,7 @@ LACKED = (
 
 @dataclass(frozen=True)
 class Options(FlightOptions):
-    """Adapt a model to logs after a change; you need ten seconds of flight or more.
+    """Adapt a model to logs from after a change. You should have at least ten seconds of flight.
 
     Exits with code 4, without writing a model, if these flights show no change.
     """
@@ -46,7 +46,7 @@ class Options(FlightOptions):
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """File for the adapted model."""
     out: Path = Path("runs/adapt")
-    """Folder of the page."""
+    """Folder for report.html and report.json."""
 
 
 def run(options: Options) -> int:

@@ -30,7 +30,7 @@ class Options(FlightOptions):
     flights: Annotated[Path, tyro.conf.Positional]
     """Folder of logs."""
     out: Path = Path("runs/check")
-    """Folder of the page."""
+    """Folder for report.html and report.json."""
 
 
 def run(options: Options) -> int:

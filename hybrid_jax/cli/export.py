@@ -71,7 +71,7 @@ class Options:
     dt: float | None = None
     """Length of a step [s]. By default the sample interval of the training flights."""
     out: Path = Path("runs/export")
-    """Folder of the page."""
+    """Folder for report.html and report.json."""
     noise: Annotated[tuple[float, ...], RARE] = ()
     """Filter: standard deviation of the measurements: position [m], quaternion, velocity [m/s] and body rates
     [rad/s], by default 0.001 0.002 0.02 0.02; or one number for all states, or one for each. For other systems than a

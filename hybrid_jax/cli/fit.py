@@ -60,7 +60,7 @@ class Options(FlightOptions):
     seed: int = 0
     """Random seed of the network."""
     out: Path = Path("runs/fit")
-    """Folder of the page."""
+    """Folder for report.html and report.json."""
     steps: Annotated[int, RARE] = 20
     """Identification: steps of a window. Short windows are robust to slow disturbances, long ones identify slow
     effects."""

@@ -63,7 +63,7 @@ class Options(LogOptions):
     dt: float = 0.01
     """Intended interval of the model [s]. A slower signal fails: half of its samples would be interpolated."""
     out: Path = Path("runs/inspect")
-    """Folder of the page."""
+    """Folder for report.html and report.json."""
 
 
 def run(options: Options) -> int:

@@ -62,7 +62,7 @@ class Options:
     bandwidth: float = 2.0
     """Highest frequency of the flight [Hz]. Frequencies that your controller cannot track add little information."""
     out: Path = Path("runs/plan")
-    """Folder of the page."""
+    """Folder for report.html and report.json."""
     rotor_speed: Annotated[tuple[float, float], RARE] = BOX.rotor_speed
     """Lowest and highest rotor speed, as shares of the vehicle's highest speed."""
     noise: Annotated[tuple[float, ...], RARE, tyro.conf.arg(name="noise-std")] = ()

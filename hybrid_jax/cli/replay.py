@@ -49,7 +49,7 @@ class Options(FlightOptions):
     seconds: float = 10.0
     """Length of the flight to show [s]."""
     out: Path = Path("runs/replay")
-    """Folder of the page."""
+    """Folder for report.html and report.json."""
 
 
 def run(options: Options) -> int:
