@@ -1,7 +1,7 @@
 """Measured signals by name, each with its own sample times."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, Self, get_args
 
 import numpy as np
@@ -123,11 +123,15 @@ class Gridded(NamedTuple):
     share: dict[str, Float[np.ndarray, " n"]]  # the position of each sample in its interval, from 0 to 1
 
 
-def completed(records: Sequence[Record], outputs: tuple[str, ...]) -> list[Record]:
-    """Return the records with an empty signal for each output that one of them lacks."""
+def completed(records: Sequence[Record], outputs: Sequence[str], angles: Sequence[str]) -> list[Record]:
+    """Return the records with an empty signal for each output that one of them lacks, and angles without jumps."""
     known = {name: each.signals[name].values[:0] for each in records for name in outputs if each.signals.get(name)}
     empty = {name: Signal(np.zeros(0), known.get(name, np.zeros((0, 1)))) for name in outputs}
-    return [Record(each.name, empty | {k: v for k, v in each.signals.items() if len(v)}) for each in records]
+    given = [{name: signal for name, signal in each.signals.items() if len(signal)} for each in records]
+    turned = [
+        {k: replace(v, values=np.unwrap(v.values, axis=0)) for k, v in each.items() if k in angles} for each in given
+    ]
+    return [Record(each.name, empty | own | more) for each, own, more in zip(records, given, turned, strict=True)]
 
 
 def on_grid(

@@ -168,6 +168,7 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
         yield
     except (ValueError, OSError, ImportError) as error:
         message = in_flags(str(error) if isinstance(error, Explained) else " ".join(str(error).split()), command)
+        message = re.sub(r"(;|, or) pass like=$", "", message)  # which a command does not have
         if command in VERBS:  # an argument at the start is one of its options
             message = re.sub(r"^([a-z_]+)(?=(\[\d\])? must )", lambda found: _flag(found[1]), message)
         lines, code = [message], BAD_INPUT

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
-from hybrid_jax.state_space import StateSpace
+from hybrid_jax.state_space import Angle, StateSpace
 
+ANGLE = Angle("angle")
 Output = Callable[..., Float[Array, "*k"]]
 
 
@@ -34,9 +35,10 @@ class StateSpaceModel(eqx.Module):
             if you know nothing about it. An attitude has three numbers here, its rotation [rad].
         process: the standard deviation of the process noise on each state, per square root of a second; by default 0.
             It should have the shape of `spread`. A state with process noise and no dynamics is a random walk.
+        angles: the names of outputs that are angles [rad], of which whole turns do not matter.
 
     Raises:
-        ValueError: if sizes do not agree, or a deviation is negative.
+        ValueError: if sizes do not agree, a deviation is negative, or an angle is no output.
     """
 
     field: AbstractVectorField
@@ -45,10 +47,13 @@ class StateSpaceModel(eqx.Module):
     start: tuple[float, ...] = eqx.field(static=True, converter=_numbers)
     spread: tuple[float, ...] = eqx.field(static=True, converter=_numbers)
     process: tuple[float, ...] = eqx.field(static=True, converter=_numbers, default=())
+    angles: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
 
     def __check_init__(self):
         if not self.outputs:
             raise ValueError("outputs: at least one is needed, for example {'angle': lambda x, u: x[0]}")
+        if unknown := [name for name in self.angles if name not in self.outputs]:
+            raise ValueError(f"angles must be names of outputs, {', '.join(self.outputs)}, got {', '.join(unknown)}")
         expected = self.space.tangent_size
         for name, numbers in (("spread", self.spread), ("process", self.process)):
             if len(numbers) not in ((0, expected) if name == "process" else (expected,)):
@@ -97,4 +102,4 @@ class StateSpaceModel(eqx.Module):
             predicted: as returned by `output` (k,).
             y: the measurement (k,).
         """
-        return predicted - y
+        return ANGLE.difference(predicted, y) if name in self.angles else predicted - y

@@ -130,10 +130,11 @@ def fit_records(
         checks.count(name, number)
     if any(model.process) and segment is None:
         raise ValueError("segment must be given with process noise: it acts between segments")
-    records = completed(records, tuple(model.outputs))
+    records = completed(records, tuple(model.outputs), model.angles)
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
     record_search.check_signals(model, records, gridded, dt)
-    with jax.enable_x64(True), solver_errors(solver):
+    # A step too far may overflow, and is taken back.
+    with jax.enable_x64(True), solver_errors(solver), np.errstate(over="ignore", invalid="ignore"):
         model = in_double(model)
         record_search.check_rates(model, records)
         y = {name: np.concatenate([each.y[name] for each in gridded]) for name in gridded[0].y}

@@ -106,8 +106,8 @@ def predict(
 
 def _of_outputs(model: StateSpaceModel, record: Record) -> StateSpaceModel:
     """Return the model with the outputs that a record has."""
-    seen = {name: h for name, h in model.outputs.items() if record.signals.get(name)}
-    return dataclasses.replace(model, outputs=seen or model.outputs)
+    seen = {name: h for name, h in model.outputs.items() if record.signals.get(name)} or model.outputs
+    return dataclasses.replace(model, outputs=seen, angles=[name for name in model.angles if name in seen])
 
 
 def _warn_if_short(model: StateSpaceModel, past: Record, known: RecordFit, states: Float[np.ndarray, "t d"]) -> None:

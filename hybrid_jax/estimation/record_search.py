@@ -205,7 +205,7 @@ def check_signals(model: Model, records: Sequence[Record], gridded: list[Gridded
 def _turns(signal: Signal) -> list[str]:
     """Return a warning if a signal jumps like a wrapped angle."""
     pairs = np.stack([signal.values[:-1], signal.values[1:]], axis=1)[np.diff(signal.t) < GAP * signal.interval]
-    remedies = {2 * np.pi: "jumps by 2π: if it is an angle, unwrap it", 360.0: "jumps by 360: an angle must be in rad"}
+    remedies = {2 * np.pi: "jumps by 2π: if it is an angle, pass angles=", 360.0: "jumps by 360: an angle is in rad"}
     narrow = {turn: np.ptp(signal.values, axis=0) < 1.1 * turn for turn in remedies}
     return [line for turn, line in remedies.items() if (turns(pairs, turn) * narrow[turn]).any()]
 

@@ -1,5 +1,7 @@
 """Units, times and angles that cannot be right are named, and so is what a past does not tell of the future."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from test_record_fit import NOISE, angle, model_of, pendulum, record
@@ -38,8 +40,14 @@ def spinning():
 @pytest.mark.parametrize(
     ("name", "times", "of", "dt", "said"),
     [
-        ("angle", 1, lambda y: (y + np.pi) % (2 * np.pi) - np.pi, 0.02, "angle jumps by 2π: if it is an angle, unwrap"),
-        ("angle", 1, lambda y: np.rad2deg(y) % 360, 0.02, "angle jumps by 360: an angle must be in rad"),
+        (
+            "angle",
+            1,
+            lambda y: (y + np.pi) % (2 * np.pi) - np.pi,
+            0.02,
+            "angle jumps by 2π: if it is an angle, pass ",
+        ),
+        ("angle", 1, lambda y: np.rad2deg(y) % 360, 0.02, "angle jumps by 360: an angle is in rad"),
         ("angle", 1, lambda y: 1e3 * y, 0.02, "angle varies less than the fit's errors"),
         ("angle", 1e2, np.array, 0.02, r"most of angle is not between 0 and 8\.?\d* s: check all times"),
         ("torque", 1e3, np.array, 0.02, "most of torque is not between 0"),
@@ -52,6 +60,22 @@ def test_other_units_and_wrapped_angles_are_said(name, times, of, dt, said):
     with pytest.warns(UserWarning, match=said) as warned:
         fit_records(model_of(pendulum()), [Record("r", signals)], dt=dt, max_steps=1, rounds=1)
     assert {w.filename for w in warned} == {__file__}
+
+
+def test_an_angle_that_jumps_is_fitted_as_one_that_does_not():
+    """Also across a gap in which it makes a turn, so that it cannot be unwrapped."""
+    one = record(pendulum(), (0.5, 12.0), seed=4, samples=300, drop=(1.0, 2.0))
+    y, free = one.signals["angle"], model_of(pendulum(0.82, 0.28))
+    free = dataclasses.replace(free, start=(0.5, 12.0), spread=(0.1, 0.5))
+    wrapped = Record("r", {**one.signals, "angle": Signal(y.t, (y.values + np.pi) % (2 * np.pi) - np.pi)})
+    turning = dataclasses.replace(free, angles=("angle",))
+    given = (free, one), (turning, wrapped)
+    fit, same = (fit_records(model, [each], dt=0.02) for model, each in given)
+    assert fit.errors["angle"] < 2 * NOISE
+    for name, (value, *_) in fit.intervals.items():
+        assert float(same.intervals[name].value) == pytest.approx(float(value), abs=1e-6)
+    with pytest.raises(ValueError, match="angles must be names of outputs, angle, got yaw"):
+        dataclasses.replace(free, angles=("yaw",))
 
 
 def test_a_past_far_from_the_models_start_is_found_and_a_short_one_said():
