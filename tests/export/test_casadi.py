@@ -97,5 +97,5 @@ def test_an_operation_that_casadi_has_not_is_named(field, said):
 
 
 def test_what_makes_no_sense_is_refused():
-    refusal(lambda: casadi_function(body(), name="1 f"), "name must be one")
+    refusal(lambda: casadi_function(body(), name="1 f"), "name must be a valid")
     refusal(lambda: casadi_function(solved), "state_size must be given: function does not know its size")
