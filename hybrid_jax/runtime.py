@@ -35,10 +35,12 @@ WHOLE_LOOPS = f"{EXTRA}=xla_cpu_small_while_loop_byte_threshold=10000000"
 FAST_COMPILE: dict[str, bool | int] = {}
 if version("jaxlib").split(".")[:2] == ["0", "10"]:
     FAST_COMPILE |= {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+LEVEL = "xla_backend_optimization_level"
 # At optimisation level 1 the simulator compiles in two thirds of the time of level 3, and flights are 3 % slower. At
-# level 0, which XLA_FLAGS can set, they are five times slower.
-FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
-UNOPTIMISED = FAST_COMPILE | {"xla_backend_optimization_level": 0}  # for programs that compute little
+# level 0 they are five times slower. Other programs keep a level that XLA_FLAGS sets, as it does for tests.
+COMPILE_FLIGHTS = FAST_COMPILE | {LEVEL: 1}
+FASTEST_COMPILE = FAST_COMPILE if LEVEL in os.environ.get(FLAGS, "") else COMPILE_FLIGHTS
+UNOPTIMISED = FAST_COMPILE | {LEVEL: 0}  # for programs that compute little
 UNUSED = 30 * 24 * 3600  # s after which unused programs are deleted: their source has changed
 MOST = 2**30  # bytes of programs; beyond, those used longest ago are deleted
 THREADS = "OPENBLAS_NUM_THREADS"

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hybrid_jax.runtime import FASTEST_COMPILE, cores
+from hybrid_jax.runtime import COMPILE_FLIGHTS, cores
 from hybrid_jax.sweep.lanes import LaneMap, stack
 
 WIDTH = {"cpu": 4}  # flights in one vmap; on another backend an even share of all
@@ -20,7 +20,7 @@ def compiled(
     programs = {}
     for kind in kinds:
         width = min(WIDTH.get(jax.default_backend(), -(-most[kind] // jax.device_count())), most[kind])
-        programs[kind] = LaneMap(simulate, width, min_capacity=most[kind], compiler=FASTEST_COMPILE)
+        programs[kind] = LaneMap(simulate, width, min_capacity=most[kind], compiler=COMPILE_FLIGHTS)
     # Processes of one run must compile in the same order.
     with ThreadPoolExecutor(cores() if jax.process_count() == 1 else 1) as pool:
         # By flying none: XLA computes a single chunk nevertheless, so no program is run twice for this.

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.io.datasets import Dataset, versions
-from hybrid_jax.runtime import FASTEST_COMPILE, entry, jit_with
+from hybrid_jax.runtime import COMPILE_FLIGHTS, entry, jit_with
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import CHUNK, Domain, Quadrotor
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
@@ -80,7 +80,7 @@ def random_flights(domain: Domain, flights: int, seconds: float, key: PRNGKeyArr
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
-@jit_with(FASTEST_COMPILE)
+@jit_with(COMPILE_FLIGHTS)
 def _fly_chunk(
     shared: tuple[Quadrotor, Parameters, PRNGKeyArray],
     numbers: UInt[Array, " n"],
@@ -212,7 +212,7 @@ def permutation(key: PRNGKeyArray, n: int) -> Int[np.ndarray, " n"]:
     return order
 
 
-@jit_with(FASTEST_COMPILE)
+@jit_with(COMPILE_FLIGHTS)
 def _drawn(key: PRNGKeyArray, n: int) -> tuple[PRNGKeyArray, UInt[Array, " n"]]:
     key, own = jax.random.split(key)
     return key, jax.random.bits(own, (n,), jnp.uint32)
