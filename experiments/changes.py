@@ -202,9 +202,7 @@ def _candidates(
 
     def of_flight(field, flight):
         blocks = jax.tree.map(lambda leaf: leaf[places[0]], flight), jnp.asarray(places[1])
-        return jnp.mean(
-            jax.lax.map(lambda block: errors_at_ends(field, block[0], block[1], shared.solver), blocks), axis=0
-        )
+        return jnp.mean(jax.lax.map(lambda b: errors_at_ends(field, b[0], b[1], shared.solver), blocks), axis=0)
 
     return jax.lax.map(one, (fields, windows))
 

@@ -122,9 +122,7 @@ def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, d
     fields = {Agent("nominal").name: rigid_body(IRIS)}
     for model in ("hybrid", "invariant"):
         fields[Agent(model, few).name] = lane(trained[model].adapted[PARAMETER_SHIFT.name, few], 0)
-    times = on_one_core(
-        call_times, [jax.device_get(field) for field in fields.values()], config.controller(), config.calls
-    )
+    times = on_one_core(call_times, jax.device_get([*fields.values()]), config.controller(), config.calls)
     return dict(zip(fields, times, strict=True))
 
 

@@ -67,9 +67,7 @@ class FlightEvidence:
 
 
 def claims(few: int) -> list[Claim[FlightEvidence]]:
-    made: list[Claim[FlightEvidence]] = [
-        Claim(id, text, lambda e, f=fast: f(e.clock())) for id, text, fast in SPEED_CLAIMS
-    ]
+    made: list[Claim[FlightEvidence]] = [Claim(id, text, lambda e, f=of: f(e.clock())) for id, text, of in SPEED_CLAIMS]
     for (number, text, parts), (letter, model) in product(CLAIMS, zip("abc", SOURCES, strict=True)):
         own = partial(parts, Agent(SOURCES[model]), Agent(model, few))
         made.append(Claim(f"R{number}{letter}", f"{LEARNED[model]}: {text}", lambda e, own=own: all_of(own(e))))

@@ -66,13 +66,9 @@ class RecordedFlight(NamedTuple):
 
 
 def flights(folder: Path, vehicle: str = "E8") -> tuple[list[RecordedFlight], list[RecordedFlight]]:
-    normal = [
-        RecordedFlight(read_recording(path), WHOLE) for path in sorted((folder / "normal_flight").glob(f"{vehicle}_*"))
-    ]
+    normal = [RecordedFlight(read_recording(p), WHOLE) for p in sorted((folder / "normal_flight").glob(f"{vehicle}_*"))]
     found = sorted(folder.glob(f"cut_propeller_M3_*/{vehicle}_*"))
-    cut = [
-        RecordedFlight(read_recording(path), float(re.findall(r"([\d.]+)mm", path.parent.name)[-1])) for path in found
-    ]
+    cut = [RecordedFlight(read_recording(p), float(re.findall(r"([\d.]+)mm", p.parent.name)[-1])) for p in found]
     if not normal or not cut:
         raise ValueError(f"{folder}: no flights normal_flight/{vehicle}_* and cut_propeller_M3_*/{vehicle}_*")
     return normal, sorted(cut, key=lambda each: -each.length)

@@ -155,9 +155,7 @@ def _draw(axes: Axes, curves: _Curves, bottom: float, top: float, lost_at_top: b
     axes.set_ylim(bottom, top)
     for (model, mode), curve in curves.items():
         inside = (curve.mean >= bottom) & (curve.mean <= top)
-        mean, low, high = (
-            np.where(inside, part.clip(bottom, top), np.nan) for part in (curve.mean, *_band(axes, curve))
-        )
+        mean, low, high = (np.where(inside, p.clip(bottom, top), np.nan) for p in (curve.mean, *_band(axes, curve)))
         style = {"color": colour(model), "linestyle": DASHES[mode], "marker": MARKERS[mode], "markeredgewidth": 0}
         axes.plot(curve.n, mean, label=label(model, mode), **style)
         axes.fill_between(curve.n, low, high, color=colour(model), alpha=0.15, linewidth=0)

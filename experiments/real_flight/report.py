@@ -52,7 +52,7 @@ def write(
     config: RealFlightConfig, sets: Mapping[str, Flights], folds: Sequence[Fold], rows: Results, stages: Stages
 ) -> None:
     split = [{"train": [*map(flight_of, fold.train)], "test": [*map(flight_of, fold.test)]} for fold in folds]
-    said = [f"{name}: {line}" for name, each in sets.items() for line in each.said]
+    said = [f"{name}: {line}" for name, each in sets.items() for line in each.notes]
     flown = ", ".join(f"{len(each.logs)} {name} ({each.seconds:.0f} s)" for name, each in sets.items())
     stages.publish(NAME, config, rows, report, *said, folds=split, flown=flown)
 

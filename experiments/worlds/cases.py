@@ -134,9 +134,8 @@ def source_of(world: World, config: WorldsConfig, stages: Stages, own: Dataset) 
     one, start = replace(config, seeds=1), None
     if config.source_training == "physics_first":
         windows, body = own.splits["train"], hj.rigid_body(world.vehicle, PHYSICS)
-        physics = (
-            LeastSquares(False).solve(body, windows, windows, Settings(objective=scaled_loss(body, windows))).field
-        )
+        settings = Settings(objective=scaled_loss(body, windows))
+        physics = LeastSquares(False).solve(body, windows, windows, settings).field
         fresh: Any = fresh_fields(HYBRID, world.vehicle, one)
         start = hj.Hybrid(jax.tree.map(lambda leaf: leaf[None], physics), zero_output(fresh.residual))
         one = replace(one, rates=replace(one.rates, physics=0.0))
