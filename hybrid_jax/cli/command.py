@@ -207,7 +207,7 @@ class _Output(io.FileIO):
             return super().write(text)
         except OSError as error:
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
-            if sys.stdout.fileno() == self.fileno():
+            if sys.stdout.fileno() == self.fileno() and not isinstance(error, BrokenPipeError):
                 print(f"{self.program}: standard output: {error.strerror}; the rest is not shown", file=sys.stderr)
             return memoryview(text).nbytes
 
