@@ -92,7 +92,7 @@ def test_output_that_cannot_be_written_or_shown_ends_no_run(where, tmp_path):
     done = subprocess.run(run, cwd=ROOT, env=os.environ | ASCII, capture_output=True)
     assert done.returncode == 0, done.stderr[-300:]
     assert (tmp_path / "file").exists()
-    assert (b"\nhybrid-jax: standard output: No space left" in done.stderr) == (where == "> /dev/full")
+    assert (b"hybrid-jax: standard output: No space left" in done.stderr) == (where == "> /dev/full")
     assert b"Broken pipe" not in done.stderr
     assert done.stdout in (b"", b"0.1 ? 0.01\n", b"?\n")
 
