@@ -140,7 +140,8 @@ def fit_records(
         y = {name: np.concatenate([each.y[name] for each in gridded]) for name in gridded[0].y}
         for name in (name for name, each in y.items() if not len(each)):
             raise ValueError(f"records: no record has a sample of {name}")
-        deviation = {name: np.maximum(each.std(axis=0), TINY) for name, each in y.items()}
+        most = {name: 1.0 if name in model.angles else np.inf for name in y}  # [rad]: whole turns do not matter
+        deviation = {name: np.clip(each.std(axis=0), TINY, most[name]) for name, each in y.items()}
         known = {name: np.full_like(deviation[name], size) for name, size in (noise or {}).items()}
         scale = {name: jnp.asarray(each) for name, each in (deviation | known).items()}
         # Plain least squares in the first round would follow outliers to another minimum.
@@ -174,9 +175,10 @@ def fit_records(
     if found.status != Status.OK:
         checks.warn(f"records: the fit {found.status.message}; check all units and the model")
     for name, each in found.errors.items():
-        if (each > 1.1 * deviation[name] + FINE * np.abs(y[name]).max()).any():
-            line = f"{name} varies less than the fit's errors: check all units and the model, or give a segment"
-            checks.warn(f"records: {line}")
+        if (each > 1.1 * deviation[name] + FINE * min(np.abs(y[name]).max(), most[name])).any():
+            far = "is off by more than a radian", "varies less than the fit's errors"
+            line = f"{name} {far[int((deviation[name] < most[name]).all())]}: check all units and the model"
+            checks.warn(f"records: {line}, or give a segment")
     if found.directions:
         checks.warn(f"records: no sample determines {'; '.join(found.directions)}")
     return found

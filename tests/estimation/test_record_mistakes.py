@@ -40,13 +40,7 @@ def spinning():
 @pytest.mark.parametrize(
     ("name", "times", "of", "dt", "said"),
     [
-        (
-            "angle",
-            1,
-            lambda y: (y + np.pi) % (2 * np.pi) - np.pi,
-            0.02,
-            "angle jumps by 2π: if it is an angle, pass ",
-        ),
+        ("angle", 1, lambda y: (y + np.pi) % (2 * np.pi) - np.pi, 0.02, "angle jumps by 2π: .* pass angles="),
         ("angle", 1, lambda y: np.rad2deg(y) % 360, 0.02, "angle jumps by 360: an angle is in rad"),
         ("angle", 1, lambda y: 1e3 * y, 0.02, "angle varies less than the fit's errors"),
         ("angle", 1e2, np.array, 0.02, r"most of angle is not between 0 and 8\.?\d* s: check all times"),
@@ -74,6 +68,9 @@ def test_an_angle_that_jumps_is_fitted_as_one_that_does_not():
     assert fit.errors["angle"] < 2 * NOISE
     for name, (value, *_) in fit.intervals.items():
         assert float(same.intervals[name].value) == pytest.approx(float(value), abs=1e-6)
+    still = dataclasses.replace(turning, start=(0.5, 0.0), spread=(0.0, 0.0))  # the wrong start, which is kept
+    with pytest.warns(UserWarning, match="^records: angle is off by more than a radian: check"):
+        fit_records(still, [wrapped], dt=0.02, max_steps=1, rounds=1)
     with pytest.raises(ValueError, match="angles must be names of outputs, angle, got yaw"):
         dataclasses.replace(free, angles=("yaw",))
 
