@@ -38,7 +38,7 @@ class Quantity:
     def __post_init__(self):
         checks.count("size", self.size)
         if len(self.labels) not in (0, self.size):
-            raise ValueError(f"labels must be one for each of size={self.size} of {self.name}, got {self.labels}")
+            raise ValueError(f"labels of {self.name} must be one for each of size={self.size}, got {self.labels}")
 
     @property
     def tangent_size(self) -> int:

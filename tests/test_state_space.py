@@ -71,7 +71,7 @@ def test_further_numbers_are_quantities_of_their_own():
     assert (padded.size, padded.names[-3:], padded.units[-3:]) == (15, ("wz", "13", "14"), ("rad/s", "", ""))
     assert StateSpace().padded(2).names == ("0", "1")
     assert not any(isinstance(one, Attitude) for one in RIGID_BODY_SPACE.padded(4).quantities)
-    with pytest.raises(ValueError, match="labels must be one for each of size=2 of pair"):
+    with pytest.raises(ValueError, match="labels of pair must be one for each of size=2, got"):
         Quantity("pair", 2, labels=("one",))
 
 

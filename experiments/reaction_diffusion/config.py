@@ -79,7 +79,7 @@ class Config(Run):
         if self.sizes != tuple(sorted(self.sizes)):
             raise ValueError(f"--n-target must be in ascending order, got {self.sizes}")
         if self.points < 8:
-            raise ValueError(f"--points must be at least 8, for kernels and for structure, got {self.points}")
+            raise ValueError(f"--points must be at least 8, to resolve the fields, got {self.points}")
 
 
 PAPER = Config()

@@ -84,7 +84,7 @@ class WorldsConfig(OneFlight):
     without these terms and the network at once, as in the paper."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
     """How a log samples them: means over each interval, or values at its start."""
-    test: Annotated[int, tyro.conf.Suppress] = 1000  # this and the next two have no effect here: a world flies itself
+    test: Annotated[int, tyro.conf.Suppress] = 1000  # no effect here, like the next two: each world has own flights
     pool: Annotated[int | None, tyro.conf.Suppress] = None
     draw: Annotated[Literal["random", "contiguous"], tyro.conf.Suppress] = "contiguous"
     rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
