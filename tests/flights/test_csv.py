@@ -31,6 +31,7 @@ def reversed_with(name):
 WRITTEN = {
     "plain": (str, str, "\n", ""),
     "of Windows": (str, str, "\r\n", ""),
+    "time for t": (lambda line: f"time{line[1:]}", str, "\n", ""),
     "names in quotes": (quoted, str, "\n", ""),
     "all in quotes": (quoted, quoted, "\n", ""),
     "another order, and a column of text": (reversed_with("mode"), reversed_with("armed"), "\n", ""),

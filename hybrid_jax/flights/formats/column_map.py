@@ -111,12 +111,12 @@ def load_column_map(path: str | Path) -> ColumnMap:
 
 
 def library_map(path: str | Path) -> ColumnMap:
-    """Return the map of a file with the library's columns t, px … wz, u0 …"""
+    """Return the map of a file with the library's columns t (or time), px … wz, u0 …"""
     names, motors = header_of(path), vehicle.input_names(vehicle.MOST_ROTORS)
     count = max([vehicle.FEWEST_ROTORS, *(i + 1 for i, name in enumerate(motors) if name in names)])
     return ColumnMap(
         Frames("ENU", "FLU", "world"),
-        Columns(("t",), "s"),
+        Columns(("time" if "time" in names and "t" not in names else "t",), "s"),
         position=Columns(vehicle.STATE_NAMES[vehicle.POSITION], "m"),
         attitude=Columns(vehicle.STATE_NAMES[vehicle.QUATERNION], "wxyz"),
         velocity=Columns(vehicle.STATE_NAMES[vehicle.VELOCITY], "m/s"),
