@@ -162,10 +162,9 @@ def key(name: str, value: Any) -> None:
 
 
 def writable_folder(name: str, folder: Path) -> None:
-    """Create a folder and check that it can be written, before work begins."""
+    """Check that a folder can be written, or made, before work begins; it is not made, as the work may fail."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
+        tempfile.TemporaryFile(dir=next(each for each in (folder, *folder.parents) if each.exists())).close()
     except OSError as error:
         raise ValueError(f"{name} {folder}: cannot be written: {error.strerror}") from error
 

@@ -118,6 +118,7 @@ def run(options: Options) -> int:
                 written.append(options.output / f"{kind}.npz")
                 export_program(written[-1], field, length, about=model.about, **own, **more)
             if "casadi" in options.to:
+                options.output.mkdir(parents=True, exist_ok=True)
                 written.append(options.output / f"{kind}.casadi")
                 casadi_function(field, length, name=letter, **own, **more).save(str(written[-1]))
     if options.smooth is not None:
