@@ -135,10 +135,10 @@ MEASURE = """(page, window) => {
   return {
     sideways: page.documentElement.scrollWidth > window.innerWidth,
     tables: frames.filter(frame => frame.getBoundingClientRect().right > right + 1).length,
-    formulas: [...page.querySelectorAll("math")].filter(each => each.getBoundingClientRect().height < 3).length,
-    bars: [...page.querySelectorAll("math")].filter(
-      each => each.scrollHeight > each.clientHeight && window.getComputedStyle(each).overflowY == "auto").length,
-    source: page.querySelectorAll(".arithmatex").length,
+    formulas: [...page.querySelectorAll(".arithmatex")].filter(
+      each => !each.querySelector(".katex-html .base") || each.querySelector(".katex-error")).length,
+    cut: [...page.querySelectorAll("div.arithmatex")].filter(each => [...each.querySelectorAll(".mord")].some(
+      part => part.getBoundingClientRect().top < each.getBoundingClientRect().top)).length,
     styles: [...page.styleSheets].filter(each => each.href && !each.cssRules.length).length,
     pictures: [...page.images].filter(each => each.complete && !each.naturalWidth).length,
   }
@@ -154,3 +154,13 @@ def test_pages_fit_wide_and_narrow_screens_and_need_no_network(site, tmp_path):
     assert len(found) == 2 * len(pages) + 2
     assert [(page, width, own) for page, width, own in found if any(own.values())] == []
     assert said == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium")
+def test_formulas_are_set_in_the_fonts_of_the_site(site, tmp_path):
+    formulas = """page => [page.querySelectorAll(".katex-html").length,
+      [...page.fonts].some(each => each.family == "KaTeX_Math" && each.status == "loaded")]"""
+    ((_, _, (count, loaded)),), _ = visit(site, ["concepts.html"], [1400], formulas, tmp_path)
+    written = re.findall(r"\$\$.+?\$\$|\$.+?\$", (DOCS / "concepts.md").read_text(), flags=re.DOTALL)
+    assert (count, loaded) == (len(written), True)

@@ -1,64 +1,40 @@
-"""What mkdocs does beyond its plugins: MathML, changes, names, 404.html."""
+"""What mkdocs does beyond its plugins: KaTeX, changes, names, 404.html."""
 
-import html
-import io
 import re
 from importlib import import_module, resources
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from fontTools import subset
-from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
-FORMULA = re.compile(
-    r'<(span|div) class="arithmatex">\s*\\[(\[](.*?)\\[)\]]\s*</\1>',
-    re.DOTALL,
-)
-# Code and tags, which stay as they are, or a letter with an index.
+# Formulas, code and tags, which stay as they are, or a letter with an index.
 INDEXED = re.compile(
-    r"<(code|pre|math|script|style)\b.*?</\1>|<[^>]*>|"
+    r'<(span|div) class="arithmatex">.*?</\1>|'
+    r"<(code|pre|script|style)\b.*?</\2>|<[^>]*>|"
     r"(?<![\w/.])([^\W\d_]\u0302?)(?:\^([ST]))?"
     r"_([Dipdkmtuvxyz0]|up|down|MSE|reg)(?![a-zA-Z0-9_])",
     re.DOTALL,
 )
-# Without `stretchy="false"` a norm is as high as its whole line.
-NORM, FIXED = "<mo>&#x02016;", '<mo stretchy="false">&#x02016;'
-# The sign of a number, not a difference: no space behind it.
-SIGN = re.compile(r"(&#x0(?:003D|003C|2264|2265);</mo><mo)>&#x02212;")
-# Letters, which browsers set as italics, accents, punctuation, operators.
-SIGNS = (
-    "20-7E,A0-FF,2B0-36F,370-3FF,2010-205F,2100-214F,2190-22FF,2308-230B,"
-    "27E8-27EB,1D434-1D467,1D6E2-1D71B"
-)
+# KaTeX as its authors publish it, in a package that also is a plugin of
+# Django CMS, of which nothing runs here.
+PACKAGE = "djangocms_katex"
+KATEX = resources.files(PACKAGE) / "static" / PACKAGE / "vendor/katex"
 ROOT = Path(__file__).parents[2]
 
 
 def on_files(files, config):
-    """Add the list of changes, which lies beside README.md, and a font."""
+    """Add the list of changes, which lies beside README.md, and KaTeX."""
     text = (ROOT / "CHANGELOG.md").read_text().replace("](docs/", "](../")
     files.append(File.generated(config, "about/changes.md", content=text))
-    name = "assets/formulas.woff"
-    files.append(File.generated(config, name, content=font()))
+    parts = [KATEX / f"katex.min.{end}" for end in ("js", "css")]
+    parts += [KATEX / "LICENSE", *(KATEX / "fonts").iterdir()]
+    for part in parts:
+        if part.name.endswith((".ttf", ".woff")):
+            continue  # for browsers older than woff2
+        folder = "assets/katex/fonts" if "_" in part.name else "assets/katex"
+        name = f"{folder}/{part.name}"
+        files.append(File.generated(config, name, content=part.read_bytes()))
     return files
-
-
-def font():
-    """Return the part of ziamath's font that formulas need, as WOFF."""
-    source = resources.files("ziamath") / "fonts/STIXTwoMath-Regular.ttf"
-    options = subset.Options(
-        flavor="woff",
-        hinting=False,
-        layout_features=["ssty"],  # smaller signs for indices
-        name_IDs=[0, 1, 2, 13, 14],  # with the licence
-    )
-    part = subset.load_font(io.BytesIO(source.read_bytes()), options)
-    subsetter = subset.Subsetter(options)
-    subsetter.populate(unicodes=subset.parse_unicodes(SIGNS))
-    subsetter.subset(part)
-    file = io.BytesIO()
-    subset.save_font(part, file, options)
-    return file.getvalue()
 
 
 def on_page_markdown(markdown, page, config, files):
@@ -86,21 +62,15 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def on_page_content(content, page, config, files):
-    """Write formulas as MathML, which needs no script, and set indices."""
-    display = {"span": "inline", "div": "block"}
-
-    def formula(found):
-        text = html.unescape(found[2]).strip()
-        math = convert(text, display=display[found[1]]).replace(NORM, FIXED)
-        return SIGN.sub(r'\1 form="prefix">&#x02212;', math)
+    """Set letters with an index that are no formula."""
 
     def indexed(found):
-        if found[2] is None:
+        if found[3] is None:
             return found[0]
-        above = f"<sup>{found[3]}</sup>" if found[3] else ""
-        return f"<i>{found[2]}</i>{above}<sub>{found[4]}</sub>"
+        above = f"<sup>{found[4]}</sup>" if found[4] else ""
+        return f"<i>{found[3]}</i>{above}<sub>{found[5]}</sub>"
 
-    return INDEXED.sub(indexed, FORMULA.sub(formula, content))
+    return INDEXED.sub(indexed, content)
 
 
 def on_post_template(output_content, template_name, config):
