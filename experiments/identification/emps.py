@@ -69,7 +69,7 @@ def candidate(direction: bool = False, drift: bool = False, lag: bool = False, p
         prior = {f"field.{name}": value for name, value in prior.items()} | {"parts": 1.0}
     d, spread = 2 + drift, (1e-5, 1e-6, 0.0)[: 2 + drift] + (1.0,) * lag
     model = hj.StateSpaceModel(field, ("u",), {"q": position}, start=(0.0,) * (d + lag), spread=spread)
-    return model, {f"field.{name}": value for name, value in prior.items()}
+    return model, prior
 
 
 BENCHMARK = Benchmark(

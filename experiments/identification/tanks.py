@@ -80,7 +80,7 @@ NEAR = {"offset": 0.3, "edge": 0.7, "log_weir": 0.7, "caught": 1.5, "power": 0.1
 
 def candidate(*extra: str):
     field, d = physics(*extra), 2 + ("log_play" in extra)
-    prior = {f"field.{name}": value for name, value in NEAR.items() if getattr(field, name) is not None}
+    prior = {name: value for name, value in NEAR.items() if getattr(field, name) is not None}
     start, spread = (4.0, 5.2, 0.0), (5.0, 0.3, 0.3)
     return hj.StateSpaceModel(field, ("u",), {"y": level}, start=start[:d], spread=spread[:d]), prior
 

@@ -43,15 +43,22 @@ def reduced(equations: NormalEquations, p: int, damping: Float[Array, ""] | floa
 
 
 @partial(jax.jit, static_argnums=1)
-def move(equations: NormalEquations, p: int, damping: Float[Array, ""], free: Bool[Array, " p"], least: float):
-    """Return a step of θ, the steps of the own unknowns (n, s), and the expected decrease of the cost."""
+def move(equations: NormalEquations, p: int, damping: Float[Array, ""], free: Bool[Array, " p"], least: float, most):
+    """Return a step of θ of at most `most` (p), the steps of the own unknowns (n, s), and the expected decrease."""
     (gram, score, _), offset, slope = reduced(equations, p, damping)
     gram, score = jnp.sum(gram, axis=0), jnp.sum(score, axis=0)
     seen = free & (jnp.diagonal(gram) > least)
     step, expected = jnp.zeros(p), jnp.zeros(())
     if p:
-        both = jnp.where(seen[:, None] & seen, gram, 0)
-        step, expected = move_of_equations(both, jnp.where(seen, score, 0), damping)
+        both, pull = jnp.where(seen[:, None] & seen, gram, 0), jnp.where(seen, score, 0)
+        step, expected = move_of_equations(both, pull, damping)
+        near = jnp.clip(step, -most, most)
+        far = near != step
+        # The others move to where they are best beside the parameters that stop on the way.
+        rest = jnp.where(~far[:, None] & ~far, both, 0), jnp.where(far, 0, pull + both @ jnp.where(far, near, 0))
+        short = jnp.where(far, near, jnp.clip(move_of_equations(*rest, damping)[0], -most, most))
+        step = jnp.where(jnp.any(far), short, step)
+        expected = jnp.where(jnp.any(far), -short @ (2 * pull + both @ short), expected)
     own = -offset - jnp.einsum("nsp,p->ns", slope, step)
     weight = jnp.diagonal(equations.gram[:, p:, p:], axis1=1, axis2=2)
     return step, own, expected + jnp.sum(equations.score[:, p:] * offset) + damping * jnp.sum(weight * own**2)
@@ -74,12 +81,14 @@ def descend(
     *,
     free: Bool[Array | np.ndarray, " p"] | None = None,
     least: float = 0.0,
+    most: Float[np.ndarray, " p"] | float = np.inf,
     max_steps: int = 50,
     tolerance: float = 1e-6,
 ) -> End:
     """Minimise the cost over θ and the pieces' own unknowns, by Levenberg–Marquardt.
 
     Parameters that are not `free`, or with information of at most `least` after elimination, do not change.
+    No step changes a parameter by more than `most`.
     """
     moves = jnp.ones(len(theta), bool) if free is None else jnp.asarray(free)
 
@@ -89,7 +98,7 @@ def descend(
 
     def aim(best, damping):
         (theta, own), found = best
-        step, change, expected = move(found, len(theta), damping, moves, least)
+        step, change, expected = move(found, len(theta), damping, moves, least, most)
         return (theta + step, own + change), expected, 0.0
 
     point, nothing = (theta, own), NormalEquations(*3 * (jnp.zeros(()),))

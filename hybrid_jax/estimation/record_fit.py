@@ -10,18 +10,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import in_double, ravel_learned, trainable
-from hybrid_jax.dynamics.disturbance import physics_of
+from hybrid_jax.dynamics.base import in_double, ravel_learned
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
 from hybrid_jax.estimation.discretisation import FINE, Solver, warn_of_steps
-from hybrid_jax.estimation.elimination import End, descend, reduced
-from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.elimination import End, reduced
 from hybrid_jax.estimation.normal_equations import inverse
-from hybrid_jax.estimation.record_search import TINY, size_of
+from hybrid_jax.estimation.record_search import LOGARITHM, TINY, size_of
 from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.implicit_solvers import solver_errors
@@ -30,6 +29,7 @@ from hybrid_jax.records import Between, Record, completed, on_grid
 from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 
+VAGUE = np.log(100.0)  # a logarithm with a larger standard error is not identifiable
 FASTEST = 2.0  # decay rate times RK4's step, which is unstable above 2.8
 CONTINUOUS = 1e-6  # allowed gap between segments, over the size of a state, if the state has no process noise
 
@@ -43,7 +43,8 @@ class RecordFit(eqx.Module):
         starts_error: the standard error of `starts` (r, d); three rotation angles [rad] for an attitude.
         ends: the state at the end of each record (r, d).
         times: first and last time of each record at which outputs were compared [s] (r, 2).
-        intervals: confidence interval of each physical parameter, number by number; infinite if not identifiable.
+        intervals: confidence interval of each number of the physics and the outputs, for example log_drag or gyro.bias.
+            It is infinite if not identifiable, as for a logarithm (log_…) known no better than by a factor of 100.
         errors: RMS of each output's errors in the fit (k).
         set_aside: number of samples of each output that counted less, because their errors were too large.
         covariance: the covariance (p, p) of the learned numbers, in the order of `ravel_learned`.
@@ -104,8 +105,8 @@ def fit_records(
         between: how inputs act between their samples: "held", "linear" or "averaged", see `records.on_grid`.
         segment: length of the segments of multiple shooting [s], which come before whole simulations; by default there
             are none. You need them for unstable systems, a poor initial model, and process noise.
-        prior: standard deviations of learned numbers from their start, by the beginning of their path, for example
-            {"field.residual": 0.3}; the others are free.
+        prior: standard deviations of learned numbers from their start, by the beginning of their names in `intervals`,
+            for example {"log_drag": 0.5, "residual": 0.3}; 0 keeps them, and the others are free.
         noise: expected size of each output's errors in the first round, relative to which `prior` is weighted; by
             default the standard deviation of its samples.
         robust: errors beyond this many times their usual size count linearly, for example 3 for data with outliers. In
@@ -140,8 +141,8 @@ def fit_records(
         y = {name: np.concatenate([each.y[name] for each in gridded]) for name in gridded[0].y}
         for name in (name for name, each in y.items() if not len(each)):
             raise ValueError(f"records: no record has a sample of {name}")
-        most = {name: 1.0 if name in model.angles else np.inf for name in y}  # [rad]: whole turns do not matter
-        deviation = {name: np.clip(each.std(axis=0), TINY, most[name]) for name, each in y.items()}
+        widest = {name: 1.0 if name in model.angles else np.inf for name in y}  # [rad]: whole turns do not matter
+        deviation = {name: np.clip(each.std(axis=0), TINY, widest[name]) for name, each in y.items()}
         known = {name: np.full_like(deviation[name], size) for name, size in (noise or {}).items()}
         scale = {name: jnp.asarray(each) for name, each in (deviation | known).items()}
         # Plain least squares in the first round would follow outliers to another minimum.
@@ -152,7 +153,8 @@ def fit_records(
         segments = shooting.cut(gridded, steps)
         nodes = len(gridded), 1 if segment is None else segments.valid.shape[1], 1
         centres, spread = jnp.tile(jnp.array(model.start), nodes), np.array(model.spread)[None]
-        search = record_search.Search(problem, centres, near, theta, segments, spread)
+        most = np.where(record_search.logarithms(record_search.learned_names(model)), LOGARITHM, np.inf)
+        search = record_search.Search(problem, centres, near, theta, segments, spread, most=most)
         (search, theta, own), total = record_search.approached(search, segment), 0
         if any(model.process):
             noise = np.array(model.process) * np.sqrt(steps * dt)
@@ -164,7 +166,7 @@ def fit_records(
         drawn[0] = 0.0
         for i in range(rounds):
             moves = drawn if i == 0 else drawn[:1]
-            ends = [descend(search.equations, theta + move, own, max_steps=max_steps) for move in moves]
+            ends = [search.descend(theta + move, own, max_steps=max_steps) for move in moves]
             end = min(ends, key=lambda each: np.nan_to_num(float(jnp.sum(each.equations.square)), nan=np.inf))
             theta, own, total = end.theta, end.own, total + end.steps
             errors = search.errors(theta, own)
@@ -175,9 +177,9 @@ def fit_records(
     if found.status != Status.OK:
         checks.warn(f"records: the fit {found.status.message}; check all units and the model")
     for name, each in found.errors.items():
-        if (each > 1.1 * deviation[name] + FINE * min(np.abs(y[name]).max(), most[name])).any():
+        if (each > 1.1 * deviation[name] + FINE * min(np.abs(y[name]).max(), widest[name])).any():
             far = "is off by more than a radian", "varies less than the fit's errors"
-            line = f"{name} {far[int((deviation[name] < most[name]).all())]}: check all units and the model"
+            line = f"{name} {far[int((deviation[name] < widest[name]).all())]}: check all units and the model"
             checks.warn(f"records: {line}, or give a segment")
     if found.directions:
         checks.warn(f"records: no sample determines {'; '.join(found.directions)}")
@@ -187,13 +189,12 @@ def fit_records(
 def _result(search: record_search.Search, end: End, records, gridded, errors, robust, level: float) -> RecordFit:
     model, start = search.model(end.theta), np.asarray(search.nodes(end.own)[0])[:, 0]
     covariance, variances = _covariance(search, end, errors)
+    names = record_search.learned_names(model)
+    # The others keep what they share with it: it may be anything from zero to where it begins to matter.
+    lost = record_search.logarithms(names) & np.isfinite(np.diagonal(covariance)) & (np.diagonal(covariance) > VAGUE**2)
+    covariance = np.where(lost | lost[:, None], np.diag(np.where(lost, np.inf, 0.0)), covariance)
     deviation = np.sqrt(variances[:, : model.space.tangent_size])
-    found, physics = {}, physics_of(model.field)
-    if jax.tree.leaves(eqx.filter(physics, trainable(physics))):
-        picked = np.asarray(jax.jacfwd(lambda theta: ravel_parameters(search.model(theta).field)[0])(end.theta))
-        rows = picked.argmax(axis=1)
-        found = uncertainty.intervals(model.field, jnp.asarray(covariance[np.ix_(rows, rows)]), level)
-        found = jax.tree.map(np.asarray, found)
+    found = intervals_of(model, covariance, level)
     limits = {name: robust * size_of(each, robust) for name, each in errors.items()}
     aside = {name: int((np.abs(each) > limits[name]).any(axis=1).sum()) for name, each in errors.items()}
     rms = {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in errors.items()}
@@ -202,7 +203,20 @@ def _result(search: record_search.Search, end: End, records, gridded, errors, ro
     times = np.array([(each.start, each.start + len(each.u) * search.problem.dt) for each in gridded])
     moved = _discretisation(search, end, errors)
     fit = RecordFit(model, start, deviation, ends, times, found, rms, aside, covariance, end.steps, end.status, moved)
-    return dataclasses.replace(fit, directions=record_search.directions(search, end, records))
+    vague = (name for name, each in zip(names, lost, strict=True) if each)
+    return dataclasses.replace(fit, directions=(*vague, *record_search.directions(search, end, records)))
+
+
+def intervals_of(model: StateSpaceModel, covariance: Float[np.ndarray, "p p"], level: float) -> dict[str, Interval]:
+    """Return the interval of each number of the physics and of the outputs; `covariance` is of all learned numbers."""
+    found, rows = {}, record_search.places_of(model, record_search.physics_in)
+    if len(rows):
+        found = uncertainty.intervals(model.field, jnp.asarray(covariance[np.ix_(rows, rows)]), level)
+    theta, names = np.asarray(ravel_learned(model)[0]), record_search.learned_names(model)
+    away = scipy.special.ndtri((1 + level) / 2) * np.sqrt(np.diagonal(covariance))
+    for i in record_search.places_of(model, lambda model: model.outputs):
+        found[names[i]] = Interval(theta[i], theta[i] - away[i], theta[i] + away[i])
+    return jax.tree.map(np.asarray, found)
 
 
 def _discretisation(search: record_search.Search, end: End, errors) -> float:

@@ -2,23 +2,25 @@
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import ravel_learned, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
+from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.window_checks import foreign_units, turns
 from hybrid_jax.estimation import shooting
 from hybrid_jax.estimation.elimination import End, descend, reduced, undetermined
 from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.estimation.shooting import Local, Model, Predicted, Problem, Segments
+from hybrid_jax.estimation.uncertainty import names_of
 from hybrid_jax.records import Gridded, Record, Signal, integral
 from hybrid_jax.state_space import StateSpace
 
@@ -27,6 +29,7 @@ MOST = 3000  # unknowns
 CLUSTERS = 20  # of a simulation's errors, each of which is one observation
 GAP = 5.0  # sample intervals without a sample that count as a gap
 TINY, SMALL = 1e-12, 1e-3
+LOGARITHM = 3.0  # largest step of a logarithm: the linear model would take one that loses its effect to −∞
 SLOW = 300  # dt in one interval, or records in one input: more is a mistake in a unit of time
 
 
@@ -59,6 +62,7 @@ class Search(NamedTuple):
     segments: Segments  # of the records; one node each, or one for a record in a simulation
     spread: Float[Array | np.ndarray, "#r e"]  # prior standard deviations of each record's start from its centre
     off: Float[np.ndarray, " e"] | None = None  # standard deviation of gaps between segments; None in a simulation
+    most: Float[np.ndarray, " p"] | float = np.inf  # largest step of each number of θ
 
     @property
     def still(self) -> Float[Array, "r q"]:
@@ -99,6 +103,11 @@ class Search(NamedTuple):
         known[0] = np.eye(p)  # the prior of θ is added to the first record
         total.add(np.arange(p), known, known @ (np.asarray(theta) - self.theta), self.deviations)
         return NormalEquations(*map(jnp.asarray, total))
+
+    def descend(self, theta, own, free: Bool[np.ndarray, " p"] | None = None, **options) -> End:
+        """Minimise the cost; numbers with a prior deviation of 0 do not change, nor those that are not `free`."""
+        moves = self.deviations > 0
+        return descend(self.equations, theta, own, free=moves if free is None else free, most=self.most, **options)
 
     def predicted(self, theta, own) -> Predicted:
         model, nodes = self.model(theta), self.nodes(own)[0]
@@ -150,29 +159,52 @@ def _missing(model: Model, ends, slopes, nodes, charts):
     return jax.vmap(jax.vmap(one))(ends, slopes, nodes, charts)
 
 
-def paths_of(model: Model) -> list[str]:
-    """Return the path of each learned number, in the order of `ravel_learned`."""
+def places_of(model: Model, part: Callable[[Model], Any]) -> Int[np.ndarray, " k"]:
+    """Return where the learned numbers of a part of the model are among all, in the order of `ravel_learned`."""
+    theta, unravel = ravel_learned(model)
+    return np.asarray(ravel_learned(part(unravel(jnp.arange(len(theta), dtype=theta.dtype))))[0]).astype(int)
+
+
+def physics_in(model: Model) -> AbstractVectorField:
+    return physics_of(model.field)
+
+
+def learned_names(model: Model) -> list[str]:
+    """Return the name of each learned number, in the order of `ravel_learned`, for example log_drag or gyro.bias.
+
+    Physics' numbers are named as in `uncertainty.named_parameters`, and others by their path in the field or outputs.
+    """
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(model, trainable(model)))
-    return [jax.tree_util.keystr(path, simple=True, separator=".") for path, leaf in leaves for _ in range(leaf.size)]
+    paths = ((jax.tree_util.keystr(path, simple=True, separator="."), leaf.shape) for path, leaf in leaves)
+    indices = ((path.split(".", 1)[1], at) for path, shape in paths for at in np.ndindex(shape))
+    names = [f"{path}[{','.join(map(str, at))}]" if at else path for path, at in indices]
+    for place, name in zip(places_of(model, physics_in), names_of(model.field), strict=True):
+        names[place] = name
+    return names
+
+
+def logarithms(names: Sequence[str]) -> Bool[np.ndarray, " p"]:
+    return np.array([name.split(".")[-1].startswith("log_") for name in names], bool)
 
 
 def deviations_of(model: Model, prior: Mapping[str, float]) -> Float[np.ndarray, " p"]:
-    """Return the prior deviation of each learned number; ValueError for an unknown path."""
-    names, used = paths_of(model), set()
+    """Return the prior deviation of each learned number; ValueError for an unknown name."""
+    names, used = learned_names(model), set()
     found = np.full(len(names), np.inf)
     for i, name in enumerate(names):
-        chosen = [each for each in prior if name == each or name.startswith(f"{each}.")]
+        chosen = [each for each in prior if name == each or name.startswith((f"{each}.", f"{each}["))]
         used.update(chosen)
         found[i] = prior[max(chosen, key=len)] if chosen else np.inf
     for name in prior.keys() - used:
-        raise ValueError(f"prior: the model has no {name}; it has {', '.join(dict.fromkeys(names))}")
+        known = dict.fromkeys(each.split("[")[0] for each in names)
+        raise ValueError(f"prior: the model has no {name}; it has {', '.join(known)}")
     return found
 
 
 def directions(search: Search, end: End, records: Sequence[Record]) -> tuple[str, ...]:
     """Return the directions of θ, and of each start in a simulation, that change no output."""
     p, model = len(search.theta), search.problem.model
-    lines = undetermined(np.asarray(jnp.sum(reduced(end.equations, p).equations.gram, axis=0)), paths_of(model))
+    lines = undetermined(np.asarray(jnp.sum(reduced(end.equations, p).equations.gram, axis=0)), learned_names(model))
     if search.off is None:
         names = np.array(model.space.tangent_names)
         free, equations = np.array(model.spread) > 0, search.local(end.theta, end.own).equations
@@ -252,9 +284,11 @@ def approached(search: Search, segment: float | None) -> tuple[Search, Float[Arr
         raise ValueError(f"segment: {own.size} unknown initial states are too many; use {segment * 2:.3g} s or more")
     size = sizes_of(search, theta, own)
     none = np.zeros(len(theta), bool)
+    if search.problem.model.angles:
+        search, own = _followed(search, theta, APPROACH[0] * size)
     for i, share in enumerate((APPROACH[0], *APPROACH)):
         search = search._replace(off=share * size)
-        found = descend(search.equations, theta, own, free=None if i else none)
+        found = search.descend(theta, own, free=None if i else none)
         theta, nodes = found.theta, search.nodes(found.own)[0]
         if not i:
             moved = np.asarray(_changes(space, nodes, search.centres[:1, :1]))
@@ -262,6 +296,19 @@ def approached(search: Search, segment: float | None) -> tuple[Search, Float[Arr
         own = found.own.at[:, space.tangent_size :].set(0.0)
         search = search._replace(centres=nodes.at[:, 0].set(search.centres[:, 0]))
     return search, theta, own
+
+
+def _followed(search: Search, theta, off: Float[np.ndarray, " e"]) -> tuple[Search, Float[Array, "r q"]]:
+    """Fit one node after another, from where the previous segment ends: an angle then has the right number of turns."""
+    x, spread, nodes, own = search.centres[:, 0], search.spread, [], search.still
+    for j in range(search.centres.shape[1]):
+        segments = jax.tree.map(lambda leaf, j=j: leaf[:, j : j + 1], search.segments)
+        part = search._replace(centres=x[:, None], segments=segments, spread=spread)
+        end = part.descend(theta, part.still, free=np.zeros(len(theta), bool))
+        nodes.append(part.nodes(end.own)[0][:, 0] if j else x)
+        own = own if j else own.at[:, : end.own.shape[1]].set(end.own)
+        x, spread = part.predicted(theta, end.own).states[:, 0, -1], off[None]
+    return search._replace(centres=jnp.stack(nodes, axis=1)), own
 
 
 def sizes_of(search: Search, theta, own) -> Float[np.ndarray, " e"]:

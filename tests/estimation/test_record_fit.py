@@ -106,7 +106,7 @@ def test_multiple_shooting_ends_where_the_simulation_does_from_a_worse_start(rec
 
 
 def test_several_starts_find_the_minimum_that_one_misses(records):
-    options = {"dt": 0.02, "prior": {"field.log_length": 1.0}, "noise": {"angle": NOISE}}
+    options = {"dt": 0.02, "prior": {"log_length": 1.0}, "noise": {"angle": NOISE}}
     far = model_of(pendulum(0.1, 0.1))
     one, several = (fit_records(far, records[:1], starts=starts, **options) for starts in (1, 5))
     assert one.errors["angle"] > 10 * NOISE
@@ -151,11 +151,62 @@ class Twofold(hj.AbstractVectorField):
 
 def test_what_no_output_tells_is_named_and_has_no_interval(records):
     model = model_of(Twofold(*map(jnp.array, (3.0, 3.0, 0.3, 1.0))))
-    with pytest.warns(UserWarning, match="no sample determines .*0.71 field.a - 0.71 field.b") as warned:
+    with pytest.warns(UserWarning, match="no sample determines .*0.71 a - 0.71 b") as warned:
         fit = fit_records(model, records[:1], dt=0.02)
     assert set(fit.undetermined) == {"a", "b", "unused"}
     assert (len(warned), float(fit.intervals["unused"].value)) == (1, 1.0)
     assert np.isfinite(float(fit.intervals["damping"].high))
+
+
+class Slider(hj.AbstractVectorField):
+    """The drag is a number, or the exponential of one."""
+
+    gain: jax.Array
+    drag: jax.Array | None = None
+    log_drag: jax.Array | None = None
+
+    def __call__(self, x, u):
+        return self.gain * u - (self.drag if self.log_drag is None else jnp.exp(self.log_drag)) * x
+
+
+def test_a_logarithm_on_its_way_to_minus_infinity_is_named_and_others_count_it():
+    """The data want a negative drag, so its logarithm loses its effect; the gain is not better known for that."""
+    t = np.arange(0.0, 3.0, 0.05)
+    y = np.expm1(0.02 * t) / 0.02 + NOISE * np.random.default_rng(0).normal(size=len(t))
+    data, one = [Record.of("r", push=(t, 0 * t + 1), angle=(t, y))], jnp.array(1.2)
+
+    def fit(field):
+        return fit_records(StateSpaceModel(field, ("push",), {"angle": angle}, (0.0,), (0.0,)), data, dt=0.05)
+
+    with pytest.warns(UserWarning, match="records: no sample determines log_drag$"):
+        found = fit(Slider(one, log_drag=jnp.log(0.3)))
+    known = fit(Slider(one, drag=jnp.array(0.3)))
+    assert (found.undetermined, float(found.intervals["log_drag"].value) > -100) == (("log_drag",), True)
+    wide, right = (float(each.intervals["gain"].high - each.intervals["gain"].low) for each in (found, known))
+    assert wide > right
+
+
+class Biased(eqx.Module):
+    bias: jax.Array
+
+    def __call__(self, x, u):
+        return x[0] + self.bias
+
+
+def test_a_sensor_has_an_interval_and_the_names_of_intervals_are_those_of_priors(records):
+    outputs = {"angle": Biased(jnp.array(0.1))}
+    start = dataclasses.replace(model_of(pendulum(1.0, 0.1)), outputs=outputs)
+    fit = fit_records(start, records, dt=0.02)
+    bias = fit.intervals["angle.bias"]
+    assert (set(fit.intervals), float(bias.value)) == (
+        {"log_length", "damping", "angle.bias"},
+        fit.model.outputs["angle"].bias,
+    )
+    assert float(bias.low) < 0 < float(bias.high) < 0.02
+    kept = fit_records(start, records, dt=0.02, prior=dict.fromkeys(fit.intervals, 0.0), max_steps=9)
+    assert eqx.tree_equal(
+        jax.tree.map(float, (kept.model.field, kept.model.outputs)), jax.tree.map(float, (start.field, start.outputs))
+    )
 
 
 def oscillator():
@@ -258,7 +309,7 @@ def test_the_mean_of_an_input_over_intervals_keeps_its_integral(between):
     ("wrong", "said"),
     [
         ({"records": [Record.of("r", torque=([0, 1], [0, 1]))]}, "r: has no angle; it has torque"),
-        ({"prior": {"field.mass": 1.0}}, "prior: the model has no field.mass"),
+        ({"prior": {"mass": 1.0}}, "prior: the model has no mass; it has log_length, damping"),
         ({"between": "cubic"}, "between must be one of held, linear, averaged, got 'cubic'"),
         ({"dt": 0.0}, "dt must be a positive number of seconds"),
         ({"segment": 9.0}, r"segment must be at most the .* s of the longest record, got 9"),

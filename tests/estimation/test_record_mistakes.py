@@ -68,6 +68,11 @@ def test_an_angle_that_jumps_is_fitted_as_one_that_does_not():
     assert fit.errors["angle"] < 2 * NOISE
     for name, (value, *_) in fit.intervals.items():
         assert float(same.intervals[name].value) == pytest.approx(float(value), abs=1e-6)
+    poor = dataclasses.replace(turning, field=pendulum(1.2, 0.1), spread=(np.inf, np.inf))
+    found = fit_records(poor, [wrapped], dt=0.02, segment=0.5)
+    assert float(found.intervals["log_length"].value) == pytest.approx(
+        float(fit.intervals["log_length"].value), abs=1e-3
+    )
     still = dataclasses.replace(turning, start=(0.5, 0.0), spread=(0.0, 0.0))  # the wrong start, which is kept
     with pytest.warns(UserWarning, match="^records: angle is off by more than a radian: check"):
         fit_records(still, [wrapped], dt=0.02, max_steps=1, rounds=1)
