@@ -74,7 +74,7 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     learned, experts = source_models(config, stages)
     out, rows, flights = config.out / NAME, Results(), dict[str, Any]()
     for domain in DOMAINS:
-        target = flown(domain, drawn_splits(config) | past_splits(test=config.test), config, stages)
+        target = flown(domain, drawn_splits(config) | past_splits(test=config.n_test), config, stages)
         case = Case(config, stages, learned, experts, target)
         lanes = [source_only(case, model) for model in learned]
         lanes += [adapted(case, method) for method in config.methods]

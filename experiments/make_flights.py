@@ -48,9 +48,9 @@ class Options:
     """Windows of 0.1 s (10 steps) for training; 0 omits a split."""
     validation: CountFromZero = 1000
     """Windows of 0.1 s."""
-    test: CountFromZero = 0
+    test: Annotated[CountFromZero, Named(name="n-test")] = 0
     """Windows of 1 s (100 steps)."""
-    test_with_past: CountFromZero = 0
+    test_with_past: Annotated[CountFromZero, Named(name="n-test-with-past")] = 0
     """Windows of 0.2 s: 10 steps of past and the 10 to predict."""
     picture: Path | None = None
     """Also render the vehicle to this PNG (needs the system package libosmesa6 or libegl1)."""
@@ -62,7 +62,7 @@ class Options:
         steps = {"train": 10, "validation": 10, "test": 100, "test_with_past": 20}
         splits = {name: SplitSpec(getattr(self, name), n) for name, n in steps.items() if getattr(self, name) != 0}
         if not splits:
-            raise ValueError("no windows requested; give --train, --validation, --test or --test-with-past")
+            raise ValueError("no windows requested; give --train, --validation, --n-test or --n-test-with-past")
         return splits
 
 

@@ -74,7 +74,7 @@ class Config(Run):
     validation: Count | Literal["own"] = 1000
     """Validation trajectories, in the source and in the target. own: only the N target trajectories, with the
     last fifth held out if a method needs early stopping."""
-    test: Count = 1000
+    n_test: Count = 1000
     """Target test trajectories."""
     data_seed: CountFromZero = 0
     """Seed of all flights."""
@@ -125,8 +125,8 @@ class Config(Run):
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
         self._check_draws()
-        if self.pooled() + self.source_train + self.validating() + self.test > MOST:
-            named = "--n-target, --draws, --pool, --source-train, --validation and --test"
+        if self.pooled() + self.source_train + self.validating() + self.n_test > MOST:
+            named = "--n-target, --draws, --pool, --source-train, --validation and --n-test"
             raise ValueError(f"{named} must request at most {MOST:,} trajectories together")
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
         if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
@@ -250,10 +250,10 @@ def column(size: int) -> int:
 PAPER = AdaptationConfig()
 QUICK = replace(
     PAPER, preset="quick", seeds=3, sizes=(100, 300), models=(HYBRID, NO_PHYSICS, CONSTANT_DISTURBANCE),
-    source_train=1000, validation=200, test=200, max_epochs=200,
+    source_train=1000, validation=200, n_test=200, max_epochs=200,
 )  # fmt: skip
 SMOKE = replace(
-    PAPER, preset="smoke", seeds=1, sizes=(20,), source_train=40, validation=20, test=20, batch_size=20, max_epochs=3,
+    PAPER, preset="smoke", seeds=1, sizes=(20,), source_train=40, validation=20, n_test=20, batch_size=20, max_epochs=3,
     hidden=32,
 )  # fmt: skip
 # Both ends of the sizes, and less source flight, learnt at rates that converge in it: under a minute on two cores.

@@ -70,7 +70,7 @@ def protocol(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, stages:
     flying = partial(flown, config=config, stages=stages)
     source = Stage(("flights", SOURCE.name), partial(flying, SOURCE, source_splits(config), file=config.source_flights))
     target = Stage(("flights", domain.name), partial(flying, domain, target_splits(config), file=config.target_flights))
-    home = Stage(("flights", "test"), partial(flying, SOURCE, {"test": SplitSpec(config.test, 100)}))
+    home = Stage(("flights", "test"), partial(flying, SOURCE, {"test": SplitSpec(config.n_test, 100)}))
     found, learned = [source, target, home], dict[str, Stage]()
 
     def test(model: str, mode: str, fit: Stage, *more: Stage) -> Stage:
@@ -217,7 +217,7 @@ def source_splits(config: Config) -> dict[str, SplitSpec]:
 
 
 def target_splits(config: Config) -> dict[str, SplitSpec]:
-    return drawn_splits(config) | {"test": SplitSpec(config.test, 100)}
+    return drawn_splits(config) | {"test": SplitSpec(config.n_test, 100)}
 
 
 def drawn_splits(config: Config) -> dict[str, SplitSpec]:

@@ -56,7 +56,7 @@ class Config(Run):
     """Trajectories to adapt to."""
     points: Count = 32
     """Grid points along each axis."""
-    test: Count = 100
+    n_test: Count = 100
     """Test trajectories of forecasts; a third of these after a shift and for Gray–Scott."""
     hidden: Count = 24
     """Hidden units of the pointwise residual of forecasts."""
@@ -86,13 +86,13 @@ PAPER = Config()
 PRESETS = {
     "paper": PAPER,
     "quick": replace(
-        PAPER, preset="quick", seeds=1, starts=1, sizes=(1, 2), test=20, hidden=12, units=8, channels=6, steps=15,
+        PAPER, preset="quick", seeds=1, starts=1, sizes=(1, 2), n_test=20, hidden=12, units=8, channels=6, steps=15,
         polish=3,
         parts=("forecast", "shifted"), shifts=("parameter_shift",),
         cases=("pointwise", "convolution, neighbours penalised", "physics alone: diffusion", "physics alone: complete"),
     ),
     "smoke": replace(
-        PAPER, preset="smoke", seeds=1, starts=2, sizes=(1, 2), test=3, hidden=3, units=3, channels=2, steps=2,
+        PAPER, preset="smoke", seeds=1, starts=2, sizes=(1, 2), n_test=3, hidden=3, units=3, channels=2, steps=2,
         polish=1, points=8, cases=("pointwise", "convolution", "physics alone: diffusion"), shifts=("new_term",),
     ),
 }  # fmt: skip

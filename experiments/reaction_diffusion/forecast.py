@@ -63,7 +63,7 @@ def trained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
 def study(config: Config, kept: Kept) -> list[Row]:
     """Return a row for each case and seed."""
     truth = fitzhugh_nagumo(plane(config.points))
-    test = reacting(truth, config.test, (TEST, 0))
+    test = reacting(truth, config.n_test, (TEST, 0))
     cases = [case for case in CASES if case.name in config.cases]
     runs = [(case, seed) for case in cases for seed in range(min(config.seeds, case.seeds))]
 

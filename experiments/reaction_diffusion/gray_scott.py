@@ -24,7 +24,7 @@ EVERY = 3  # intervals between the windows that are trained on
 # the network does not yet know, and come back slowly.
 STAGES = ((True, 20), (False, 35))
 UNITS = 16  # of the network, at most --hidden
-SHARE = 3  # test trajectories of an environment: --test over this
+SHARE = 3  # test trajectories of an environment: --n-test over this
 SCALING = ChannelScaling((0.6, 0.15), (0.3, 0.15), (0.02,))
 
 
@@ -60,7 +60,7 @@ def study(config: Config, kept: Kept) -> list[Row]:
     def adapt(index: int, environment: tuple[float, float]) -> Found:
         truth = gray_scott([environment], True, config.points)
         seen = patterns(truth, 0, 1, (ADAPT, index))
-        test = patterns(truth, 0, -(-config.test // SHARE), (TEST, index))
+        test = patterns(truth, 0, -(-config.n_test // SHARE), (TEST, index))
         middle = hj.Hybrid(gray_scott([GUESS], False, config.points), source.residual)
         fitted: Any = hj.fit_least_squares(middle, pieces(seen, 3, 3), solver=SCOTT_COARSE).field
         feed, kill = (float(value[0]) for value in fitted.physics.theta().values())

@@ -23,7 +23,7 @@ SOURCES = 2  # trajectories that a source learns from
 EVERY = 12  # intervals between the windows to learn from
 TUNING, SCRATCH = 6, 14  # most Gauss–Newton steps from the source, and from random weights
 WINDOW = 3  # intervals of a window to adapt parameters to
-SHARE = 3  # test trajectories: --test over this
+SHARE = 3  # test trajectories: --n-test over this
 MODELS = {HYBRID: 1, NO_PHYSICS: 3}  # kernel of the network
 
 
@@ -85,7 +85,7 @@ def before(config: Config, trained, shift: str) -> list[Row]:
 
 @cache
 def tested(config: Config, shift: str) -> hj.Trajectories:
-    return reacting(fitzhugh_nagumo(plane(config.points), *SHIFTS[shift]), -(-config.test // SHARE), (TEST, 0))
+    return reacting(fitzhugh_nagumo(plane(config.points), *SHIFTS[shift]), -(-config.n_test // SHARE), (TEST, 0))
 
 
 @cache

@@ -48,6 +48,7 @@ PRESETS = {
         worlds=("iris", "hummingbird"),
         changes=("nothing", "motor_lag", "battery", "reaction_torque", "external_force", "parameter_shift"),
         learn_from=("moving", "hover", "near_ground", "outliers"),
+        n_test=WorldsConfig.n_test,
     ),
     "smoke": preset_like(
         WorldsConfig,
@@ -56,7 +57,7 @@ PRESETS = {
         changes=("nothing",),
         learn_from=("short",),
         rivals=(),
-        test_flights=1,
+        n_test=1,
     ),
 }
 

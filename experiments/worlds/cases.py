@@ -18,7 +18,7 @@ from experiments.paper.study import pretrained
 from experiments.reporting.names import HYBRID
 from experiments.reporting.results import Row
 from experiments.runner.cache import identity_of
-from experiments.runner.options import distinct
+from experiments.runner.options import Count, distinct
 from experiments.runner.stages import Found, Stages, rows_of
 from experiments.worlds.iris import Iris
 from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
@@ -84,13 +84,14 @@ class WorldsConfig(OneFlight):
     without these terms and the network at once, as in the paper."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
     """How a log samples them: means over each interval, or values at its start."""
-    test: Annotated[int, tyro.conf.Suppress] = 1000  # no effect here, like the next two: each world has own flights
+    n_test: Count = 20
+    """Usual flights of ten seconds after each change, for each source."""
+    # These have no effect here: each world has its own flights.
+    sizes: Annotated[tuple[int, ...], tyro.conf.Suppress] = (100,)
     pool: Annotated[int | None, tyro.conf.Suppress] = None
     draw: Annotated[Literal["random", "contiguous"], tyro.conf.Suppress] = "contiguous"
     rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
     """Changes after which other methods are compared with `hj.adapt`, on the first flight of six sources."""
-    test_flights: int = 20
-    """Usual flights of ten seconds after each change, for each source."""
 
     def __post_init__(self):
         OneFlight.__post_init__(self)
@@ -158,9 +159,9 @@ class Tests(NamedTuple):
 
 def tests_after(world: World, change: str, config: WorldsConfig, seed: int) -> Tests:
     key, averaged = key_of(world, config, TEST, seed), config.rotor_speeds == "averaged"
-    flown = usual_flights(world, change, config.test_flights, TESTING, key)
+    flown = usual_flights(world, change, config.n_test, TESTING, key)
     noisy = logged(flown, key, LONG, noise=config.noise, averaged=averaged)
-    each = len(noisy) // config.test_flights
+    each = len(noisy) // config.n_test
     others = [noisy[i : i + each] for i in range(0, len(noisy), each)]
     return Tests(logged(flown, key, LONG, noise=0.0, averaged=averaged), others)
 

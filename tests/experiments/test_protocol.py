@@ -47,7 +47,7 @@ def test_the_paper_preset_is_the_paper():
     paper = PRESETS["paper"]
     assert paper.sizes == (100, 300, 500, 700, 1000)
     assert (paper.seeds, paper.hidden, paper.batch_size, paper.max_epochs) == (10, 64, 100, 2000)
-    assert (paper.source_train, paper.validation, paper.test) == (10_000, 1000, 1000)
+    assert (paper.source_train, paper.validation, paper.n_test) == (10_000, 1000, 1000)
     assert (paper.regulariser, paper.regulariser_weight, paper.solver) == ("trajectory_correlation", 1e-3, "rk4")
     assert paper.guess == (0.8, 1.25)
     assert paper == AdaptationConfig()  # no preset means the paper
