@@ -17,7 +17,7 @@ from experiments.flying.changes import CHANGES
 from experiments.paper import study
 from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, OneFlight, preset_like
-from experiments.paper.regret import CLAIMS, conclusion, error_figure, error_table, regret_table
+from experiments.paper.regret import CLAIMS, ERRORS, conclusion, error_figure, error_table, regret_table
 from experiments.paper.study import EVERY, flown, pretrained, source_splits, target_splits, windows_of
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
@@ -37,7 +37,7 @@ from hybrid_jax.adaptation.selection import BLOCKS, alike, blocks_of, fit_each
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.io.datasets import Dataset
-from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.metrics import window_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sweep import evaluate
@@ -47,6 +47,7 @@ from hybrid_jax.vehicle import IRIS, STATE_SIZE
 
 NAME = "changes"
 INSIDE = "expected_inside"  # column: see `_share_inside`
+SCALES = np.where(np.arange(STATE_SIZE) < [[STATE_SIZE], [3]], 1.0, np.inf)  # of all states, and of the position alone
 Compared = Literal["fine_tune", "fine_tune_offset", "l2_sp"]
 METHOD, OFFSET = Auto(), 0.3
 L2_SP = FineTune(l2_sp=1e-2)
@@ -109,9 +110,7 @@ def report(record: Mapping[str, Any]) -> Report:
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
-    errors = (
-        "Prediction error by change, % of that without adaptation; bands reach from the least to the most of all cases"
-    )
+    errors = "RMSE of the position predicted over 1 s; lower is better; bands reach from the least to the most"
     return {"errors": (error_figure(rows), errors)}
 
 
@@ -132,8 +131,8 @@ def adapted(
         def row(seed: int, i: int) -> Row:
             taken = bool(found.taken[seed] == i)
             tags = {"domain": domain.name, "candidate": found.names[i], "draw": draw, "seed": seed, "taken": taken}
-            numbers = {"test_mse": found.test_mse[seed, i], "probability": found.probability[seed, i]}
-            return tags | numbers | {INSIDE: inside[seed] if taken else None}
+            numbers = dict(zip(ERRORS, found.errors[seed, i], strict=True))
+            return tags | numbers | {"probability": found.probability[seed, i], INSIDE: inside[seed] if taken else None}
 
         return [row(seed, i) for seed in seeds for i in range(len(found.names))], {}
 
@@ -152,21 +151,27 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
     }
     rows = []
     for name in config.compared:
-        errors = evaluate(fits[name]().fields, target.splits["test"], EVERY, settings(config), config.runs())
+        fitted, test = fits[name]().fields, target.splits["test"]
+        errors = evaluate(fitted, test, EVERY, settings(config), config.runs())
+        columns = dict(zip(ERRORS, (errors, _errors(fitted, test, settings(config))[:, 1]), strict=True))
         tags = {"domain": target.config["domain"], "candidate": name, "probability": None, "taken": False}
         cases = [divmod(i, config.seeds) for i in range(len(errors))]
         rows += [
-            {**tags, INSIDE: None, "draw": d, "seed": s, "test_mse": float(errors[i])} for i, (d, s) in enumerate(cases)
+            {**tags, INSIDE: None, "draw": d, "seed": s} | {column: float(own[i]) for column, own in columns.items()}
+            for i, (d, s) in enumerate(cases)
         ]
     return rows
 
 
 class Tested(eqx.Module):
-    """The candidates of each seed: `ends` has errors of left-out blocks, `flown` of each flight, see `BlockErrors`."""
+    """The candidates of each seed: `errors` are `ERRORS`.
+
+    `ends` has errors of left-out blocks, `flown` of each flight, see `BlockErrors`.
+    """
 
     names: tuple[str, ...] = eqx.field(static=True)
     probability: Array
-    test_mse: Array
+    errors: Array
     taken: Array
     ends: Array
     flown: Array
@@ -188,13 +193,13 @@ def _candidates(
         choice = choice._replace(theta=fits.theta)
 
         def error(index):
-            return rollout_mse(candidate(larger, choice, index), test, EVERY, shared.solver)
+            return _both_errors(candidate(larger, choice, index), test, shared)
 
         adapted = candidate(larger, choice, choice.taken)
         return Tested(
             choice.names,
             probability=choice.probability,
-            test_mse=jax.lax.map(error, jnp.arange(len(choice.names))),
+            errors=jax.lax.map(error, jnp.arange(len(choice.names))),
             taken=choice.taken,
             ends=choice.ends,
             flown=jax.lax.map(partial(of_flight, adapted), flights),
@@ -205,6 +210,15 @@ def _candidates(
         return jnp.mean(jax.lax.map(lambda b: errors_at_ends(field, b[0], b[1], shared.solver), blocks), axis=0)
 
     return jax.lax.map(one, (fields, windows))
+
+
+@jit_with(FAST_COMPILE)
+def _errors(fields: Any, test: Trajectories, shared: Settings):
+    return jax.lax.map(lambda field: _both_errors(field, test, shared), fields)
+
+
+def _both_errors(field: AbstractVectorField, test: Trajectories, shared: Settings) -> Array:
+    return jnp.stack([jnp.mean(window_mse(field, test, EVERY, shared.solver, scale)) for scale in SCALES])
 
 
 def _share_inside(ends: np.ndarray, flown: np.ndarray) -> float | None:

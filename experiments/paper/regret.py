@@ -19,15 +19,17 @@ MEAN_RHO, WORST_RHO = 0.93, 0.85
 HELD = 0.7, 0.9  # share of errors in their 80 % interval
 AUTO = "auto"  # the candidate that was taken
 COMPARED = "fine_tune", "fine_tune_offset", "l2_sp"  # no candidates
-SHOWN = {  # method → label, colour and marker
-    AUTO: ("hj.adapt", METHODS["adapted"], "o"),
-    "fine_tune": ("fine-tuned (Adam)", METHODS["fine-tuned"], "^"),
+ERRORS = "test_mse", "position_mse"  # columns: of all states, and of the position [m²]
+SHOWN = {  # method → label, colour, marker, and side of its number
+    "source": ("not adapted", METHODS["not adapted"], "s", 1),
+    "fine_tune": ("fine-tuned (Adam)", METHODS["fine-tuned"], "^", -1),
+    AUTO: ("hj.adapt", METHODS["adapted"], "o", 1),
 }
 
 
-def of_each_case(rows: Results, name: str) -> np.ndarray:
+def of_each_case(rows: Results, name: str, column: str = ERRORS[0]) -> np.ndarray:
     own = rows.where(taken=True) if name == AUTO else rows.where(candidate=name)
-    return np.array([case.numbers("test_mse")[0] for case in own.group("domain", "draw", "seed").values()])
+    return np.array([case.numbers(column)[0] for case in own.group("domain", "draw", "seed").values()])
 
 
 def best_of_each_case(rows: Results) -> np.ndarray:
@@ -135,20 +137,19 @@ def error_table(rows: Results) -> Table:
 
 @mpl.rc_context(STYLE)
 def error_figure(rows: Results) -> Figure:
-    """Draw each change's error as a percentage of the unadapted one; lines reach from the least to the most."""
+    """Draw each change's error of the position [m]; lines reach from the least to the most."""
     groups = rows.group("domain")
-    figure, ((axes,),) = subplots(1.4 + 0.36 * len(groups), 1, 1)
-    axes.axvline(100, color=METHODS["not adapted"], label="not adapted")
+    figure, ((axes,),) = subplots(1.4 + 0.4 * len(groups), 1, 1)
     for y, own in enumerate(groups.values()):
-        before = of_each_case(own, "source")
-        for name, (label, colour, marker) in SHOWN.items():
+        for name, (label, colour, marker, side) in SHOWN.items():
             if name in (AUTO, *own.unique("candidate")):
-                errors = of_each_case(own, name)
-                each, mean = 100 * np.sqrt(errors / before), 100 * np.sqrt(errors.mean() / before.mean())
+                errors = of_each_case(own, name, ERRORS[1])
+                each, mean = np.sqrt(errors), np.sqrt(errors.mean())
                 axes.plot([each.min(), each.max()], [y, y], color=colour, lw=4, alpha=0.25, solid_capstyle="round")
                 axes.plot(mean, y, marker, ms=6, color=colour, ls="", label="" if y else label)
-                note(axes, f"{mean:.0f} %", (mean, y), (0, 6), ha="center", color=colour)
-    about = "RMS error of predictions over 1 s [% of the error\nwithout adaptation] (log scale; lower is better)"
+                placed = {"ha": "center", "va": "bottom" if side > 0 else "top", "color": colour}
+                note(axes, f"{mean:.2g}", (mean, y), (0, 5 * side), **placed)
+    about = "RMS error of the predicted position over 1 s [m]\n(log scale; lower is better)"
     axes.set(xscale="log", xlabel=about)
     tick_errors(axes.xaxis, *axes.get_xlim(), room=3.0)
     name_lines(axes, [*map(names.label, groups)])
