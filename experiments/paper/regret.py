@@ -99,16 +99,15 @@ CLAIMS: Sequence[Claim[Results]] = (
 
 def conclusion(rows: Results) -> list[str]:
     gains = {domain: 1 - over(own, "source").mean() for domain, own in rows.group("domain").items()}
-    sentence = (
-        f"`hj.adapt` removes {min(gains.values()):.0%} to {max(gains.values()):.0%} of the source's error, by change"
-    )
+    share = f"{min(gains.values()):.0%} to {max(gains.values()):.0%}"
+    sentence = f"`hj.adapt` removes {share} of the source's mean squared error, by change"
     if "fine_tune" not in rows.unique("candidate"):
         return [f"{sentence}."]
     worse = [
         of_each_case(own, "fine_tune").mean() > of_each_case(own, "source").mean()
         for own in rows.group("domain").values()
     ]
-    return [f"{sentence}; fine-tuning is worse than the source in {sum(worse)} of {len(worse)} changes."]
+    return [f"{sentence}; fine-tuning increases it in {sum(worse)} of {len(worse)} changes."]
 
 
 def regret_table(rows: Results) -> Table:
