@@ -1,11 +1,11 @@
 """Options of the closed-loop experiment, and its presets."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from experiments.flying.scenario import Reference, hardware
 from experiments.paper.config import QUICK, SMOKE, AllModels, Config, ResidualInputs, preset_like
-from experiments.runner.options import Count, NotNegative, Positive, distinct
+from experiments.runner.options import Count, Named, NotNegative, Positive, distinct
 from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.vehicle import IRIS
 
@@ -28,7 +28,7 @@ class ClosedLoopConfig(AllModels):
     """Distance of flights away from home [m]."""
     away_references: tuple[Reference, ...] | None = None
     """Subset of --references to fly away from home; by default hover, figure_eight and low_pass."""
-    bandwidth: Positive = 10.0
+    bandwidth: Annotated[Positive, Named(name="observer-bandwidth")] = 10.0
     """Bandwidth of the disturbance observer [rad/s]."""
     noise: NotNegative = 0.0
     """White noise on the states that controller and observer see; 1 is typical of motion capture and a gyroscope."""

@@ -89,8 +89,8 @@ class ExcitationConfig(Run):
     """Highest frequency of the design [Hz]."""
     starts: Count = 4
     """Number of random series to start from."""
-    steps: Count = 200
-    """Steps of the search."""
+    steps: Annotated[Count, Named(name="iterations")] = 200
+    """Iterations of the search."""
 
     def __post_init__(self):
         Run.__post_init__(self)

@@ -1,10 +1,10 @@
 """Options of the experiment that adapts in the air, and its presets."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from experiments.flying.scenario import Reference, hardware
-from experiments.runner.options import NotNegative, Positive, Run, distinct
+from experiments.runner.options import Named, NotNegative, Positive, Run, distinct
 from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.vehicle import IRIS
 
@@ -30,7 +30,7 @@ class OnlineConfig(Run):
     """Latency from a sample to its command [s], a multiple of 0.01."""
     rotor_lag: NotNegative = 0.03
     """Time constant of the rotors [s]."""
-    bandwidth: Positive = 8.0
+    bandwidth: Annotated[Positive, Named(name="observer-bandwidth")] = 8.0
     """Bandwidth of the disturbance observer [rad/s]."""
     l1_cutoff: Positive = 8.0
     """Cutoff of the low-pass filter of L1 adaptive augmentation [rad/s]."""

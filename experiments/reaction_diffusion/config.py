@@ -66,7 +66,7 @@ class Config(Run):
     """Hidden units of the hybrids that are adapted."""
     starts: Count = 3
     """Random networks to start with; the one with the least training loss after ten steps is continued."""
-    steps: Count = 35
+    steps: Annotated[Count, Named(name="iterations")] = 35
     """Gauss–Newton steps on single intervals, the first ten included."""
     polish: Count = 8
     """Gauss–Newton steps on whole trajectories."""

@@ -18,7 +18,7 @@ from experiments.paper.study import pretrained
 from experiments.reporting.names import HYBRID
 from experiments.reporting.results import Row
 from experiments.runner.cache import identity_of
-from experiments.runner.options import Count, distinct
+from experiments.runner.options import Count, Named, distinct
 from experiments.runner.stages import Found, Stages, rows_of
 from experiments.worlds.iris import Iris
 from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
@@ -79,7 +79,7 @@ class WorldsConfig(OneFlight):
     learn_from: tuple[FlightName, ...] = get_args(FlightName)
     """Flights to adapt to. moving: ten seconds of usual flight. Of the others one draw for each source. near_ground:
     slow. short: three seconds. noisy: sensors three times as noisy. outliers: 0.3 s of outliers."""
-    source_training: Literal["physics_first", "joint"] = "physics_first"
+    source_training: Annotated[Literal["physics_first", "joint"], Named(name="pretraining")] = "physics_first"
     """physics_first: physics with drag and moments by least squares, then the network on what is left. joint: physics
     without these terms and the network at once, as in the paper."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"

@@ -72,7 +72,7 @@ class Options:
     """Length of a step [s]. By default the sample interval of the training flights."""
     out: Path = Path("runs/export")
     """Folder for report.html and report.json."""
-    noise: Annotated[tuple[float, ...], RARE] = ()
+    noise: Annotated[tuple[float, ...], RARE, tyro.conf.arg(name="noise-std")] = ()
     """Filter: standard deviation of the measurements: position [m], quaternion, velocity [m/s] and body rates
     [rad/s], by default 0.001 0.002 0.02 0.02; or one number for all states, or one for each. For other systems than a
     rigid body there is no default, and no filter without it. For other settings of the filter see docs/howto/c.md."""
@@ -89,7 +89,7 @@ def run(options: Options) -> int:
         raise ValueError(f"--dt is needed: {options.model} does not contain the sample interval of its flights")
     checks.positive(f"{options.model}: dt" if options.dt is None else "--dt", dt, "a positive number of seconds")
     if options.noise and "c" not in options.to:
-        raise ValueError("--noise needs --to c: the filter is only written as C")
+        raise ValueError("--noise-std needs --to c: the filter is only written as C")
     if options.smooth is not None:
         checks.positive("--smooth", options.smooth)
     d, m = sizes_of(field, options.state_size, options.input_size)
@@ -173,11 +173,11 @@ def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> 
             raise
         return str(error)
     if not (noise := options.noise or SENSOR_NOISE * rigid):
-        return "--noise must be given, because it has no default for this system"
+        return "--noise-std must be given, because it has no default for this system"
     known = {1: 1, d: 1} | ({len(PARTS): PARTS} if d == STATE_SIZE else {})  # repeats of each number
     if len(noise) not in known:
         expected = f"1, {len(PARTS)} or {d}" if d == STATE_SIZE else f"1 or {d}"
-        raise ValueError(f"--noise must be {expected} numbers, got {len(noise)}")
+        raise ValueError(f"--noise-std must be {expected} numbers, got {len(noise)}")
     field = field if options.smooth is None else smoothed(field, options.smooth)
     beyond, process = 0.0, 0.0
     if rigid:  # an adapted model may have a disturbance of some states only

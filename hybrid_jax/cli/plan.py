@@ -69,7 +69,7 @@ class Options:
     """Standard deviation of the noise of each of the 13 states, by default typical of motion capture."""
     starts: Annotated[int, RARE] = 4
     """Number of random initial flights of the search."""
-    steps: Annotated[int, RARE] = 200
+    steps: Annotated[int, RARE, tyro.conf.arg(name="iterations")] = 200
     """Iterations of the search."""
     seed: Annotated[int, RARE] = 0
     """Random seed of the initial flights."""

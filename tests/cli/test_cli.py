@@ -128,7 +128,7 @@ def test_physics_that_takes_the_place_of_a_network_is_saved_though_nothing_chang
 def test_set_points_of_a_plan_begin_and_end_in_the_middle(tmp_path, called):
     save(tmp_path / "model.npz", rigid_body(IRIS), {"dt": 0.02})
     files = ["-o", tmp_path / "plan.csv", "--out", tmp_path]
-    code, said, _ = called("plan", tmp_path / "model.npz", *files, "--seconds", 2, "--starts", 1, "--steps", 0)
+    code, said, _ = called("plan", tmp_path / "model.npz", *files, "--seconds", 2, "--starts", 1, "--iterations", 0)
     assert code == 0
     assert "is the least certain" in said
     points = np.genfromtxt(tmp_path / "plan.csv", delimiter=",", names=True)

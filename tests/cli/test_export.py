@@ -88,7 +88,7 @@ def test_c_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, ca
 
 def test_the_filter_that_is_written_is_that_of_the_options(tmp_path, called, filters):
     hj.save(tmp_path / "model.npz", hj.rigid_body(hj.IRIS), {"dt": 0.02})
-    options = "--noise 0.1,0.2,0.3,0.4"
+    options = "--noise-std 0.1,0.2,0.3,0.4"
     _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--out", tmp_path, *options.split())
     assert "model_adaptation adapts Ix, Iy, k, disturbance, with a sample every 0.02 s" in said
     noise, process = (np.repeat(each, [3, 4, 3, 3]) for each in ([0.1, 0.2, 0.3, 0.4], [0, 0, 0.003, 0.005]))
@@ -112,8 +112,8 @@ def test_a_model_without_parameters_has_no_filter(tmp_path, called):
         ({"dt": 0.02}, ["--dt", "nan"], "--dt must be a positive number of seconds, got nan"),
         ({}, [], "--dt is needed"), ({"dt": 0.02}, ["--smooth", "-1"], "--smooth must be"),
         ({"dt": 0.02}, ["--name", "1"], "name must be a lower-case C identifier"),
-        ({"dt": 0.02}, ["--noise", "1", "--to", "casadi"], "needs --to c"),
-        ({"dt": 0.02}, ["--noise", "1", "2"], "--noise must be 1, 4 or 13 numbers, got 2"),
+        ({"dt": 0.02}, ["--noise-std", "1", "--to", "casadi"], "needs --to c"),
+        ({"dt": 0.02}, ["--noise-std", "1", "2"], "--noise-std must be 1, 4 or 13 numbers, got 2"),
     ],
     ids=str,
 )  # fmt: skip

@@ -89,7 +89,7 @@ def test_from_logs_of_every_format_to_pages_and_a_program(fitted, ran, seen):
     written(fitted / "other", PARAMETER_SHIFT, 1, 2)
     assert "times as accurate as with frozen rates" in ran(fitted, "check adapted.npz other")
     assert set(report("check")["rmse"]) >= {"model", "no forces"}
-    ran(fitted, "plan adapted.npz -o plan.csv --seconds 2 --starts 1 --steps 5")
+    ran(fitted, "plan adapted.npz -o plan.csv --seconds 2 --starts 1 --iterations 5")
     ran(fitted, "replay adapted.npz other/flight0.csv.gz --other source.npz --seconds 1")
     (fitted / "commands.toml").write_text((fitted / "v.toml").read_text() + ACTUATOR)
     options = "--learn Ix,Iy --windows 20 --ignore-checks --out runs/identified"
