@@ -40,7 +40,6 @@ from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.metrics import window_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sweep import evaluate
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS, STATE_SIZE
@@ -151,23 +150,16 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
     }
     rows = []
     for name in config.compared:
-        fitted, test = fits[name]().fields, target.splits["test"]
-        errors = evaluate(fitted, test, EVERY, settings(config), config.runs())
-        columns = dict(zip(ERRORS, (errors, _errors(fitted, test, settings(config))[:, 1]), strict=True))
+        errors = np.asarray(_errors(fits[name]().fields, target.splits["test"], settings(config)), float)
         tags = {"domain": target.config["domain"], "candidate": name, "probability": None, "taken": False}
-        cases = [divmod(i, config.seeds) for i in range(len(errors))]
-        rows += [
-            {**tags, INSIDE: None, "draw": d, "seed": s} | {column: float(own[i]) for column, own in columns.items()}
-            for i, (d, s) in enumerate(cases)
-        ]
+        for i, own in enumerate(errors.tolist()):
+            case = {"draw": i // config.seeds, "seed": i % config.seeds}
+            rows.append(tags | {INSIDE: None} | case | dict(zip(ERRORS, own, strict=True)))
     return rows
 
 
 class Tested(eqx.Module):
-    """The candidates of each seed: `errors` are `ERRORS`.
-
-    `ends` has errors of left-out blocks, `flown` of each flight, see `BlockErrors`.
-    """
+    """Of each seed: the candidates' `ERRORS`, and the `BlockErrors` of left-out blocks and of each flight."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     probability: Array

@@ -146,8 +146,8 @@ def error_figure(rows: Results) -> Figure:
                 each, mean = np.sqrt(errors), np.sqrt(errors.mean())
                 axes.plot([each.min(), each.max()], [y, y], color=colour, lw=4, alpha=0.25, solid_capstyle="round")
                 axes.plot(mean, y, marker, ms=6, color=colour, ls="", label="" if y else label)
-                placed = {"ha": "center", "va": "bottom" if side > 0 else "top", "color": colour}
-                note(axes, f"{mean:.2g}", (mean, y), (0, 5 * side), **placed)
+                up = "bottom" if side > 0 else "top"
+                note(axes, f"{mean:.2g}", (mean, y), (0, 5 * side), ha="center", va=up, color=colour)
     about = "RMS error of the predicted position over 1 s [m]\n(log scale; lower is better)"
     axes.set(xscale="log", xlabel=about)
     tick_errors(axes.xaxis, *axes.get_xlim(), room=3.0)
