@@ -1,6 +1,6 @@
 """Rollouts of many windows by a field's kernel: one call for all intervals, and one for the derivative."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,7 +23,6 @@ class Call(NamedTuple):
 
     kernel: Kernel
     dt: float
-    windows: int
 
     def forward(self, kept: int, *arrays: Array) -> Sequence[Array]:
         """Return the states, and `kept` numbers that the backward pass needs."""
@@ -32,7 +31,7 @@ class Call(NamedTuple):
 
     def run(self, way: str, results: list, *arrays: Array) -> Sequence[Array]:
         """Call the kernel on arrays, which it does not check. `vmap` calls it for one lane after the other."""
-        numbers = np.array([self.dt, self.kernel.epsilon, self.windows], np.float32)
+        numbers = np.array([self.dt, self.kernel.epsilon], np.float32)
         call = jax.ffi.ffi_call(f"hybrid_jax_{way}", results, vmap_method="sequential")
         return call(*arrays, kernel=self.kernel.name, numbers=numbers)
 
@@ -42,32 +41,44 @@ def serves_training(field, x0: Shaped, u: Shaped, solver: Solver, windows_axis: 
     return _kernel(field, x0, u, solver, windows_axis, True) is not None
 
 
-def trained(field, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver) -> Any:
-    """Return the trajectories (t, d, b) of a minibatch in training mode, or None without a kernel."""
+def trained(
+    field, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, plain: Callable
+) -> Any:
+    """Return the trajectories (t, d, b) of a minibatch in training mode, or None without a kernel.
+
+    `plain` computes them in JAX. Derivatives with respect to u, which kernels lack, are its own.
+    """
     if (kernel := _kernel(field, x0, u, solver, -1, True)) is None:
         return None
-    call = Call(kernel, float(dt), x0.shape[-1])
-    states: Any = _rollout(call, kernel.weights(field), *_filled(x0, u))
-    return states[..., : call.windows]
+
+    def run(field, x0, u):
+        return _rollout(Call(kernel, float(dt)), kernel.weights(field), x0, u)
+
+    def derivative(values, slopes):
+        return eqx.filter_jvp(run if slopes[-1] is None else plain, values, slopes)
+
+    return _with_derivative(run, derivative)(field, x0, u)
 
 
-def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, solver: Solver):
+def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, solver: Solver) -> Any:
     """Return the trajectories (n, t, d) for x0 (n, d), u (n, t, m) in inference mode, or None without a kernel."""
     if (kernel := _kernel(field, x0, u, solver, 0, False)) is None:
         return None
-    arrays, rest = eqx.partition(field, eqx.is_inexact_array)
 
-    @jax.custom_jvp
-    def run(arrays, x0, u):
-        weights, last = kernel.weights(eqx.combine(arrays, rest)), (jnp.moveaxis(a, 0, -1) for a in (x0, u))
-        call = Call(kernel, float(dt), len(x0))
-        return jnp.moveaxis(call.forward(0, weights, *_filled(*last))[0][..., : len(x0)], -1, 0)
+    def run(field, *arrays):
+        last = (jnp.moveaxis(array, 0, -1) for array in arrays)
+        return jnp.moveaxis(Call(kernel, float(dt)).forward(0, kernel.weights(field), *last)[0], -1, 0)
 
-    def plain(arrays, x0, u):
-        return rollout_batch(eqx.combine(arrays, rest), x0, u, dt, solver)
+    def plain(field, x0, u):
+        return rollout_batch(field, x0, u, dt, solver)
 
-    run.defjvp(partial(jax.jvp, plain))
-    return run(arrays, jnp.asarray(x0), jnp.asarray(u))
+    return _with_derivative(run, partial(eqx.filter_jvp, plain))(field, x0, u)
+
+
+def _with_derivative(run: Callable, derivative: Callable) -> Callable:
+    made = eqx.filter_custom_jvp(run)
+    made.def_jvp(derivative)
+    return lambda field, *arrays: made(field, *map(jnp.asarray, arrays))
 
 
 def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, axis: int, training: bool) -> Kernel | None:
@@ -81,29 +92,24 @@ def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, axis: int, training: b
     return kernel_of(field, x0.shape[1 + axis], u.shape[2 + axis], training)
 
 
-def _filled(*arrays: Array) -> list[Array]:
-    """Repeat the last window until windows fill vectors."""
-    more = -arrays[0].shape[-1] % library.width()
-    return [jnp.pad(array, (*((0, 0),) * (array.ndim - 1), (0, more)), mode="edge") for array in arrays]
-
-
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _rollout(call: Call, *arrays: Array) -> Float[Array, "t d b"]:
-    """Compute the states from weights, x0 and u by one call forward and one backward."""
+    """Compute the states from weights, x0 and u by one call forward and one backward, which takes u for data."""
     return call.forward(0, *arrays)[0]
 
 
 def _forward(call: Call, *arrays: Array):
     (d, _, _, units), (x0, u), width = call.kernel.sizes, arrays[-2:], library.width()
-    kept = len(u) * 4 * (x0.shape[1] * (d + units + 1) + -(-units // width) * width) + width  # see cpp/rollout.h
+    windows, padded = (-(-n // width) * width for n in (x0.shape[1], units))
+    kept = len(u) * 4 * (windows * (d + units + 1) + padded) + width  # see cpp/rollout.h
     states, saved = call.forward(kept, *arrays)
     return states, (*arrays, saved)
 
 
 def _backward(call: Call, saved: tuple[Array, ...], d_states: Float[Array, "t d b"]):
     *given, kept = saved
-    results = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in given]
-    return tuple(call.run("backward", results, *given, call.kernel.back_weights(given[0]), kept, d_states))
+    results = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in given[:2]]
+    return *call.run("backward", results, *given, call.kernel.back_weights(given[0]), kept, d_states), None
 
 
 _rollout.defvjp(_forward, _backward)

@@ -9,7 +9,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from hybrid_jax.codegen import loops, nodes
 from hybrid_jax.codegen.loops import Tables
-from hybrid_jax.codegen.nodes import Expression, Loop, Operation, Statement
+from hybrid_jax.codegen.nodes import Address, Entry, Expression, Loop, Operation, Statement
 from hybrid_jax.codegen.operations import CTranslation, entries, is_zero
 from hybrid_jax.codegen.printer import LOGIC, OPERATIONS, CPrinter
 from hybrid_jax.kernels.library import width
@@ -85,8 +85,8 @@ class SamplePrinter(CPrinter):
 
 GIVEN = "const float *__restrict w, const Vec *__restrict x, const Vec *__restrict u, "
 SLOPE, READ = "const Normal n, Vec *out", "Vec *out"
-SLOPE_BACK = "const Normal n, const Vec *__restrict d_slope, Vec *dx, Vec *du, Vec *dn, Vec *s, Vec *f"
-READ_BACK = "const Vec *d_read, Vec *dx, Vec *du, Vec *s"
+SLOPE_BACK = "const Normal n, const Vec *__restrict d_slope, Vec *dx, Vec *dn, Vec *s, Vec *f"
+READ_BACK = "const Vec *d_read, Vec *dx, Vec *s"
 Outputs = list[tuple[str, int]]  # array, and where a result begins in it
 
 
@@ -94,7 +94,8 @@ class Source:
     """Functions of a field's weights and of one sample x, u, n; see cpp/rollout.h. `back` computes its own weights."""
 
     def __init__(self, forward: Split, of_sample: Sequence[Shape], training: bool):
-        self.tables, self.printer, self.factors = Tables(double=False), SamplePrinter(double=False), 1
+        self.tables, self.printer = Tables(double=False), SamplePrinter(double=False)
+        self.constants = {"F": 1, "BACK": 0}
         self.functions, self.code = list[str](), tuple[Any, ...]()
         self.back = self._add_backward(forward, of_sample) if training else None
         for i, (name, given) in enumerate((("slope", SLOPE), ("read", READ))):
@@ -109,29 +110,31 @@ class Source:
         def pulled_back(*arrays):
             *arrays, d_slope, d_read = arrays
             ways = (jax.vjp(part, *arrays)[1]([slope]) for part, slope in zip(parts, (d_slope, d_read), strict=True))
-            return [slope for way in ways for slope in way]
+            return [slope for *of, dx, _, dn in ways for slope in (*of, dx, dn)]  # inputs are data
 
         back = split(traced(pulled_back, *forward.shapes, *of_sample, slope, read), count)
-        whole, products = with_factors(outputs_of(back.program, range(count + 3)), count)
-        reading = outputs_of(back.program, range(count + 3, 2 * count + 5))
-        ways: Outputs = [("dx", 0), ("du", 0), ("dn", 0)]
+        whole, products = with_factors(outputs_of(back.program, range(count + 2)), count)
+        reading = outputs_of(back.program, range(count + 2, 2 * count + 3))
         sums: Outputs = [("s", place) for place in forward.places()]
-        outputs, at, calls = [*(one for i, one in enumerate(sums) if i not in products), *ways], 0, []
+        outputs, at, calls = [*(one for i, one in enumerate(sums) if i not in products), ("dx", 0), ("dn", 0)], 0, []
         for i, pairs in products.items():
             for rows, columns in pairs:
                 outputs += [("f", at), ("f", at + rows)]
                 where = f"sums + {sums[i][1]}, factors + {at}, F, factors + {at + rows}, F, slots"
                 calls.append(f"    add_products<{rows}, {columns}>({where});")
                 at += rows + columns
-        self.factors = at | 1  # with an even number of vectors, all slots could share lines of the cache
+        self.constants["F"] = at | 1  # with an even number of vectors, all slots could share lines of the cache
         inputs = ("x", "u", "n", "d_slope", "d_read")
         self._add("slope_back", SLOPE_BACK, whole, back.places(), inputs, outputs)
-        self._add("read_back", READ_BACK, reading, back.places(), inputs, [*sums, *ways[:2]])
+        body = self._add("read_back", READ_BACK, reading, back.places(), inputs, [*sums, ("dx", 0)])
+        used = (one for one in nodes.walk(body) if isinstance(one, Entry) and one.name == "d_read")
+        ends = (read.size if one.steps or isinstance(one, Address) else (one.index or 0) + 1 for one in used)
+        self.constants["BACK"] = max(ends, default=0)
         head = "void products(Vec *sums, const Vec *factors, int64_t slots) {"
         self.functions.append("\n".join([head, *calls, "}\n"]))
         return back
 
-    def _add(self, name: str, parameters: str, program: ClosedJaxpr, weights, inputs, outputs: Outputs) -> None:
+    def _add(self, name: str, parameters: str, program: ClosedJaxpr, weights, inputs, outputs: Outputs) -> tuple:
         """Add a function that fills outputs from inputs and weights, which begin at these places of `w`."""
         starts = [*(("w", place) for place in weights), *((name, 0) for name in inputs)]
         pairs = zip(starts, program.in_avals, strict=True)
@@ -146,10 +149,11 @@ class Source:
             raise ValueError(f"its evaluation takes {len(body)} statements and {held} numbers, too many for kernels")
         self.code = *self.code, body
         self.functions.append(f"void {name}({GIVEN}{parameters}) {{\n{self.printer.body(body)}\n}}\n")
+        return body
 
     def text(self, constants: dict[str, int]) -> str:
         head = [f"#define TRAINING {int(self.back is not None)}", f"#define V {width()}"]
         head += ['#include "samples.h"', "namespace {"]
-        head += [f"constexpr int64_t {name} = {value};" for name, value in (constants | {"F": self.factors}).items()]
+        head += [f"constexpr int64_t {name} = {value};" for name, value in (constants | self.constants).items()]
         tables = [one.replace("real", "float", 1) for one in self.printer.tables(self.tables, self.code)]
         return "\n".join([*head, *tables, *self.functions, "}  // namespace", '#include "rollout.h"', ""])

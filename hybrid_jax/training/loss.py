@@ -4,9 +4,11 @@ Inner product, cosine and Pearson correlation of f_p and f_d: Takeishi and Kalou
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -38,8 +40,12 @@ def rollout_minibatch(
     field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver
 ) -> Float[Array, "t d b"]:
     """Predict a minibatch in training mode, features first, so that batch normalisation uses all windows."""
-    if (states := kernels.trained(field, x0, u, dt, solver)) is not None:
-        return states
+    plain = partial(_by_jax, dt=dt, solver=solver)
+    states = kernels.trained(field, x0, u, dt, solver, plain)
+    return plain(field, x0, u) if states is None else states
+
+
+def _by_jax(field, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver):
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     # With batch normalisation, an implicit solver solves one system of equations for all windows.
     if batch_norms(field) if implicit else as_field(field).features_first:
@@ -55,7 +61,9 @@ def rollout_minibatch(
 def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):
     """Return the states and inputs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
     starts = jnp.concatenate([x0[None], x[:-1]])
-    return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], a.shape[0] * a.shape[2]) for a in (starts, u))
+    # Without the barrier, XLA looks up every number by its own index.
+    moved = jax.lax.optimization_barrier([jnp.moveaxis(a, 0, 1) for a in (starts, u)])
+    return (a.reshape(len(a), -1) for a in moved)
 
 
 def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:

@@ -83,7 +83,7 @@ def trained_by_jax(field, x0, u, dt=DT):
 
 def both_ways(function, field, x0, u, d_states):
     arrays, rest = eqx.partition(field, eqx.is_array)
-    states, pullback = jax.vjp(lambda arrays, x0, u: function(eqx.combine(arrays, rest), x0, u), arrays, x0, u)
+    states, pullback = jax.vjp(lambda arrays, x0: function(eqx.combine(arrays, rest), x0, u), arrays, x0)
     return states, pullback(d_states)
 
 
@@ -108,6 +108,13 @@ def test_values_and_derivatives_are_those_of_jax_in_double_precision(name):
             # Twelve evaluations of sums of up to a hundred terms, each rounded at 6e-8. Those of θ_p cancel in part.
             tolerance = 5e-6 if other.ndim else 5e-5
             np.testing.assert_allclose(one, other, rtol=0, atol=tolerance * np.abs(other).max(initial=0) + 1e-30)
+
+
+@needs_kernels
+def test_inputs_have_the_derivative_of_jax():
+    x0, u, d_states = windows(paper(), 16)
+    slopes = [jax.vjp(partial(of, paper(), x0), u)[1](d_states)[0] for of in (trained, trained_by_jax)]
+    np.testing.assert_allclose(*slopes, rtol=0, atol=1e-5 * np.abs(slopes[1]).max())
 
 
 @needs_kernels

@@ -2,10 +2,10 @@
 // evaluates for V windows at a time. Defined before this file is included (source.py):
 //
 //   D, M, P: numbers of x, of u and of weights; F: of factors of a vector of windows whose products are derivatives.
-//   slope: from w, x, u, n to ẋ; slope_back, its derivative, which `products` completes.
+//   slope: from w, x, u, n to ẋ; slope_back, its derivative, which `products` completes. u has none.
 //   Z, H: numbers of z and of n, or 0, of the layer that couples the windows by batch normalisation,
 //   n = γ q h + β with h = W (z − mean z) and q = 1 / √(mean h² + ε); W, γ and β are at WEIGHT, GAIN and SHIFT of w.
-//   read: from w, x, u to z; read_back.
+//   read: from w, x, u to z; read_back, which needs the derivatives with respect to the first BACK numbers of z.
 //
 // A group of vectors of windows goes through all intervals before the next begins: one, or all if they are coupled.
 
@@ -20,14 +20,14 @@ constexpr int64_t U = H ? H | 1 : 0;  // vectors from one n to the next: an even
 
 // Arguments: the weights, x0 (d, b) and u (t, m, b), on the way back also those of the kernels there, what was kept, and
 // the derivatives with respect to the states.
-enum Argument { WEIGHTS, X0, INPUTS, BACK, KEPT, D_STATES };
+enum Argument { WEIGHTS, X0, INPUTS, WEIGHTS_BACK, KEPT, D_STATES };
 
-// V windows of an array (rows, b).
-INLINE void gather(const float* from, int64_t rows, int64_t b, Vec* to) {
-  for (int64_t r = 0; r < rows; ++r) to[r] = load(from + r * b);
+// The vector j of windows of an array (rows, b); behind the end the last window repeats.
+INLINE void gather(const float* from, int64_t rows, int64_t b, int64_t j, Vec* to) {
+  for (int64_t r = 0; r < rows; ++r) to[r] = load(from + r * b + j * V, b - j * V);
 }
-INLINE void scatter(const Vec* from, int64_t rows, int64_t b, float* to) {
-  for (int64_t r = 0; r < rows; ++r) store(to + r * b, from[r]);
+INLINE void scatter(const Vec* from, int64_t rows, int64_t b, int64_t j, float* to) {
+  for (int64_t r = 0; r < rows; ++r) store(to + r * b + j * V, from[r], b - j * V);
 }
 
 // A call of XLA with arrays in single precision; the caller in Python keeps to number and shapes. By the interface in C:
@@ -35,8 +35,7 @@ INLINE void scatter(const Vec* from, int64_t rows, int64_t b, float* to) {
 INLINE const XLA_FFI_Buffer& array(const void* of) { return *static_cast<const XLA_FFI_Buffer*>(of); }
 INLINE float* data(const void* of) { return static_cast<float*>(array(of).data); }
 
-// b windows of `steps` intervals, of which `own` are no copies that fill the last vector, and what is kept of each
-// evaluation for the way back, or nothing: x, h and q.
+// b windows of `steps` intervals, and what is kept of each evaluation for the way back, or nothing: x, h and q.
 struct Windows {
   const XLA_FFI_CallFrame* call;
   Vec* kept;
@@ -45,7 +44,7 @@ struct Windows {
 
   const float* numbers = static_cast<const float*>(static_cast<const XLA_FFI_Array*>(call->attrs.attrs[1])->data);
   const int64_t* shape = array(call->args.args[INPUTS]).dims;
-  const int64_t steps = shape[0], b = shape[2], blocks = b / V, own = int64_t(numbers[2]);
+  const int64_t steps = shape[0], b = shape[2], blocks = (b + V - 1) / V;
   const int64_t group = H ? blocks : 1, n = group * D;  // vectors of windows, and of their states
   const int64_t size = group * (D + U) + (H + V - 1) / V;  // of what is kept of an evaluation
   // What each stage's slope counts for in the step, and how far along it the next point lies.
@@ -75,22 +74,23 @@ struct Coupling {
   Vec *zs = all.room(STAGES * blocks * Z), *dhs = all.room(STAGES * blocks * U), *dn = all.room(blocks * U), *dz = all.room(blocks * Z);
   float *scale = reinterpret_cast<float*>(all.room(U)), *through_q = reinterpret_cast<float*>(all.room(U));
 
+  template <int ROWS>
   void centre(Vec* z) const {
-    in_tiles<Z, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
+    in_tiles<ROWS, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
       Vec total[R] = {};
       for (int64_t j = 0; j < blocks; ++j)
-        UNROLL for (int r = 0; r < R; ++r) total[r] += z[j * Z + i + r] = first(z[j * Z + i + r], all.own - j * V);
-      UNROLL for (int r = 0; r < R; ++r) total[r] = wide(sum(total[r]) / float(all.own));
+        UNROLL for (int r = 0; r < R; ++r) total[r] += first(z[j * Z + i + r], all.b - j * V);
+      UNROLL for (int r = 0; r < R; ++r) total[r] = wide(sum(total[r]) / float(all.b));
       for (int64_t j = 0; j < blocks; ++j)
-        UNROLL for (int r = 0; r < R; ++r) z[j * Z + i + r] = first(z[j * Z + i + r] - total[r], all.own - j * V);
+        UNROLL for (int r = 0; r < R; ++r) z[j * Z + i + r] = first(z[j * Z + i + r] - total[r], all.b - j * V);
     });
   }
   // z, and unless these are known h and q, some units at a time, so that these stay in the first cache.
   void evaluate(int stage, const Vec* x, const Vec* u, Vec* h, float* q, bool known) const {
     Vec* z = zs + stage * blocks * Z;
     for (int64_t j = 0; j < blocks; ++j) read(all.w, x + j * D, u + j * M, z + j * Z);
-    centre(z);
+    centre<Z>(z);
     if (!known) in_tiles<H, UNITS>([&](auto rows, int i) __attribute__((always_inline)) {
       constexpr int R = decltype(rows)::value;
       Vec squares[R] = {};
@@ -99,7 +99,7 @@ struct Coupling {
         dense<R, Z>(all.w + WEIGHT + i * Z, Z, 1, z + j * Z, block);
         UNROLL for (int r = 0; r < R; ++r) squares[r] += block[r] * block[r];
       }
-      UNROLL for (int r = 0; r < R; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(all.own) + all.epsilon);
+      UNROLL for (int r = 0; r < R; ++r) q[i + r] = 1 / std::sqrt(sum(squares[r]) / float(all.b) + all.epsilon);
     });
     for (int i = 0; i < H; ++i) scale[i] = all.w[GAIN + i] * q[i];
   }
@@ -114,12 +114,12 @@ struct Coupling {
         UNROLL for (int r = 0; r < R; ++r) by_scale[r] += dn[j * U + i + r] * h[j * U + i + r], by_shift[r] += dn[j * U + i + r];
       UNROLL for (int r = 0; r < R; ++r) {
         sums[GAIN + i + r] += q[i + r] * by_scale[r], sums[SHIFT + i + r] += by_shift[r];
-        through_q[i + r] = -scale[i + r] * q[i + r] * q[i + r] * sum(by_scale[r]) / float(all.own);
+        through_q[i + r] = -scale[i + r] * q[i + r] * q[i + r] * sum(by_scale[r]) / float(all.b);
       }
     });
     for (int64_t j = 0; j < blocks; ++j)
-      dense<Z, H>(all.w + WEIGHT, 1, Z, Through{scale, through_q, dn + j * U, h + j * U, dh + j * U}, dz + j * Z);
-    centre(dz);
+      dense<BACK, H>(all.w + WEIGHT, 1, Z, Through{scale, through_q, dn + j * U, h + j * U, dh + j * U}, dz + j * Z);
+    centre<BACK>(dz);
   }
 };
 
@@ -133,9 +133,9 @@ extern "C" void forward(const XLA_FFI_CallFrame* call) {
   Vec *x = all.room(n), *slopes = all.room(n), *total = all.room(n), *u = all.room(group * M), *passing = all.room(all.size);
   const Coupling coupling{all};
   for (int64_t first = 0; first < all.blocks; first += group) {
-    for (int64_t j = 0; j < group; ++j) gather(all.x0 + (first + j) * V, D, b, x + j * D);
+    for (int64_t j = 0; j < group; ++j) gather(all.x0, D, b, first + j, x + j * D);
     for (int64_t t = 0; t < all.steps; ++t) {
-      for (int64_t j = 0; j < group; ++j) gather(all.u + t * M * b + (first + j) * V, M, b, u + j * M);
+      for (int64_t j = 0; j < group; ++j) gather(all.u + t * M * b, M, b, first + j, u + j * M);
       for (int stage = 0; stage < STAGES; ++stage) {
         Vec *point = all.kept ? all.point(first, t, stage) : passing, *h = all.h(point);
         for (int64_t i = 0; i < n; ++i) point[i] = stage ? x[i] + all.ahead[stage - 1] * slopes[i] : x[i];
@@ -145,22 +145,20 @@ extern "C" void forward(const XLA_FFI_CallFrame* call) {
         for (int64_t i = 0; i < n; ++i) total[i] = (stage ? total[i] : x[i]) + all.share[stage] * slopes[i];
       }
       std::swap(x, total);
-      for (int64_t j = 0; j < group; ++j) scatter(x + j * D, D, b, all.result(0) + t * D * b + (first + j) * V);
+      for (int64_t j = 0; j < group; ++j) scatter(x + j * D, D, b, first + j, all.result(0) + t * D * b);
     }
   }
 }
 
 #if TRAINING
-// Results: the derivatives with respect to the weights, x0 and u. Those with respect to weights are summed over windows
+// Results: the derivatives with respect to the weights and x0. Those with respect to weights are summed over windows
 // within each place of a vector; their factors wait in slots for the products.
 extern "C" void backward(const XLA_FFI_CallFrame* call) {
   const Windows all{call, vectors(data(call->args.args[KEPT]))};
   const int64_t group = all.group, n = all.n, b = all.b;
-  const float *back = all.argument(BACK), *d_states = all.argument(D_STATES);
-  float *d_x0 = all.result(X0), *d_u = all.result(INPUTS);
+  const float *back = all.argument(WEIGHTS_BACK), *d_states = all.argument(D_STATES);
   Vec *dx = all.room(n), *next = all.room(n), *d_slope = all.room(n), *d_point = all.room(n);
-  Vec *u = all.room(group * M), *du = all.room(group * M), *more = all.room(D), *more_u = all.room(M);
-  Vec *sums = all.room(P), *factors = all.room(F * SLOTS);
+  Vec *u = all.room(group * M), *more = all.room(D), *sums = all.room(P), *factors = all.room(F * SLOTS);
   int64_t used = 0;
   const Coupling c{all};
   std::fill_n(sums, P, Vec{});
@@ -168,31 +166,28 @@ extern "C" void backward(const XLA_FFI_CallFrame* call) {
     std::fill_n(dx, n, Vec{});
     for (int64_t t = all.steps; t--;) {
       for (int64_t j = 0; j < group; ++j) {
-        gather(all.u + t * M * b + (first + j) * V, M, b, u + j * M), gather(d_states + t * D * b + (first + j) * V, D, b, more);
-        for (int i = 0; i < D; ++i) dx[j * D + i] += more[i];
+        gather(all.u + t * M * b, M, b, first + j, u + j * M), gather(d_states + t * D * b, D, b, first + j, more);
+        for (int i = 0; i < D; ++i) dx[j * D + i] += ::first(more[i], b - (first + j) * V);
       }
-      std::copy_n(dx, n, next), std::fill_n(du, group * M, Vec{});
+      std::copy_n(dx, n, next);
       for (int stage = STAGES; stage--;) {
         Vec *point = all.point(first, t, stage), *h = all.h(point);
         for (int64_t i = 0; i < n; ++i) d_slope[i] = all.share[stage] * next[i] + (stage < STAGES - 1 ? all.ahead[stage] * d_point[i] : Vec{});
         if (H) c.evaluate(stage, point, u, h, all.q(point), true);
         for (int64_t j = 0; j < group; ++j) {
           if (used == SLOTS) products(sums, factors, used), used = 0;
-          slope_back(back, point + j * D, u + j * M, c.normal(h + j * U), d_slope + j * D, d_point + j * D, more_u, c.dn + j * U, sums, factors + F * used++);
-          for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
+          slope_back(back, point + j * D, u + j * M, c.normal(h + j * U), d_slope + j * D, d_point + j * D, c.dn + j * U, sums, factors + F * used++);
         }
         if (H) c.back(stage, h, all.q(point), sums);
         for (int64_t j = 0; j < group && H; ++j) {
-          read_back(back, point + j * D, u + j * M, c.dz + j * Z, more, more_u, sums);
+          read_back(back, point + j * D, u + j * M, c.dz + j * Z, more, sums);
           for (int i = 0; i < D; ++i) d_point[j * D + i] += more[i];
-          for (int i = 0; i < M; ++i) du[j * M + i] += more_u[i];
         }
         for (int64_t i = 0; i < n; ++i) dx[i] += d_point[i];
       }
       if (H) add_products<H, Z>(sums + WEIGHT, c.dhs, U, c.zs, Z, STAGES * group);
-      for (int64_t j = 0; j < group; ++j) scatter(du + j * M, M, b, d_u + t * M * b + (first + j) * V);
     }
-    for (int64_t j = 0; j < group; ++j) scatter(dx + j * D, D, b, d_x0 + (first + j) * V);
+    for (int64_t j = 0; j < group; ++j) scatter(dx + j * D, D, b, first + j, all.result(X0));
   }
   products(sums, factors, used);
   for (int64_t i = 0; i < P; ++i) all.result(WEIGHTS)[i] = sum(sums[i]);

@@ -23,6 +23,17 @@ typedef int32_t Places __attribute__((vector_size(4 * V)));
 
 INLINE Vec load(const float* from) { return *reinterpret_cast<const Vec*>(from); }
 INLINE void store(float* to, Vec v) { *reinterpret_cast<Vec*>(to) = v; }
+// The first n numbers; the last of them repeats.
+INLINE Vec load(const float* from, int64_t n) {
+  if (n >= V) return load(from);
+  Vec v;
+  for (int j = 0; j < V; ++j) v[j] = from[std::min<int64_t>(j, n - 1)];
+  return v;
+}
+INLINE void store(float* to, Vec v, int64_t n) {
+  if (n >= V) store(to, v);
+  else std::copy_n(reinterpret_cast<const float*>(&v), n, to);
+}
 INLINE Vec* vectors(float* at) {
   return reinterpret_cast<Vec*>((reinterpret_cast<uintptr_t>(at) + sizeof(Vec) - 1) & -sizeof(Vec));
 }
