@@ -20,7 +20,7 @@ from hybrid_jax.adaptation.results import NETWORK
 from hybrid_jax.adaptation.selection import Fit, Posterior, Unchanged
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import disturbance_units
-from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.least_squares import Scale, ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import sandwich_of_repeated
 from hybrid_jax.networks.standardise import motion_of
@@ -122,12 +122,21 @@ class Auto(Method):
                 if not traced and int(found.status) == Status.DIVERGED:
                     _, found, starts = _fits(larger, still, train, rows, *options)
         units = selection.blocks_of(len(train), self.blocks, flights)
-        fits = (found, starts), (first[0], first[2])
-        found, starts, chosen, left_out = _confirm(self, larger, *fits, chosen, None if flights is None else units)
+        weights = anchored.weights_of(larger)[0].size if network else 0
+        units = selection.blocks_of(len(train), self.blocks, flights)
+
+        def ends_of(thetas, change: Array | None = None) -> Array:
+            change = jnp.zeros((len(thetas), weights)) if change is None else change
+            return _ends(larger, thetas, change, train, units, solver)
+
+        sure, left_out = _left_out(self, larger, found, first[0], chosen, None if flights is None else units)
+        same = jnp.broadcast_to(ravel_parameters(larger)[0], left_out.shape)
+        fits = (found, starts, left_out, ends_of(left_out)), (first[0], first[2], same, ends_of(same))
+        (found, starts, left_out, ends), chosen = _confirm(sure, *fits, chosen, scale)
         if self.networks and network:
-            step = _anchor(larger, train, starts, found, solver, scale)
-        outcome = found, chosen, left_out, source, nothing, effect, step, units
-        return _conclude(self, field, larger, train, outcome, (sizes, solver))
+            step = _fit_network(self, _anchor(larger, train, starts, found, solver, scale), found, nothing, units)
+            step, ends = _confirm_network(step, ends, ends_of(left_out, step.left_out), source, scale)
+        return _conclude(field, larger, train, (found, chosen, ends, source, nothing, effect, step), sizes)
 
 
 _shares = jit_by_size(UNOPTIMISED)(selection.shares_outside)
@@ -185,20 +194,41 @@ def _judge(
 
 
 @jit_by_size(UNOPTIMISED)
-def _confirm(method: Auto, larger, changed, still, chosen: Posterior, units) -> tuple[Fit, Any, Posterior, Array]:
-    """Return fit and starts of the chosen change, or of no change if left-out blocks do not confirm it.
-
-    The last result are the parameters fitted without each block, or without each of `units`.
-    """
+def _left_out(
+    method: Auto, larger, changed: Fit, still: Fit, chosen: Posterior, units
+) -> tuple[Bool[Array, ""], Array]:
+    """Return whether left-out blocks confirm the change, and the parameters without each block, or each of `units`."""
     free, start = jnp.stack([*free_parameters(larger).values()])[chosen.taken], ravel_parameters(larger)[0]
-    blocks = selection.blocks_of(len(still[0].equations.score), method.blocks)
-    thetas = selection.left_out_thetas(changed[0], free, chosen.sizes, start, blocks)
-    sure = (chosen.taken == 0) | selection.surely_lower(changed[0], still[0], thetas, blocks)
-    if units is not None:
-        thetas = selection.left_out_thetas(changed[0], free, chosen.sizes, start, units)
-    found, starts = jax.tree.map(partial(jnp.where, sure), changed, still)
-    chosen = chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
-    return found, starts, chosen, jnp.where(sure, thetas, found.theta)
+    blocks = selection.blocks_of(len(still.equations.score), method.blocks)
+    thetas = selection.left_out_thetas(changed, free, chosen.sizes, start, blocks)
+    sure = selection.surely_lower(changed, still, thetas, blocks)
+    return sure, thetas if units is None else selection.left_out_thetas(changed, free, chosen.sizes, start, units)
+
+
+@jit_by_size(UNOPTIMISED)
+def _ends(
+    larger, thetas: Float[Array, "b p"], changes: Float[Array, "b w"], train: Trajectories, units, solver
+) -> Array:
+    """Compute `errors_at_ends` of each left-out unit, with its own parameters and change of the network."""
+    unravel = ravel_parameters(larger)[1]
+
+    def one(unit):
+        theta, change, windows, counted = unit
+        field = unravel(theta)
+        return errors_at_ends(anchored.with_change(field, change) if change.size else field, windows, counted, solver)
+
+    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[units[0]], train)
+    return jax.lax.map(one, (thetas, changes, own, jnp.asarray(units[1])))
+
+
+@jit_by_size(UNOPTIMISED)
+def _confirm(
+    sure: Bool[Array, ""], changed: tuple, still: tuple, chosen: Posterior, scale: Scale
+) -> tuple[Any, Posterior]:
+    """Return the chosen change or, if left-out blocks do not confirm it, no change."""
+    sure = (chosen.taken == 0) | sure & selection.no_higher(changed[-1], still[-1], scale)
+    changed = jax.tree.map(partial(jnp.where, sure), changed, still)
+    return changed, chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
 
 
 @jit_by_size(FASTEST_COMPILE)
@@ -208,13 +238,30 @@ def _anchor(larger, train: Trajectories, starts, found: Fit, solver, scale) -> a
 
 
 @jit_by_size(UNOPTIMISED)
-def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options) -> Solution:
-    """Add the network's change if it is probable, and compute the errors of left-out units."""
-    (found, chosen, left_out, source, nothing, effect, step, units), (sizes, solver) = outcome, options
-    start, unravel = ravel_parameters(larger)
+def _fit_network(method: Auto, found: anchored.Subspace, at: Fit, nothing: Unchanged, units) -> anchored.Anchored:
+    blocks = selection.blocks_of(len(at.equations.score), method.blocks)
+    return anchored.fit_anchored(found, at.noise, nothing.error, blocks, units)
+
+
+@jit_by_size(UNOPTIMISED)
+def _confirm_network(
+    step: anchored.Anchored, ends, changed, source: OfSource | None, scale: Scale
+) -> tuple[Any, Array]:
+    """Set the odds of the network's change to 0 if left-out units do not confirm it; also return the errors."""
+    sure = selection.no_higher(changed, ends, scale)
+    sure = sure if source is None else sure & ~source.alone
+    step = step._replace(odds=jnp.where(sure, step.odds, 0.0))
+    return step, jnp.where(step.odds > selection.STRONG, changed, ends)
+
+
+@jit_by_size(UNOPTIMISED)
+def _conclude(field, larger, train: Trajectories, outcome, sizes) -> Solution:
+    """Summarise the outcome, with the variances that the source and its network add."""
+    found, chosen, ends, source, nothing, effect, step = outcome
+    start = ravel_parameters(larger)[0]
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
-    theta, blocks = chosen.theta.at[taken].set(found.theta), selection.blocks_of(len(train), method.blocks)
+    theta = chosen.theta.at[taken].set(found.theta)
     probability, rejected = chosen.probability, chosen.naive > chosen.naive[taken]
     equations = masked(found.equations, free[taken] & found.seen)
     alone, of_source, degrees = jnp.array(False), jnp.diag(nothing.apparent), jnp.inf
@@ -223,26 +270,14 @@ def _conclude(method: Auto, field, larger, train: Trajectories, outcome, options
         of_source = jnp.where(alone, sandwich_of_repeated(own.equations, len(start), distinct), of_source)
         degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
     inherited = selection.spread(found.equations, free[taken] & found.seen, of_source)
-    changes = jnp.zeros((len(left_out), 0))
     if step is not None:
-        step = anchored.fit_anchored(step, found.noise, nothing.error, blocks, units)
         removed = anchored.weights_of(larger)[0] - anchored.weights_of(field)[0]  # all, if physics replaced it
-        odds, naive = (jnp.where(alone, 0.0, each) for each in (step.odds, step.naive))
-        better = odds > selection.STRONG
-        changes, change = jnp.where(better, step.left_out, 0.0), jnp.tile(removed, (len(names) + 1, 1))
-        change = change.at[-1].add(step.change)
-        probability = jnp.append(probability, odds / (1 + odds))
-        rejected = jnp.append(rejected, (naive > selection.STRONG) & ~better)
+        better = step.odds > selection.STRONG
+        change = jnp.tile(removed, (len(names) + 1, 1)).at[-1].add(step.change)
+        probability = jnp.append(probability, step.odds / (1 + step.odds))
+        rejected = jnp.append(rejected, (step.naive > selection.STRONG) & ~better & ~alone)
         free, theta = (jnp.concatenate([each, each[taken][None]]) for each in (free, theta))
         names, taken = (*names, NETWORK), jnp.where(better, len(names), taken)
-
-    def at_ends(block):
-        theta, change, windows, counted = block
-        field = unravel(theta)
-        return errors_at_ends(anchored.with_change(field, change) if change.size else field, windows, counted, solver)
-
-    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[units[0]], train)
-    ends = jax.lax.map(at_ends, (left_out, changes, own, jnp.asarray(units[1])))
     absorbed = jnp.zeros_like(start)
     if effect is not None:
         # Aerodynamic forces depend, for example, on the velocity, the body rates and the rotor speeds.
