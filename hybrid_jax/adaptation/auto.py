@@ -187,7 +187,10 @@ def _judge(
     start = ravel_parameters(larger)[0]
     free, nothing = np.stack([*free_parameters(larger).values()]), Unchanged(jnp.zeros_like(start), jnp.zeros(()))
     if source is not None:
-        nothing = selection.unchanged(source.own, around, effect.total if effect else 0.0, learned_from, shares)
+        added = effect.total if effect else 0.0
+        nothing = selection.unchanged(
+            source.own, around, added, _quantities(larger, learned_from), learned_from, shares
+        )
     found = selection.posterior(around, every, start, free, sizes, nothing.apparent)
     rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
     return found, nothing, selection.without_others(every, rows[1], start).astype(sizes.dtype), rows
@@ -280,8 +283,7 @@ def _conclude(field, larger, train: Trajectories, outcome, sizes) -> Solution:
         names, taken = (*names, NETWORK), jnp.where(better, len(names), taken)
     absorbed = jnp.zeros_like(start)
     if effect is not None:
-        # Aerodynamic forces depend, for example, on the velocity, the body rates and the rotor speeds.
-        quantities = len(disturbance_units(larger)) + train.u.shape[-1]
+        quantities = _quantities(larger, train)
         most = anchored.taken_by_network(effect.of_states, equations, found.of_states, quantities)
         absorbed = jnp.where(alone, absorbed, most)
     # Only rigid bodies: other systems' sizes are relative to the source's value and depend on the parametrisation.
@@ -292,6 +294,14 @@ def _conclude(field, larger, train: Trajectories, outcome, sizes) -> Solution:
     status = jnp.where(jnp.any(found.seen), found.status, Status.STALLED)  # no parameter has an effect
     finite = (status == Status.OK) | ~jnp.isinf(ends).any()
     return Solution(adapted, found.steps, jnp.where(finite, status, Status.DIVERGED), choice)
+
+
+def _quantities(larger, windows: Trajectories) -> int:
+    """Return on how many quantities an effect that physics lacks may depend.
+
+    Aerodynamic forces depend, for example, on the velocity, the body rates and the rotor speeds.
+    """
+    return len(disturbance_units(larger)) + windows.u.shape[-1]
 
 
 def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:

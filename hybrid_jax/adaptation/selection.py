@@ -89,10 +89,13 @@ class Unchanged(NamedTuple):
     error: Float[Array, ""]
 
 
-def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, learned_from, shares) -> Unchanged:
+def unchanged(
+    own: Fit, found: Fit, added: Float[Array, ""] | float, quantities: int, learned_from, shares
+) -> Unchanged:
     """Estimate apparent changes beyond noise from the source's own motion (DerSimonian and Laird 1986).
 
     Where windows are unlike that motion (`shares_outside`), the network's error is taken to be as large as its effect.
+    Each parameter could explain a share of it, see `anchored.taken_by_network` for `quantities`.
     """
     outside, missed = shares
     places = jnp.maximum(1.0, (1 - missed) * len(found.equations.score))
@@ -101,7 +104,7 @@ def unchanged(own: Fit, found: Fit, added: Float[Array, ""] | float, learned_fro
     apparent = jnp.maximum(beyond, 0.0) / jnp.maximum(jnp.sum(jnp.square(known), axis=0), TINY)
     unknown = jnp.square(outside * missed) * added
     total = jnp.maximum(jnp.sum(own.equations.square) - own.noise * jnp.sum(~jnp.isnan(learned_from.x)), 0.0)
-    variance = apparent / places + unknown / jnp.maximum(jnp.sum(information, axis=0), TINY)
+    variance = apparent / places + unknown / quantities / jnp.maximum(jnp.sum(information, axis=0), TINY)
     return Unchanged(variance, total / places + unknown)
 
 
