@@ -5,9 +5,11 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pendulum import DAMPING, LENGTH, pendulum
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics import ConstantDisturbance, Terms
+from hybrid_jax.trajectories import windows_of
 
 DRAG = np.array([0.4, 0.3, 0.1])
 NOISE = np.repeat([1e-3, 2e-3, 0.02, 0.02], [3, 4, 3, 3])  # m, 1, m/s, rad/s
@@ -87,3 +89,28 @@ def test_other_propellers_are_found_by_their_reaction_torque():
 @pytest.mark.slow
 def test_nor_do_three_seconds():
     assert ratios([(0.003,), (0.03,), (0.1,)], count=30).max() <= 1.2
+
+
+class Sloshing(hj.AbstractVectorField):
+    """A pendulum that a hidden oscillator of 9 rad/s pushes: x = (angle, rate, two states of the oscillator)."""
+
+    push: float
+
+    def __call__(self, x, u):
+        swing = pendulum(LENGTH, DAMPING)(x[:2], u) + jnp.array([0.0, self.push]) * x[2]
+        return jnp.concatenate([swing, jnp.stack([9 * x[3], -9 * x[2]])])
+
+
+def sloshing(seed, push):
+    """One flight of 10 s in windows of 0.2 s."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.normal(size=20), 25)[:, None].astype(np.float32)
+    x0 = np.array([0.3, 0.0, *np.sin(rng.uniform(0, 2 * np.pi) + np.array([np.pi / 2, 0]))], np.float32)
+    x = np.concatenate([x0[None], hj.rollout(Sloshing(push), x0, u, 0.02)])[:, :2]
+    return windows_of((x + rng.normal(size=x.shape) * [0.003, 0.02]).astype(np.float32), u, dt=0.02, steps=10)
+
+
+def test_a_push_that_no_candidate_expresses_is_not_taken_for_one_that_short_windows_cannot_tell_from_it():
+    source = pendulum(1.01 * LENGTH, DAMPING)
+    found = [hj.adapt(source, sloshing(seed, 6.0), learned_from=sloshing(0, 0.0)) for seed in (1, 2, 3)]
+    assert [(each.chosen, "theta" in each.rejected) for each in found] == [("source", True)] * 3
