@@ -90,8 +90,8 @@ class Auto(Method):
         """See `Method.solve`.
 
         Args:
-            learned_from: windows that the source was trained on, by default those that it stores; without them the
-                source is assumed to be exact.
+            learned_from: windows that the source was trained on, by default those that it stores; without them its
+                network is assumed to err by a fifth of its effect (`selection.ERRING`).
             flights: the flight of each window (n,), if there are several: expected errors then come from left-out
                 flights instead of blocks.
         """
@@ -101,6 +101,7 @@ class Auto(Method):
         scale, solver = scale_of(settings.objective), settings.solver
         larger, physics, sizes = _begin(self, field, train)
         options, effect, step = (sizes, solver, scale, self.max_steps), None, None
+        quantities = _quantities(larger, train)
         still, network = np.zeros(sizes.shape, sizes.dtype), anchored.has_network(field)
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
         learned_from = motion_of(field) if learned_from is None else learned_from
@@ -115,7 +116,8 @@ class Auto(Method):
         for _ in range(ROUNDS):
             if network:  # even if physics replaced the source: the effect is the difference of the two models
                 effect = anchored.network_effect(field, train, solver, scale, starts)
-            chosen, nothing, move, rows = _judge(larger, found, every, source, learned_from, shares, effect, sizes)
+            given = source, quantities, learned_from, shares, effect
+            chosen, nothing, move, rows = _judge(larger, found, every, *given, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
                 options = chosen.sizes, *options[1:]
                 (_, found, starts), fitted = _fits(larger, move, train, rows, *options), rows
@@ -136,7 +138,7 @@ class Auto(Method):
         if self.networks and network:
             step = _fit_network(self, _anchor(larger, train, starts, found, solver, scale), found, nothing, units)
             step, ends = _confirm_network(step, ends, ends_of(left_out, step.left_out), source, scale)
-        return _conclude(field, larger, train, (found, chosen, ends, source, nothing, effect, step), sizes)
+        return _conclude(field, larger, train, (found, chosen, ends, source, nothing, effect, step), quantities, sizes)
 
 
 _shares = jit_by_size(UNOPTIMISED)(selection.shares_outside)
@@ -182,15 +184,12 @@ def _replace(method: Auto, larger, own: Fit, rival: tuple[Fit, Fit] | None, dist
 
 @jit_by_size(UNOPTIMISED)
 def _judge(
-    larger, around: Fit, every: Fit, source: OfSource | None, learned_from, shares, effect, sizes
+    larger, around: Fit, every: Fit, source: OfSource | None, quantities: int, learned_from, shares, effect, sizes
 ) -> tuple[Posterior, Unchanged, Float[Array, " p"], Bool[Array, "2 p"]]:
     start = ravel_parameters(larger)[0]
-    free, nothing = np.stack([*free_parameters(larger).values()]), Unchanged(jnp.zeros_like(start), jnp.zeros(()))
-    if source is not None:
-        added = effect.total if effect else 0.0
-        nothing = selection.unchanged(
-            source.own, around, added, _quantities(larger, learned_from), learned_from, shares
-        )
+    free, added = np.stack([*free_parameters(larger).values()]), effect.total if effect else 0.0
+    own = None if source is None else source.own
+    nothing = selection.unchanged(own, around, added, quantities, learned_from, shares)
     found = selection.posterior(around, every, start, free, sizes, nothing.apparent)
     rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
     return found, nothing, selection.without_others(every, rows[1], start).astype(sizes.dtype), rows
@@ -258,7 +257,7 @@ def _confirm_network(
 
 
 @jit_by_size(UNOPTIMISED)
-def _conclude(field, larger, train: Trajectories, outcome, sizes) -> Solution:
+def _conclude(field, larger, train: Trajectories, outcome, quantities: int, sizes) -> Solution:
     """Summarise the outcome, with the variances that the source and its network add."""
     found, chosen, ends, source, nothing, effect, step = outcome
     start = ravel_parameters(larger)[0]
@@ -283,7 +282,6 @@ def _conclude(field, larger, train: Trajectories, outcome, sizes) -> Solution:
         names, taken = (*names, NETWORK), jnp.where(better, len(names), taken)
     absorbed = jnp.zeros_like(start)
     if effect is not None:
-        quantities = _quantities(larger, train)
         most = anchored.taken_by_network(effect.of_states, equations, found.of_states, quantities)
         absorbed = jnp.where(alone, absorbed, most)
     # Only rigid bodies: other systems' sizes are relative to the source's value and depend on the parametrisation.

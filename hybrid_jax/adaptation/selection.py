@@ -26,6 +26,7 @@ SURELY = 2.0  # standard errors by which one model must predict better to replac
 ENOUGH = 5  # blocks that give a standard error
 MOST = 1.0  # largest log-gain of a block that counts: more would only add to the standard error
 ALIKE = 2  # so many blocks of a flight count as one: neighbouring blocks are alike, and another flight differs more
+ERRING = 0.2  # error of a network over its effect, if its training windows are unknown
 STRONG = 20.0  # odds of a change over no change that are strong evidence (Kass and Raftery 1995)
 TINY = float(np.finfo(np.float32).tiny)
 
@@ -90,22 +91,26 @@ class Unchanged(NamedTuple):
 
 
 def unchanged(
-    own: Fit, found: Fit, added: Float[Array, ""] | float, quantities: int, learned_from, shares
+    own: Fit | None, found: Fit, added: Float[Array, ""] | float, quantities: int, learned_from, shares
 ) -> Unchanged:
     """Estimate apparent changes beyond noise from the source's own motion (DerSimonian and Laird 1986).
 
-    Where windows are unlike that motion (`shares_outside`), the network's error is taken to be as large as its effect.
-    Each parameter could explain a share of it, see `anchored.taken_by_network` for `quantities`.
+    Where windows are unlike that motion (`shares_outside`), the network's error is taken to be as large as its effect,
+    and a fifth of it if that motion is unknown. Each parameter could explain a share of that error, see
+    `anchored.taken_by_network` for `quantities`.
     """
-    outside, missed = shares
+    outside, missed = (ERRING, 1.0) if own is None else shares
+    unknown = jnp.square(outside * missed) * jnp.asarray(added)
+    information = jnp.sum(jnp.diagonal(found.equations.gram, axis1=1, axis2=2), axis=0)
+    of_network = Unchanged(unknown / quantities / jnp.maximum(information, TINY), unknown)
+    if own is None:
+        return of_network
     places = jnp.maximum(1.0, (1 - missed) * len(found.equations.score))
-    known, information = (jnp.diagonal(each.equations.gram, axis1=1, axis2=2) for each in (own, found))
+    known = jnp.diagonal(own.equations.gram, axis1=1, axis2=2)
     beyond = jnp.sum(jnp.square(own.equations.score) - own.noise * known, axis=0)
     apparent = jnp.maximum(beyond, 0.0) / jnp.maximum(jnp.sum(jnp.square(known), axis=0), TINY)
-    unknown = jnp.square(outside * missed) * added
     total = jnp.maximum(jnp.sum(own.equations.square) - own.noise * jnp.sum(~jnp.isnan(learned_from.x)), 0.0)
-    variance = apparent / places + unknown / quantities / jnp.maximum(jnp.sum(information, axis=0), TINY)
-    return Unchanged(variance, total / places + unknown)
+    return Unchanged(apparent / places + of_network.apparent, total / places + of_network.error)
 
 
 def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:

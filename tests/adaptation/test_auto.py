@@ -71,6 +71,16 @@ def test_a_step_of_the_network_is_taken_if_the_source_does_not_err_as_much():
     assert np.linalg.norm(found[1].change) < 1e-3 * np.linalg.norm(found[0].change)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_without_its_training_windows_a_source_changes_only_by_more_than_its_network_may_err(known):
+    strong = jax.tree.map(lambda leaf: 10 * leaf, hybrid().residual)
+    source = eqx.tree_at(lambda field: field.residual, hybrid(LENGTH), strong)
+    own = flown(source, seed=1) if known else None
+    changed = (eqx.tree_at(lambda field: field.physics, source, pendulum(each * LENGTH)) for each in (0.97, 0.7))
+    chosen = [adapt(source, flown(each), learned_from=own).chosen for each in changed]
+    assert chosen == ["theta" if known else "source", "theta"]
+
+
 def test_physics_that_needs_no_network_takes_the_sources_place():
     network = jax.tree.map(lambda leaf: 0.3 * leaf, hj.residual_network(2, 1, jax.random.key(1), hidden=4, norm="none"))
     source = hj.Hybrid(pendulum(0.68), network)
