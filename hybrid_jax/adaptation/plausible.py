@@ -38,6 +38,16 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "force_torque_drag": ("theta", "force", "torque", "drag"),
     "all": ("theta", "force", "torque", "drag", "efficiency", "reaction_torque"),
 }
+WORDS = {
+    "source": "no change",
+    "theta": "new physical parameters",
+    "reaction_torque": "a factor of all reaction torques",
+    "disturbance": "a constant disturbance",
+    "force": "a constant force",
+    "torque": "a constant torque",
+    "drag": "drag along each axis of the body",
+    "efficiency": "the efficiency of each rotor",
+}
 CONFOUNDED = ("k", "k_rotors")  # parameters that are not identifiable beside the rotors' efficiencies
 
 

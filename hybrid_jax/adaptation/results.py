@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.adaptation.expectation import Expected, lines_of
+from hybrid_jax.adaptation.plausible import CANDIDATES, WORDS
 from hybrid_jax.adaptation.selection import STRONG
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.files import json_value
@@ -137,7 +138,7 @@ class Adaptation:
             known = dict(sorted(self.candidates.items(), key=lambda one: -one[1]))
             rather = known.pop(NETWORK, None)
             found = ", ".join(f"{name} {share:.2g}" for name, share in known.items() if share >= SHOWN)
-            yield f"Chosen: {self.chosen}. Probability of each change: {found}."
+            yield f"Chosen: {self.chosen}, that is, {_in_words(self.chosen)}. Probability of each change: {found}."
             if self.chosen == NETWORK:
                 yield f"Probability that the network changed, rather than the most probable of these: {rather:.2g}."
             # If the evidence of the most probable change is strong, left-out windows rejected it.
@@ -187,3 +188,10 @@ class Adaptation:
         parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
         found = vars(self) | {"status": str(self.status), "converged": self.converged, "parameters": parameters}
         return json_value({name: value for name, value in found.items() if name != "field"})
+
+
+def _in_words(candidate: str) -> str:
+    if candidate == NETWORK:
+        return "new weights of the network"
+    *first, last = (WORDS[each] for each in CANDIDATES[candidate] or ["source"])
+    return f"{', '.join(first)} and {last}" if first else last

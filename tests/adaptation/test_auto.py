@@ -54,7 +54,9 @@ def test_windows_choose_what_changed(chosen):
     length = found.parameters["log_length"]
     assert length.has_interval == (chosen != "source")
     assert chosen == "source" or abs(length.value - np.log(LENGTH)) < 4 / 1.96 * (length.high - length.value) < 0.2
-    assert f"Chosen: {chosen}. Probability of each change: {chosen}" in found.report()
+    words = {"source": "no change", "theta": "new physical parameters"}
+    words |= {"disturbance": "new physical parameters and a constant disturbance"}
+    assert f"Chosen: {chosen}, that is, {words[chosen]}. Probability of each change: {chosen}" in found.report()
     assert chosen != "source" or eqx.tree_equal(found.field.physics, hybrid().physics)
     assert ("Kept as before: all parameters" in found.report()) == (chosen == "source")
 
