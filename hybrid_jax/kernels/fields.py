@@ -48,13 +48,10 @@ class Kernel:
     def weights(self, field: PyTree) -> Array:
         return self.forward.joined(jax.tree.leaves(eqx.filter(field, _is_array)))
 
-    def apart(self, weights: Array) -> list[Array]:
-        parts = zip(self.forward.places(), self.forward.shapes, strict=True)
-        return [weights[begin : begin + one.size].reshape(one.shape) for begin, one in parts]
-
     def back_weights(self, weights: Array) -> Array:
         assert self.back is not None
-        return self.back.joined(self.apart(weights))
+        parts = zip(jnp.split(weights, self.forward.places()[1:]), self.forward.shapes, strict=False)
+        return self.back.joined([part.reshape(one.shape) for part, one in parts])
 
 
 def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:

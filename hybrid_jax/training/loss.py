@@ -63,7 +63,7 @@ def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t 
     starts = jnp.concatenate([x0[None], x[:-1]])
     # Without the barrier, XLA looks up every number by its own index.
     moved = jax.lax.optimization_barrier([jnp.moveaxis(a, 0, 1) for a in (starts, u)])
-    return (a.reshape(len(a), -1) for a in moved)
+    return (jax.lax.collapse(a, 1) for a in moved)
 
 
 def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:

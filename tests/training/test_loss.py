@@ -153,3 +153,10 @@ def test_settings_that_are_none_are_refused_where_they_are_set():
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"^{name} must be"):
             Settings(**{name: value})
+
+
+def test_samples_begin_at_the_start_of_each_interval_also_without_inputs():
+    x0, x = jnp.zeros((2, 3)), jnp.ones((4, 2, 3))
+    starts, u = along(x0, x, jnp.zeros((4, 0, 3)))
+    np.testing.assert_array_equal(starts, np.repeat([0, 1, 1, 1], 3)[None].repeat(2, axis=0))
+    assert u.shape == (0, 12)
