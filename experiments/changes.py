@@ -109,8 +109,8 @@ def report(record: Mapping[str, Any]) -> Report:
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
-    errors = "RMSE of the position predicted over 1 s; lower is better; bands reach from the least to the most"
-    return {"errors": (error_figure(rows), errors)}
+    about = "RMSE of the position predicted over 1 s; lower is better; bands reach from the least to the most"
+    return {"errors": (error_figure(rows), about)}
 
 
 def adapted(

@@ -98,16 +98,13 @@ CLAIMS: Sequence[Claim[Results]] = (
 
 
 def conclusion(rows: Results) -> list[str]:
-    gains = {domain: 1 - over(own, "source").mean() for domain, own in rows.group("domain").items()}
-    share = f"{min(gains.values()):.0%} to {max(gains.values()):.0%}"
-    sentence = f"`hj.adapt` removes {share} of the source's mean squared error, by change"
+    groups = rows.group("domain").values()
+    gains = [1 - over(own, "source").mean() for own in groups]
+    sentence = f"`hj.adapt` removes {min(gains):.0%} to {max(gains):.0%} of the source's mean squared error, by change"
     if "fine_tune" not in rows.unique("candidate"):
         return [f"{sentence}."]
-    worse = [
-        of_each_case(own, "fine_tune").mean() > of_each_case(own, "source").mean()
-        for own in rows.group("domain").values()
-    ]
-    return [f"{sentence}; fine-tuning increases it in {sum(worse)} of {len(worse)} changes."]
+    more = sum(of_each_case(own, "fine_tune").mean() > of_each_case(own, "source").mean() for own in groups)
+    return [f"{sentence}; fine-tuning increases it in {more} of {len(groups)} changes."]
 
 
 def regret_table(rows: Results) -> Table:
@@ -126,11 +123,8 @@ def regret_table(rows: Results) -> Table:
 
 def error_table(rows: Results) -> Table:
     groups = rows.group("domain")
-
-    def text(own: Results, name: str) -> str:
-        return f"{of_each_case(own, name).mean():.3g}"
-
-    lines = [(name, *(text(own, name) for own in groups.values())) for name in (AUTO, *rows.unique("candidate"))]
+    methods, own = (AUTO, *rows.unique("candidate")), groups.values()
+    lines = [(name, *(f"{of_each_case(each, name).mean():.3g}" for each in own)) for name in methods]
     return Table("Mean test error (less is better)", ("method", *map(names.label, groups)), lines)
 
 
