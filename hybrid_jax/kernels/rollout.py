@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,24 +16,6 @@ from hybrid_jax.kernels.fields import Kernel, kernel_of
 
 Shaped = Array | np.ndarray | jax.ShapeDtypeStruct
 FEWEST = 16  # windows; for fewer, a call costs more than it saves
-
-
-class Call(NamedTuple):
-    """The arguments that all calls of a kernel share."""
-
-    kernel: Kernel
-    dt: float
-
-    def forward(self, kept: int, *arrays: Array) -> Sequence[Array]:
-        """Return the states, and `kept` numbers that the backward pass needs."""
-        shapes = (len(arrays[-1]), *arrays[-2].shape), (kept,)
-        return self.run("forward", [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes], *arrays)
-
-    def run(self, way: str, results: list, *arrays: Array) -> Sequence[Array]:
-        """Call the kernel on arrays, which it does not check. `vmap` calls it for one lane after the other."""
-        numbers = np.array([self.dt, self.kernel.epsilon], np.float32)
-        call = jax.ffi.ffi_call(f"hybrid_jax_{way}", results, vmap_method="sequential")
-        return call(*arrays, kernel=self.kernel.name, numbers=numbers)
 
 
 def serves_training(field, x0: Shaped, u: Shaped, solver: Solver, windows_axis: int) -> bool:
@@ -52,7 +34,7 @@ def trained(
         return None
 
     def run(field, x0, u):
-        return _rollout(Call(kernel, float(dt)), kernel.weights(field), x0, u)
+        return _rollout(kernel, float(dt), kernel.weights(field), x0, u)
 
     def derivative(values, slopes):
         return eqx.filter_jvp(run if slopes[-1] is None else plain, values, slopes)
@@ -67,7 +49,7 @@ def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, s
 
     def run(field, *arrays):
         last = (jnp.moveaxis(array, 0, -1) for array in arrays)
-        return jnp.moveaxis(Call(kernel, float(dt)).forward(0, kernel.weights(field), *last)[0], -1, 0)
+        return jnp.moveaxis(_states(kernel, float(dt), 0, kernel.weights(field), *last)[0], -1, 0)
 
     def plain(field, x0, u):
         return rollout_batch(field, x0, u, dt, solver)
@@ -92,24 +74,36 @@ def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, axis: int, training: b
     return kernel_of(field, x0.shape[1 + axis], u.shape[2 + axis], training)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _rollout(call: Call, *arrays: Array) -> Float[Array, "t d b"]:
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _rollout(kernel: Kernel, dt: float, *arrays: Array) -> Float[Array, "t d b"]:
     """Compute the states from weights, x0 and u by one call forward and one backward, which takes u for data."""
-    return call.forward(0, *arrays)[0]
+    return _states(kernel, dt, 0, *arrays)[0]
 
 
-def _forward(call: Call, *arrays: Array):
-    (d, _, _, units), (x0, u), width = call.kernel.sizes, arrays[-2:], library.width()
+def _forward(kernel: Kernel, dt: float, *arrays: Array):
+    (d, _, _, units), (x0, u), width = kernel.sizes, arrays[-2:], library.width()
     windows, padded = (-(-n // width) * width for n in (x0.shape[1], units))
     kept = len(u) * 4 * (windows * (d + units + 1) + padded) + width  # see cpp/rollout.h
-    states, saved = call.forward(kept, *arrays)
+    states, saved = _states(kernel, dt, kept, *arrays)
     return states, (*arrays, saved)
 
 
-def _backward(call: Call, saved: tuple[Array, ...], d_states: Float[Array, "t d b"]):
+def _backward(kernel: Kernel, dt: float, saved: tuple[Array, ...], d_states: Float[Array, "t d b"]):
     *given, kept = saved
-    results = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in given[:2]]
-    return *call.run("backward", results, *given, call.kernel.back_weights(given[0]), kept, d_states), None
+    shapes = [array.shape for array in given[:2]]
+    return *_call("backward", kernel, dt, shapes, *given, kernel.back_weights(given[0]), kept, d_states), None
 
 
 _rollout.defvjp(_forward, _backward)
+
+
+def _states(kernel: Kernel, dt: float, kept: int, *arrays: Array) -> Sequence[Array]:
+    """Return the states, and `kept` numbers that the backward pass needs."""
+    return _call("forward", kernel, dt, [(len(arrays[-1]), *arrays[-2].shape), (kept,)], *arrays)
+
+
+def _call(way: str, kernel: Kernel, dt: float, shapes: list[tuple[int, ...]], *arrays: Array) -> Sequence[Array]:
+    """Call the kernel on arrays, which it does not check. `vmap` calls it for one lane after the other."""
+    results = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    call = jax.ffi.ffi_call(f"hybrid_jax_{way}", results, vmap_method="sequential")
+    return call(*arrays, kernel=kernel.name, numbers=np.array([dt, kernel.epsilon], np.float32))
