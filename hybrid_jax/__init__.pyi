@@ -2,7 +2,19 @@
 
 from . import runtime
 from ._version import __version__
-from .adaptation import METHODS, Adaptation, FineTune, LeastSquares, Method, Ridge, Solution, Source, adapt, pool
+from .adaptation import (
+    METHODS,
+    Adaptation,
+    FineTune,
+    LeastSquares,
+    Method,
+    Ridge,
+    Solution,
+    Source,
+    adapt,
+    adapt_records,
+    pool,
+)
 from .dynamics import (
     AbstractVectorField,
     Actuator,
@@ -53,4 +65,4 @@ __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridg
 __all__ += ["Excitation", "FlightBounds", "Hypothesis", "InputBounds", "OnlineAdaptation", "excitation"]
 __all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]
 __all__ += ["Record", "StateSpaceModel", "fit_records", "predict", "simulate", "with_hidden"]
-__all__ += ["fit_disturbance", "observe"]
+__all__ += ["adapt_records", "fit_disturbance", "observe"]

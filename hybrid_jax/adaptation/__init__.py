@@ -13,7 +13,9 @@ from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source
 from hybrid_jax.adaptation.plausible import Plausible
 from hybrid_jax.adaptation.pooling import pool
+from hybrid_jax.adaptation.records import RecordAdaptation, adapt_records
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 
 __all__ = ["METHODS", "Adaptation", "Auto", "FineTune", "LeastSquares", "Method"]
-__all__ += ["Parameter", "Plausible", "Ridge", "Solution", "Source", "adapt", "pool"]
+__all__ += ["Parameter", "Plausible", "RecordAdaptation", "Ridge", "Solution", "Source"]
+__all__ += ["adapt", "adapt_records", "pool"]

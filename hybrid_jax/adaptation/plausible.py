@@ -14,6 +14,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.record_search import logarithms
 from hybrid_jax.estimation.uncertainty import named_parameters, names_of
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories
@@ -101,10 +102,12 @@ class Plausible:
         else:
             steady = np.array(groups) == "disturbance"
             rates = jnp.broadcast_to(rates, (max(parts, k),))[np.maximum(np.cumsum(steady) - 1, 0)]
-            logarithms = np.array([name.split(".")[-1].startswith("log_") for name in names])
-            changes = self.relative * jnp.where(logarithms, 1.0, jnp.abs(theta))
-            sizes = jnp.where(steady, self.disturbance * rates, changes)
+            sizes = jnp.where(steady, self.disturbance * rates, self.relative_to(names, theta))
         return jnp.where(sizes > 0, sizes, jnp.inf)
+
+    def relative_to(self, names: Sequence[str], theta: Float[Array | np.ndarray, " p"]) -> Float[Array, " p"]:
+        """Return the sizes (p) of changes of parameters with these values by `relative`."""
+        return self.relative * jnp.where(logarithms(names), 1.0, jnp.abs(theta))
 
 
 def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:

@@ -247,19 +247,23 @@ def without_others(every: Fit, free: Bool[Array, " p"], start) -> Float[Array, "
 
 
 def surely_lower(found: Fit, still: Fit, thetas: Float[Array, "b p"], blocks) -> Bool[Array, ""]:
-    """Return whether a change lowers the log-error of left-out blocks by more than `SURELY` standard errors.
+    """Return whether a change is `surely` better in left-out blocks; see `left_out_thetas`."""
+    after = jax.vmap(lambda theta, place: found.at(theta).square[place])(thetas, blocks[0])
+    before, after = (jnp.sum(square * blocks[1], axis=1) for square in (still.equations.square[blocks[0]], after))
+    enough = surely(before, after)
+    return enough if len(before) >= ENOUGH else jnp.array(True)
+
+
+def surely(before: Float[Array | np.ndarray, " b"], after: Float[Array | np.ndarray, " b"]) -> Bool[Array, ""]:
+    """Return whether the log-error of left-out blocks falls by more than `SURELY` standard errors.
 
     Evidence assumes independent errors, but errors are correlated where physics lacks something. `ALIKE` neighbouring
     blocks count as one. The logarithm is the likelihood of a block of unknown variance, so that no block outweighs the
     others. Gains count up to `MOST`: a change that a few blocks show clearly, and the others a little, is as certain.
-    See `left_out_thetas`.
     """
-    after = jax.vmap(lambda theta, place: found.at(theta).square[place])(thetas, blocks[0])
-    before, after = (jnp.sum(square * blocks[1], axis=1) for square in (still.equations.square[blocks[0]], after))
     least = jnp.maximum(jnp.finfo(before.dtype).eps * before, TINY)
     gain = jnp.minimum(jnp.log(jnp.maximum(before, least) / jnp.maximum(after, least)), MOST)
-    enough = jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) * (ALIKE / len(gain)) ** 0.5
-    return enough if len(gain) >= ENOUGH else jnp.array(True)
+    return jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) * (ALIKE / len(gain)) ** 0.5
 
 
 def no_higher(after: Float[Array, "b 2 d"], before: Float[Array, "b 2 d"], scale: Scale) -> Bool[Array, ""]:
