@@ -64,23 +64,19 @@ def split(program: ClosedJaxpr, parameters: int) -> Split:
     Weights are in single precision, so functions of parameters of another type, for example comparisons, belong to the
     samples.
     """
-    inputs, outputs = program.jaxpr.invars, program.jaxpr.outvars
-    constant, known = set(program.jaxpr.constvars), set(inputs[:parameters])
-    ahead, after, wanted = [], [], []
-    for equation in program.jaxpr.eqns:
-        read = set(_variables(equation.invars))
-        if read <= constant:
+    inputs, outputs, equations = program.jaxpr.invars, program.jaxpr.outvars, program.jaxpr.eqns
+    constant, known, wanted = set(program.jaxpr.constvars), set(inputs[:parameters]), []
+    for equation in equations:
+        read = _variables(equation.invars)
+        if constant.issuperset(read):
             constant |= set(equation.outvars)
-            after.append(equation)
-        elif read <= constant | known and all(out.aval.dtype.kind == "f" for out in equation.outvars):  # type: ignore
+        elif (constant | known).issuperset(read) and all(out.aval.dtype.kind == "f" for out in equation.outvars):  # type: ignore
             known |= set(equation.outvars)
         else:
-            wanted += [one for one in _variables(equation.invars) if one in known]
-            after.append(equation)
-            continue
-        ahead.append(equation)
+            wanted += [one for one in read if one in known]
     frontier = list(dict.fromkeys([*wanted, *(one for one in _variables(outputs) if one in known)]))
-    weights = _program(ahead, inputs[:parameters], frontier, program)
+    weights = _program(equations, inputs[:parameters], frontier, program)
+    after = [equation for equation in equations if known.isdisjoint(equation.outvars)]
     samples = _program(after, [*frontier, *inputs[parameters:]], outputs, program)
     return Split(weights, samples, [one.aval for one in frontier])
 
