@@ -106,7 +106,12 @@ class Plausible:
         return jnp.where(sizes > 0, sizes, jnp.inf)
 
     def relative_to(self, names: Sequence[str], theta: Float[Array | np.ndarray, " p"]) -> Float[Array, " p"]:
-        """Return the sizes (p) of changes of parameters with these values by `relative`."""
+        """Return the standard deviations (p) of changes by `relative`.
+
+        Args:
+            names: the parameters; one that begins with log_ is a logarithm, whose change does not depend on its value.
+            theta: their values (p).
+        """
         return self.relative * jnp.where(logarithms(names), 1.0, jnp.abs(theta))
 
 
