@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
 
 from hybrid_jax import checks
@@ -83,7 +84,8 @@ def adapt_records(
     by `fit_records` with a prior around the source: a plausible change, plus the source's own uncertainty. Then a
     seventh of the records is left out in turn: the candidate is fitted to the other parts, and predicts this one, of
     which only the initial state is fitted. The result is the smallest candidate that predicts these parts surely better
-    than the source (see `selection.surely`), and that no other one beats surely; else it is the source.
+    than the source (see `selection.surely`), and that no other one beats surely; else it is the source. Intervals are
+    those of `fit_records`, or by the jackknife over the parts if they are wider.
 
     Args:
         source: the fit before the change. Its `errors` are the size of the errors to expect.
@@ -115,14 +117,15 @@ def adapt_records(
             warnings.simplefilter("always")
             fits[name] = fit_records(source.model, records, prior=prior, noise=noise, rounds=1, **grid, **options)
     with jax.enable_x64(True), np.errstate(over="ignore", invalid="ignore"):
-        left = _left_out(model, records, fits, near, noise, **grid)
+        left, without = _left_out(model, records, fits, near, noise, **grid)
         chosen = _chosen(left)
         errors = {name: float(np.sqrt(np.sum(each) / np.sum(left[SOURCE]))) for name, each in left.items()}
         for each in said[chosen]:
             checks.warn(str(each.message))
         if chosen == SOURCE:
             return RecordAdaptation(source, SOURCE, {}, errors)
-        return RecordAdaptation(*_changed(source, fits[chosen], chosen, near[chosen] > 0, level), errors)
+        moves, more = near[chosen] > 0, _more(fits[chosen], without[chosen])
+        return RecordAdaptation(*_changed(source, fits[chosen], chosen, moves, more, level), errors)
 
 
 def _candidates(model: StateSpaceModel, p: int) -> dict[str, Bool[np.ndarray, " p"]]:
@@ -137,7 +140,7 @@ def _candidates(model: StateSpaceModel, p: int) -> dict[str, Bool[np.ndarray, " 
 
 
 def _left_out(model, records, fits, near, noise, *, dt, between, robust, solver, substeps):
-    """Return the squared errors of each candidate on each part with samples (k), by a fit to the other parts."""
+    """Return each candidate's squared errors on each part with samples (k), and θ (k, p) fitted to the other parts."""
     given = completed(records, tuple(model.outputs), model.angles)
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in given]
     segments = shooting.cut(gridded, -(-max(len(each.u) for each in gridded) // -(-PARTS // len(gridded))))
@@ -145,19 +148,20 @@ def _left_out(model, records, fits, near, noise, *, dt, between, robust, solver,
     problem = Problem(model, scale, robust, dt, RK4() if solver is None else solver, substeps)
     theta, spread = np.asarray(ravel_learned(model)[0]), np.array(model.spread)[None]
     most = np.where(record_search.logarithms(record_search.learned_names(model)), record_search.LOGARITHM, np.inf)
-    found, sizes = {}, None
+    found, without, sizes = {}, {}, None
     for name, fit in fits.items():
         search = Search(problem, jnp.asarray(fit.starts)[:, None], near[name], theta, segments, spread, most=most)
         sizes = record_search.sizes_of(search, theta, search.still) if sizes is None else sizes
         parts = np.argwhere(np.any([each.any(axis=2) for each in segments.there.values()], axis=0))
         last = jnp.asarray(ravel_learned(fit.model)[0])
         states = search.predicted(last, search.still).states
-        found[name] = np.array([_without(search, last, states[i, j, 0], sizes, i, j) for i, j in parts])
-    return found
+        pairs = [_without(search, last, states[i, j, 0], sizes, i, j) for i, j in parts]
+        found[name], without[name] = (np.array(each) for each in zip(*pairs, strict=True))
+    return found, without
 
 
-def _without(search: Search, theta, x, sizes: Float[np.ndarray, " e"], i: int, j: int) -> float:
-    """Return the squared errors of part j of record i, from about x (d), by a fit to the other parts."""
+def _without(search: Search, theta, x, sizes: Float[np.ndarray, " e"], i: int, j: int):
+    """Return the squared errors of part j of record i, from about x (d), and θ (p) fitted to the other parts."""
     there = {name: each.copy() for name, each in search.segments.there.items()}
     for each in there.values():
         each[i, j] = False
@@ -167,14 +171,30 @@ def _without(search: Search, theta, x, sizes: Float[np.ndarray, " e"], i: int, j
     # Only the state at its start is fitted.
     alone = search._replace(centres=x[None, None], segments=part, spread=sizes[None], deviations=0 * theta + np.inf)
     end = alone.descend(theta, alone.still, free=np.zeros(len(theta), bool))
-    return float(jnp.sum(end.equations.square))
+    return float(jnp.sum(end.equations.square)), np.asarray(theta)
 
 
-def _changed(source: RecordFit, fit: RecordFit, chosen: str, moves: Bool[np.ndarray, " p"], level: float):
-    """Return the fit with the source's covariance of what did not change, the candidate, and intervals of changes."""
-    covariance = np.where(moves | moves[:, None], fit.covariance, source.covariance)
+def _more(fit: RecordFit, without: Float[np.ndarray, "k p"]) -> Float[np.ndarray, " p"]:
+    """Return how many times larger each standard error is by the jackknife over parts (Efron 1982), at least 1.
+
+    If physics lacks something, numbers make up for it, and differ from part to part more than noise explains.
+    """
+    k = len(without)
+    error = (k - 1) / k**0.5 * without.std(axis=0, ddof=1)
+    error *= scipy.special.stdtrit(k - 1, 0.975) / scipy.special.ndtri(0.975)  # few parts
+    with np.errstate(invalid="ignore", divide="ignore"):  # infinite if not identifiable, zero if kept
+        return np.fmax(np.nan_to_num(error / np.sqrt(np.diagonal(fit.covariance)), posinf=1.0), 1.0)
+
+
+def _changed(source: RecordFit, fit: RecordFit, chosen: str, moves: Bool[np.ndarray, " p"], more, level: float):
+    """Return the fit with the source's covariance of what did not change, the candidate, and intervals of changes.
+
+    The source has the same physics, so its errors count as `more` times larger, too.
+    """
+    found = fit.covariance * more * more[:, None]
+    covariance = np.where(moves | moves[:, None], found, source.covariance)
     values = intervals_of(fit.model, covariance, level)
-    apart = intervals_of(fit.model, fit.covariance + source.covariance, level)
+    apart = intervals_of(fit.model, found + source.covariance * more * more[:, None], level)
     before = intervals_of(source.model, source.covariance, level)
     names = record_search.learned_names(fit.model)
     moved = [name for name, move in zip(names, moves, strict=True) if move and name in values]

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.records import _candidates, _chosen
+from hybrid_jax.adaptation.records import _candidates, _chosen, _more
 
 NOISE, SECONDS = 0.01, 8.0
 
@@ -91,6 +92,15 @@ def test_a_larger_candidate_is_chosen_only_if_it_surely_beats_all_smaller_ones()
     assert _chosen({"source": still, "sensors": better, "physics": better / 2}) == "physics"
     assert _chosen({"source": still, "sensors": better, "physics": np.full(8, np.nan)}) == "sensors"
     assert _chosen({"source": still[:4], "physics": better[:4]}) == "source"  # too few parts to be sure
+
+
+def test_numbers_that_differ_from_part_to_part_are_known_as_well_as_their_mean(source):
+    of_parts = np.random.default_rng(0).normal(size=(7, 3)) * [0.0, 0.05, 50.0]
+    without = (of_parts.sum(axis=0) - of_parts) / 6
+    wider = _more(source, without)
+    error = scipy.stats.sem(of_parts) * scipy.stats.t.ppf(0.975, 6) / 1.96
+    np.testing.assert_allclose(wider, np.maximum(error / np.sqrt(np.diagonal(source.covariance)), 1), rtol=1e-3)
+    assert wider[0] == 1 < wider[2]
 
 
 def test_a_network_changes_only_together_with_all_others():
