@@ -16,7 +16,7 @@ from hybrid_jax.adaptation.selection import TINY, left_out_steps
 from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
 from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.disturbance import physics_of
+from hybrid_jax.dynamics.disturbance import disturbance_units, physics_of
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
 from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, inverse
 from hybrid_jax.estimation.starts import Starts, from_starts
@@ -150,6 +150,14 @@ def network_effect(
     there, without = jnp.moveaxis(in_chunks(lambda part: jnp.moveaxis(effect(part), 0, 1), smooth, CHUNK), 1, 0)
     apart = jnp.square(weigh(there) - weigh(without))
     return Effect(jnp.sum(jnp.square(there - without)), jnp.sum(apart, axis=(0, 1)))
+
+
+def quantities_of(field: AbstractVectorField, windows: Trajectories) -> int:
+    """Return on how many quantities an effect that physics lacks may depend.
+
+    Aerodynamic forces depend, for example, on the velocity, the body rates and the rotor speeds.
+    """
+    return len(disturbance_units(field)) + windows.u.shape[-1]
 
 
 def taken_by_network(

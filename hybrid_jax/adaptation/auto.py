@@ -13,13 +13,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import anchored, selection
-from hybrid_jax.adaptation.expectation import errors_at_ends
+from hybrid_jax.adaptation.expectation import errors_of_units, no_higher
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, extended, free_parameters, groups_of, names_of
 from hybrid_jax.adaptation.results import NETWORK
 from hybrid_jax.adaptation.selection import Fit, Posterior, Unchanged
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import disturbance_units
 from hybrid_jax.estimation.least_squares import Scale, ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import sandwich_of_repeated
@@ -101,7 +100,7 @@ class Auto(Method):
         scale, solver = scale_of(settings.objective), settings.solver
         larger, physics, sizes = _begin(self, field, train)
         options, effect, step = (sizes, solver, scale, self.max_steps), None, None
-        quantities = _quantities(larger, train)
+        quantities = anchored.quantities_of(larger, train)
         still, network = np.zeros(sizes.shape, sizes.dtype), anchored.has_network(field)
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
         learned_from = motion_of(field) if learned_from is None else learned_from
@@ -129,7 +128,7 @@ class Auto(Method):
 
         def ends_of(thetas, change: Array | None = None) -> Array:
             change = jnp.zeros((len(thetas), weights)) if change is None else change
-            return _ends(larger, thetas, change, train, units, solver)
+            return errors_of_units(larger, thetas, change, train, units, solver)
 
         sure, left_out = _left_out(self, larger, found, first[0], chosen, None if flights is None else units)
         same = jnp.broadcast_to(ravel_parameters(larger)[0], left_out.shape)
@@ -208,27 +207,11 @@ def _left_out(
 
 
 @jit_by_size(UNOPTIMISED)
-def _ends(
-    larger, thetas: Float[Array, "b p"], changes: Float[Array, "b w"], train: Trajectories, units, solver
-) -> Array:
-    """Compute `errors_at_ends` of each left-out unit, with its own parameters and change of the network."""
-    unravel = ravel_parameters(larger)[1]
-
-    def one(unit):
-        theta, change, windows, counted = unit
-        field = unravel(theta)
-        return errors_at_ends(anchored.with_change(field, change) if change.size else field, windows, counted, solver)
-
-    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[units[0]], train)
-    return jax.lax.map(one, (thetas, changes, own, jnp.asarray(units[1])))
-
-
-@jit_by_size(UNOPTIMISED)
 def _confirm(
     sure: Bool[Array, ""], changed: tuple, still: tuple, chosen: Posterior, scale: Scale
 ) -> tuple[Any, Posterior]:
     """Return the chosen change or, if left-out blocks do not confirm it, no change."""
-    sure = (chosen.taken == 0) | sure & selection.no_higher(changed[-1], still[-1], scale)
+    sure = (chosen.taken == 0) | sure & no_higher(changed[-1], still[-1], scale)
     changed = jax.tree.map(partial(jnp.where, sure), changed, still)
     return changed, chosen._replace(taken=jnp.where(sure, chosen.taken, 0))
 
@@ -250,7 +233,7 @@ def _confirm_network(
     step: anchored.Anchored, ends, changed, source: OfSource | None, scale: Scale
 ) -> tuple[Any, Array]:
     """Set the odds of the network's change to 0 if left-out units do not confirm it; also return the errors."""
-    sure = selection.no_higher(changed, ends, scale)
+    sure = no_higher(changed, ends, scale)
     sure = sure if source is None else sure & ~source.alone
     step = step._replace(odds=jnp.where(sure, step.odds, 0.0))
     return step, jnp.where(step.odds > selection.STRONG, changed, ends)
@@ -292,14 +275,6 @@ def _conclude(field, larger, train: Trajectories, outcome, quantities: int, size
     status = jnp.where(jnp.any(found.seen), found.status, Status.STALLED)  # no parameter has an effect
     finite = (status == Status.OK) | ~jnp.isinf(ends).any()
     return Solution(adapted, found.steps, jnp.where(finite, status, Status.DIVERGED), choice)
-
-
-def _quantities(larger, windows: Trajectories) -> int:
-    """Return on how many quantities an effect that physics lacks may depend.
-
-    Aerodynamic forces depend, for example, on the velocity, the body rates and the rotor speeds.
-    """
-    return len(disturbance_units(larger)) + windows.u.shape[-1]
 
 
 def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:

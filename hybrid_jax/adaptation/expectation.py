@@ -9,10 +9,12 @@ import numpy as np
 import scipy  # not scipy.stats, which takes half a second to import
 from jaxtyping import Array, Bool, Float, Int
 
-from hybrid_jax.adaptation.selection import ALIKE
+from hybrid_jax.adaptation import anchored
+from hybrid_jax.adaptation.selection import ALIKE, MOST
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.estimation.least_squares import Solver
+from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
 from hybrid_jax.integrate import compact, rollout
+from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.trajectories import Trajectories, errors_of
 
@@ -101,6 +103,39 @@ def errors_at_ends(
     last = counted & ~jnp.roll(touches, -1).at[-1].set(False)  # the end of each chain
     weights = jnp.stack([counted, last], axis=1)[..., None] & ~jnp.isnan(block.x[:, -1:])
     return jnp.sum(jnp.where(weights, ends, 0), axis=0) / jnp.sum(weights, axis=0)
+
+
+@jit_by_size(UNOPTIMISED)
+def errors_of_units(
+    larger: AbstractVectorField,
+    thetas: Float[Array, "b p"],
+    changes: Float[Array, "b w"],
+    train: Trajectories,
+    units: tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]],
+    solver: Solver,
+) -> Float[Array, "b 2 d"]:
+    """Compute `errors_at_ends` of each left-out unit, with its own parameters and change of the network."""
+    unravel = ravel_parameters(larger)[1]
+
+    def one(unit):
+        theta, change, windows, counted = unit
+        field = unravel(theta)
+        return errors_at_ends(anchored.with_change(field, change) if change.size else field, windows, counted, solver)
+
+    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[units[0]], train)
+    return jax.lax.map(one, (thetas, changes, own, jnp.asarray(units[1])))
+
+
+def no_higher(after: Float[Array, "b 2 d"], before: Float[Array, "b 2 d"], scale: Scale) -> Bool[Array, ""]:
+    """Return whether a change does not raise the mean log-error at the ends of joined windows of left-out units.
+
+    Windows may be too short to show that a change is wrong: a constant force, for example, explains a slow oscillation
+    within each. See `errors_at_ends`; log-errors are limited as in `selection.surely`.
+    """
+    after, before = (
+        jnp.nansum(each[:, 1] / (1.0 if scale is None else jnp.square(scale)), axis=-1) for each in (after, before)
+    )
+    return jnp.mean(jnp.clip(jnp.nan_to_num(jnp.log(before / after)), -MOST, MOST)) >= 0
 
 
 def longest_chain(windows: Trajectories, blocks: tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]) -> int:

@@ -13,8 +13,8 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
+from hybrid_jax.estimation.learned_numbers import logarithms
 from hybrid_jax.estimation.least_squares import ravel_parameters
-from hybrid_jax.estimation.record_search import logarithms
 from hybrid_jax.estimation.uncertainty import named_parameters, names_of
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories

@@ -16,7 +16,7 @@ from hybrid_jax.adaptation.plausible import Plausible
 from hybrid_jax.adaptation.selection import ENOUGH, surely
 from hybrid_jax.dynamics.base import in_double, ravel_learned
 from hybrid_jax.dynamics.outputs import StateSpaceModel
-from hybrid_jax.estimation import record_search, shooting
+from hybrid_jax.estimation import learned_numbers, record_search, shooting
 from hybrid_jax.estimation.discretisation import Solver
 from hybrid_jax.estimation.record_fit import RecordFit, fit_records, intervals_of
 from hybrid_jax.estimation.record_search import Search
@@ -106,7 +106,7 @@ def adapt_records(
     grid |= {"robust": robust, "solver": solver, "substeps": substeps}
     with jax.enable_x64(True):
         model = in_double(source.model)
-        names, theta = record_search.learned_names(model), np.asarray(ravel_learned(model)[0])
+        names, theta = learned_numbers.learned_names(model), np.asarray(ravel_learned(model)[0])
         sizes = np.asarray(plausible.relative_to(names, theta))
         wide = np.sqrt(np.where(sizes > 0, sizes, np.inf) ** 2 + np.diagonal(source.covariance))
         near = {name: np.where(free, wide, 0.0) for name, free in _candidates(model, len(theta)).items()}
@@ -131,8 +131,8 @@ def adapt_records(
 def _candidates(model: StateSpaceModel, p: int) -> dict[str, Bool[np.ndarray, " p"]]:
     """Return which learned numbers each candidate fits, the fewest first; each fits others than those before."""
     sensors, physics = np.zeros((2, p), bool)
-    sensors[record_search.places_of(model, lambda model: model.outputs)] = True
-    physics[record_search.places_of(model, record_search.physics_in)] = True
+    sensors[learned_numbers.places_of(model, lambda model: model.outputs)] = True
+    physics[learned_numbers.places_of(model, learned_numbers.physics_in)] = True
     both = {"sensors and physics": sensors | physics, "all": np.ones(p, bool)}
     found = {SOURCE: np.zeros(p, bool), "sensors": sensors, "physics": physics} | both
     first = {each.tobytes(): name for name, each in reversed(found.items())}
@@ -147,7 +147,7 @@ def _left_out(model, records, fits, near, noise, *, dt, between, robust, solver,
     scale = {name: jnp.asarray(size) for name, size in noise.items()}
     problem = Problem(model, scale, robust, dt, RK4() if solver is None else solver, substeps)
     theta, spread = np.asarray(ravel_learned(model)[0]), np.array(model.spread)[None]
-    most = np.where(record_search.logarithms(record_search.learned_names(model)), record_search.LOGARITHM, np.inf)
+    most = learned_numbers.largest_steps(model)
     found, without, sizes = {}, {}, None
     for name, fit in fits.items():
         search = Search(problem, jnp.asarray(fit.starts)[:, None], near[name], theta, segments, spread, most=most)
@@ -196,7 +196,7 @@ def _changed(source: RecordFit, fit: RecordFit, chosen: str, moves: Bool[np.ndar
     values = intervals_of(fit.model, covariance, level)
     apart = intervals_of(fit.model, found + source.covariance * more * more[:, None], level)
     before = intervals_of(source.model, source.covariance, level)
-    names = record_search.learned_names(fit.model)
+    names = learned_numbers.learned_names(fit.model)
     moved = [name for name, move in zip(names, moves, strict=True) if move and name in values]
     changes = {name: Interval(*(end - before[name].value for end in apart[name])) for name in moved}
     return eqx.tree_at(lambda fit: (fit.covariance, fit.intervals), fit, (covariance, values)), chosen, changes

@@ -266,18 +266,6 @@ def surely(before: Float[Array | np.ndarray, " b"], after: Float[Array | np.ndar
     return jnp.mean(gain) > SURELY * jnp.std(gain, ddof=1) * (ALIKE / len(gain)) ** 0.5
 
 
-def no_higher(after: Float[Array, "b 2 d"], before: Float[Array, "b 2 d"], scale: Scale) -> Bool[Array, ""]:
-    """Return whether a change does not raise the mean log-error at the ends of joined windows of left-out units.
-
-    Windows may be too short to show that a change is wrong: a constant force, for example, explains a slow oscillation
-    within each. See `errors_at_ends`; log-errors are limited as in `surely_lower`.
-    """
-    after, before = (
-        jnp.nansum(each[:, 1] / (1.0 if scale is None else jnp.square(scale)), axis=-1) for each in (after, before)
-    )
-    return jnp.mean(jnp.clip(jnp.nan_to_num(jnp.log(before / after)), -MOST, MOST)) >= 0
-
-
 def correlated(windows: Trajectories) -> int:
     """Return how many consecutive windows form a cluster: a fifth if they are from one or a few flights, else 1."""
     starts, ends = np.asarray(windows.x0), np.asarray(windows.x)[:, -1]

@@ -16,11 +16,11 @@ from jaxtyping import Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import in_double, ravel_learned
 from hybrid_jax.dynamics.outputs import StateSpaceModel
-from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
+from hybrid_jax.estimation import elimination, learned_numbers, record_search, shooting, uncertainty
 from hybrid_jax.estimation.discretisation import FINE, Solver, warn_of_steps
 from hybrid_jax.estimation.elimination import End, reduced
 from hybrid_jax.estimation.normal_equations import inverse
-from hybrid_jax.estimation.record_search import LOGARITHM, TINY, size_of
+from hybrid_jax.estimation.record_search import TINY, size_of
 from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.implicit_solvers import solver_errors
@@ -149,11 +149,11 @@ def fit_records(
         cautious = robust if known.keys() == scale.keys() else robust / 10
         problem = Problem(model, scale, cautious, dt, RK4() if solver is None else solver, substeps)
         steps = record_search.steps_of(segment, gridded, dt)
-        theta, near = np.asarray(ravel_learned(model)[0]), record_search.deviations_of(model, prior or {})
+        theta, near = np.asarray(ravel_learned(model)[0]), learned_numbers.deviations_of(model, prior or {})
         segments = shooting.cut(gridded, steps)
         nodes = len(gridded), 1 if segment is None else segments.valid.shape[1], 1
         centres, spread = jnp.tile(jnp.array(model.start), nodes), np.array(model.spread)[None]
-        most = np.where(record_search.logarithms(record_search.learned_names(model)), LOGARITHM, np.inf)
+        most = learned_numbers.largest_steps(model)
         search = record_search.Search(problem, centres, near, theta, segments, spread, most=most)
         (search, theta, own), total = record_search.approached(search, segment), 0
         if any(model.process):
@@ -189,9 +189,10 @@ def fit_records(
 def _result(search: record_search.Search, end: End, records, gridded, errors, robust, level: float) -> RecordFit:
     model, start = search.model(end.theta), np.asarray(search.nodes(end.own)[0])[:, 0]
     covariance, variances = _covariance(search, end, errors)
-    names = record_search.learned_names(model)
+    names = learned_numbers.learned_names(model)
     # The others keep what they share with it: it may be anything from zero to where it begins to matter.
-    lost = record_search.logarithms(names) & np.isfinite(np.diagonal(covariance)) & (np.diagonal(covariance) > VAGUE**2)
+    variance = np.diagonal(covariance)
+    lost = learned_numbers.logarithms(names) & np.isfinite(variance) & (variance > VAGUE**2)
     covariance = np.where(lost | lost[:, None], np.diag(np.where(lost, np.inf, 0.0)), covariance)
     deviation = np.sqrt(variances[:, : model.space.tangent_size])
     found = intervals_of(model, covariance, level)
@@ -209,12 +210,12 @@ def _result(search: record_search.Search, end: End, records, gridded, errors, ro
 
 def intervals_of(model: StateSpaceModel, covariance: Float[np.ndarray, "p p"], level: float) -> dict[str, Interval]:
     """Return the interval of each number of the physics and of the outputs; `covariance` is of all learned numbers."""
-    found, rows = {}, record_search.places_of(model, record_search.physics_in)
+    found, rows = {}, learned_numbers.places_of(model, learned_numbers.physics_in)
     if len(rows):
         found = uncertainty.intervals(model.field, jnp.asarray(covariance[np.ix_(rows, rows)]), level)
-    theta, names = np.asarray(ravel_learned(model)[0]), record_search.learned_names(model)
+    theta, names = np.asarray(ravel_learned(model)[0]), learned_numbers.learned_names(model)
     away = scipy.special.ndtri((1 + level) / 2) * np.sqrt(np.diagonal(covariance))
-    for i in record_search.places_of(model, lambda model: model.outputs):
+    for i in learned_numbers.places_of(model, lambda model: model.outputs):
         found[names[i]] = Interval(theta[i], theta[i] - away[i], theta[i] + away[i])
     return jax.tree.map(np.asarray, found)
 

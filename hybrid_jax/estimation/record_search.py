@@ -2,25 +2,24 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
-from hybrid_jax.dynamics.disturbance import physics_of
+from hybrid_jax.dynamics.base import ravel_learned
 from hybrid_jax.dynamics.window_checks import foreign_units, turns
 from hybrid_jax.estimation import shooting
 from hybrid_jax.estimation.elimination import End, descend, reduced, undetermined
+from hybrid_jax.estimation.learned_numbers import learned_names
 from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.estimation.shooting import Local, Model, Predicted, Problem, Segments
-from hybrid_jax.estimation.uncertainty import names_of
 from hybrid_jax.records import Gridded, Record, Signal, integral
 from hybrid_jax.state_space import StateSpace
 
@@ -29,7 +28,6 @@ MOST = 3000  # unknowns
 CLUSTERS = 20  # of a simulation's errors, each of which is one observation
 GAP = 5.0  # sample intervals without a sample that count as a gap
 TINY, SMALL = 1e-12, 1e-3
-LOGARITHM = 3.0  # largest step of a logarithm: the linear model would take one that loses its effect to −∞
 SLOW = 300  # dt in one interval, or records in one input: more is a mistake in a unit of time
 
 
@@ -157,48 +155,6 @@ def _missing(model: Model, ends, slopes, nodes, charts):
         return model.space.difference(end, node), jnp.concatenate([of_end @ slope, of_node @ chart], axis=1)
 
     return jax.vmap(jax.vmap(one))(ends, slopes, nodes, charts)
-
-
-def places_of(model: Model, part: Callable[[Model], Any]) -> Int[np.ndarray, " k"]:
-    """Return where the learned numbers of a part of the model are among all, in the order of `ravel_learned`."""
-    theta, unravel = ravel_learned(model)
-    return np.asarray(ravel_learned(part(unravel(jnp.arange(len(theta), dtype=theta.dtype))))[0]).astype(int)
-
-
-def physics_in(model: Model) -> AbstractVectorField:
-    return physics_of(model.field)
-
-
-def learned_names(model: Model) -> list[str]:
-    """Return the name of each learned number, in the order of `ravel_learned`, for example log_drag or gyro.bias.
-
-    Physics' numbers are named as in `uncertainty.named_parameters`, and others by their path in the field or outputs.
-    """
-    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(model, trainable(model)))
-    paths = ((jax.tree_util.keystr(path, simple=True, separator="."), leaf.shape) for path, leaf in leaves)
-    indices = ((path.split(".", 1)[1], at) for path, shape in paths for at in np.ndindex(shape))
-    names = [f"{path}[{','.join(map(str, at))}]" if at else path for path, at in indices]
-    for place, name in zip(places_of(model, physics_in), names_of(model.field), strict=True):
-        names[place] = name
-    return names
-
-
-def logarithms(names: Sequence[str]) -> Bool[np.ndarray, " p"]:
-    return np.array([name.split(".")[-1].startswith("log_") for name in names], bool)
-
-
-def deviations_of(model: Model, prior: Mapping[str, float]) -> Float[np.ndarray, " p"]:
-    """Return the prior deviation of each learned number; ValueError for an unknown name."""
-    names, used = learned_names(model), set()
-    found = np.full(len(names), np.inf)
-    for i, name in enumerate(names):
-        chosen = [each for each in prior if name == each or name.startswith((f"{each}.", f"{each}["))]
-        used.update(chosen)
-        found[i] = prior[max(chosen, key=len)] if chosen else np.inf
-    for name in prior.keys() - used:
-        known = dict.fromkeys(each.split("[")[0] for each in names)
-        raise ValueError(f"prior: the model has no {name}; it has {', '.join(known)}")
-    return found
 
 
 def directions(search: Search, end: End, records: Sequence[Record]) -> tuple[str, ...]:
