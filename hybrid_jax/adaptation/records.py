@@ -100,8 +100,11 @@ def adapt_records(
         options: other arguments of `fit_records`, for example segment and max_steps.
 
     Raises:
-        ValueError: as `fit_records`.
+        ValueError: as `fit_records`, or if the options have a prior, noise or rounds, which the source determines.
     """
+    checks.instance("source", source, RecordFit)
+    if own := options.keys() & {"prior", "noise", "rounds"}:
+        raise ValueError(f"{min(own)} cannot be given: it is determined by the source")
     records, grid = checks.list_of("records", records, Record), {"dt": dt, "between": between}
     grid |= {"robust": robust, "solver": solver, "substeps": substeps}
     with jax.enable_x64(True):

@@ -109,3 +109,10 @@ def test_a_network_changes_only_together_with_all_others():
     p = hj.dynamics.base.ravel_learned(whole)[0].size
     counts = {name: int(free.sum()) for name, free in _candidates(whole, p).items()}
     assert counts == {"source": 0, "sensors": 1, "physics": 2, "sensors and physics": 3, "all": p}
+
+
+def test_wrong_inputs_are_named(source):
+    with pytest.raises(ValueError, match=r"^source must be a RecordFit, got StateSpaceModel"):
+        hj.adapt_records(source.model, [record(4)], dt=0.02)
+    with pytest.raises(ValueError, match=r"^prior cannot be given: it is determined by the source"):
+        hj.adapt_records(source, [record(4)], dt=0.02, prior={"damping": 1.0})
