@@ -43,7 +43,7 @@ HELD_OUT = 5  # the last of so many equal parts of the windows is held out for v
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; check dt and all units"
 NOT_FITTED = "no parameter was fitted"
-NO_MOTION = "field: its training windows are unknown: its network may err by a fifth of its effect; pass learned_from="
+NO_MOTION = "field: its training windows are unknown, so its network may err by 20% of its effect; pass learned_from="
 FEW = "windows: {} are too few to determine {} parameters; undetermined parameters keep the source's values"
 BY_NETWORK = "the network's effect is comparable to that of a plausible change; hj.pool of several sources helps"
 BY_ROTORS = "the rotors' efficiencies, which were fitted too, can have the same effect"
