@@ -68,8 +68,8 @@ def candidate(direction: bool = False, drift: bool = False, lag: bool = False, p
         field = hj.with_hidden(field, hj.dynamics.Lag(jnp.log(jnp.array([0.01])), places=(0,)))
         prior = {f"field.{name}": value for name, value in prior.items()} | {"parts": 1.0}
     d, spread = 2 + drift, (1e-5, 1e-6, 0.0)[: 2 + drift] + (1.0,) * lag
-    model = hj.StateSpaceModel(field, ("u",), {"q": position}, start=(0.0,) * (d + lag), spread=spread)
-    return model, prior
+    start = (0.0,) * (d + lag)
+    return hj.StateSpaceModel(field, ("u",), {"q": position}, start, spread, noise={"q": 3e-3}), prior
 
 
 BENCHMARK = Benchmark(
@@ -83,7 +83,7 @@ BENCHMARK = Benchmark(
         "direction, drift, and a force that lags": lambda: candidate(True, True, True),
         "and a guide that is not uniform": lambda: candidate(True, True, True, True),
     },
-    options={"dt": 0.01, "substeps": 16, "between": "linear", "rounds": 1, "max_steps": 200, "noise": {"q": 3e-3}},
+    options={"dt": 0.01, "substeps": 16, "between": "linear", "rounds": 1, "max_steps": 200},
     # At rest and cold; the force has acted for longer than its lag.
     start=lambda u, q, model: (q, 0.0, 0.0, u)[: len(model.start)],
     parts=3,

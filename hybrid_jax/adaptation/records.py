@@ -88,7 +88,7 @@ def adapt_records(
     those of `fit_records`, or by the jackknife over the parts if they are wider.
 
     Args:
-        source: the fit before the change. Its `errors` are the size of the errors to expect.
+        source: the fit before the change. The noise of its model is the size of the errors to expect.
         records: one or more records of the changed system, in which each output has samples.
         dt: length of the intervals in which the inputs are constant [s].
         between: how inputs act between their samples.
@@ -100,10 +100,10 @@ def adapt_records(
         options: other arguments of `fit_records`, for example segment and max_steps.
 
     Raises:
-        ValueError: as `fit_records`, or if the options have a prior, noise or rounds, which the source determines.
+        ValueError: as `fit_records`, or if the options have a prior or rounds, which the source determines.
     """
     checks.instance("source", source, RecordFit)
-    if own := options.keys() & {"prior", "noise", "rounds"}:
+    if own := options.keys() & {"prior", "rounds"}:
         raise ValueError(f"{min(own)} cannot be given: it is determined by the source")
     records, grid = checks.list_of("records", records, Record), {"dt": dt, "between": between}
     grid |= {"robust": robust, "solver": solver, "substeps": substeps}
@@ -113,14 +113,14 @@ def adapt_records(
         sizes = np.asarray(plausible.relative_to(names, theta))
         wide = np.sqrt(np.where(sizes > 0, sizes, np.inf) ** 2 + np.diagonal(source.covariance))
         near = {name: np.where(free, wide, 0.0) for name, free in _candidates(model, len(theta)).items()}
-    fits, said, noise = {}, {}, dict[str, Any](source.errors)
+    fits, said = {}, {}
     for name, deviations in near.items():
         prior = dict(zip(names, deviations, strict=True))
         with warnings.catch_warnings(record=True) as said[name]:
             warnings.simplefilter("always")
-            fits[name] = fit_records(source.model, records, prior=prior, noise=noise, rounds=1, **grid, **options)
+            fits[name] = fit_records(source.model, records, prior=prior, rounds=1, **grid, **options)
     with jax.enable_x64(True), np.errstate(over="ignore", invalid="ignore"):
-        left, without = _left_out(model, records, fits, near, noise, **grid)
+        left, without = _left_out(model.only(source.errors), records, fits, near, **grid)
         chosen = _chosen(left)
         errors = {name: float(np.sqrt(np.sum(each) / np.sum(left[SOURCE]))) for name, each in left.items()}
         for each in said[chosen]:
@@ -142,12 +142,12 @@ def _candidates(model: StateSpaceModel, p: int) -> dict[str, Bool[np.ndarray, " 
     return {name: each for name, each in found.items() if first[each.tobytes()] == name}
 
 
-def _left_out(model, records, fits, near, noise, *, dt, between, robust, solver, substeps):
+def _left_out(model, records, fits, near, *, dt, between, robust, solver, substeps):
     """Return each candidate's squared errors on each part with samples (k), and θ (k, p) fitted to the other parts."""
     given = completed(records, tuple(model.outputs), model.angles)
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in given]
     segments = shooting.cut(gridded, -(-max(len(each.u) for each in gridded) // -(-PARTS // len(gridded))))
-    scale = {name: jnp.asarray(size) for name, size in noise.items()}
+    scale = {name: jnp.asarray(size) for name, size in model.noise.items()}
     problem = Problem(model, scale, robust, dt, RK4() if solver is None else solver, substeps)
     theta, spread = np.asarray(ravel_learned(model)[0]), np.array(model.spread)[None]
     most = learned_numbers.largest_steps(model)

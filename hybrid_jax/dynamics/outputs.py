@@ -1,14 +1,17 @@
 """Partially measured systems: ẋ = f(x, u), y = h(x, u)."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
-from hybrid_jax.state_space import Angle, StateSpace
+from hybrid_jax.state_space import Angle, Quantity, StateSpace
 
 ANGLE = Angle("angle")
 Output = Callable[..., Float[Array, "*k"]]
@@ -16,6 +19,20 @@ Output = Callable[..., Float[Array, "*k"]]
 
 def _numbers(values) -> tuple[float, ...]:
     return tuple(float(each) for each in values)
+
+
+def _numbers_by_name(values) -> dict[str, tuple[float, ...]]:
+    return {name: _numbers(np.ravel(each)) for name, each in values.items()}
+
+
+class Measured(eqx.Module):
+    """A quantity of the state as an output, compared in its tangent space."""
+
+    part: tuple[int, int] = eqx.field(static=True)
+    quantity: Quantity = eqx.field(static=True)
+
+    def __call__(self, x, u):
+        return x[slice(*self.part)]
 
 
 class StateSpaceModel(eqx.Module):
@@ -29,31 +46,50 @@ class StateSpaceModel(eqx.Module):
         inputs: the names of the signals that make up u, in order.
         outputs: the functions h by name. Each takes the state (d,) and the input (m,), and returns a scalar or (k,). A
             function with a third argument also gets the field, for example for an accelerometer, which measures ẋ. You
-            should not use a field from elsewhere, because its parameters would not follow the fitted ones.
-        start: the expected initial state (d,).
+            should not use a field from elsewhere, because its parameters would not follow the fitted ones. By default
+            each quantity of `space` is an output of its name, for example "velocity", or "x[0]" if the field has no
+            state space. Those that no record has are left out.
+        start: the expected initial state (d,). You must give it.
         spread: the standard deviation of the initial state about `start` (d,). It should be 0 if you know it, infinite
             if you know nothing about it. An attitude has three numbers here, its rotation [rad].
         process: the standard deviation of the process noise on each state, per square root of a second; by default 0.
             It should have the shape of `spread`. A state with process noise and no dynamics is a random walk.
-        angles: the names of outputs that are angles [rad], of which whole turns do not matter.
+        angles: the names of outputs that are angles [rad], of which whole turns do not matter; those of the state space
+            are known by default.
+        noise: the standard deviation of the measured outputs' errors by name, in the unit of the output: one number, or
+            one for each component; three rotation angles [rad] for an attitude. A fit estimates those that are not
+            given, and its model has all.
 
     Raises:
-        ValueError: if sizes do not agree, a deviation is negative, or an angle is no output.
+        ValueError: if sizes do not agree, a deviation is negative, or an angle or a noise is of no output.
     """
 
     field: AbstractVectorField
     inputs: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    outputs: Mapping[str, Output]
-    start: tuple[float, ...] = eqx.field(static=True, converter=_numbers)
-    spread: tuple[float, ...] = eqx.field(static=True, converter=_numbers)
+    outputs: Mapping[str, Output] = None  # pyright: ignore[reportAssignmentType]
+    start: tuple[float, ...] = eqx.field(static=True, converter=_numbers, default=())
+    spread: tuple[float, ...] = eqx.field(static=True, converter=_numbers, default=())
     process: tuple[float, ...] = eqx.field(static=True, converter=_numbers, default=())
     angles: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    noise: Mapping[str, tuple[float, ...]] = eqx.field(converter=_numbers_by_name, default_factory=dict)
+
+    def __post_init__(self):
+        if self.outputs is None:
+            self.outputs = {one.name: Measured((at.start, at.stop), one) for at, one in self.space.parts}
+            self.angles = (*self.angles, *(one.name for one in self.space.quantities if isinstance(one, Angle)))
 
     def __check_init__(self):
+        if not self.start:
+            raise ValueError("start must be given: the expected initial state")
         if not self.outputs:
             raise ValueError("outputs: at least one is needed, for example {'angle': lambda x, u: x[0]}")
-        if unknown := [name for name in self.angles if name not in self.outputs]:
-            raise ValueError(f"angles must be names of outputs, {', '.join(self.outputs)}, got {', '.join(unknown)}")
+        for name, chosen in (("angles", self.angles), ("noise", self.noise)):
+            if unknown := [each for each in chosen if each not in self.outputs]:
+                known = ", ".join(self.outputs)
+                raise ValueError(f"{name} must be names of outputs, {known}, got {', '.join(unknown)}")
+        for name, sizes in self.noise.items():
+            for number in sizes:
+                checks.positive(f"noise of {name}", number)
         expected = self.space.tangent_size
         for name, numbers in (("spread", self.spread), ("process", self.process)):
             if len(numbers) not in ((0, expected) if name == "process" else (expected,)):
@@ -102,4 +138,16 @@ class StateSpaceModel(eqx.Module):
             predicted: as returned by `output` (k,).
             y: the measurement (k,).
         """
+        if isinstance(h := self.outputs[name], Measured):
+            return h.quantity.difference(predicted, y)
         return ANGLE.difference(predicted, y) if name in self.angles else predicted - y
+
+    def only(self, names: Iterable[str]) -> "StateSpaceModel":
+        """Return the model with some of its outputs.
+
+        Args:
+            names: their names.
+        """
+        outputs = {name: self.outputs[name] for name in names}
+        noise = {name: size for name, size in self.noise.items() if name in outputs}
+        return replace(self, outputs=outputs, angles=[name for name in self.angles if name in outputs], noise=noise)

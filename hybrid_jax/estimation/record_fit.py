@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import in_double, ravel_learned
-from hybrid_jax.dynamics.outputs import StateSpaceModel
+from hybrid_jax.dynamics.outputs import Measured, StateSpaceModel
 from hybrid_jax.estimation import elimination, learned_numbers, record_search, shooting, uncertainty
 from hybrid_jax.estimation.discretisation import FINE, Solver, warn_of_steps
 from hybrid_jax.estimation.elimination import End, reduced
@@ -38,7 +38,7 @@ class RecordFit(eqx.Module):
     """The result of `fit_records`.
 
     Attributes:
-        model: the model with the fitted numbers; it starts like the first record.
+        model: the model with the fitted numbers and the noise; it starts like the first record.
         starts: the state at the start of each record (r, d).
         starts_error: the standard error of `starts` (r, d); three rotation angles [rad] for an attitude.
         ends: the state at the end of each record (r, d).
@@ -84,7 +84,6 @@ def fit_records(
     between: Between = "held",
     segment: float | None = None,
     prior: Mapping[str, float] | None = None,
-    noise: Mapping[str, float] | None = None,
     robust: float = np.inf,
     rounds: int = 2,
     max_steps: int = 50,
@@ -99,7 +98,8 @@ def fit_records(
     and if no sample determines some of the numbers (`directions`).
 
     Args:
-        model: the initial model.
+        model: the initial model. Outputs count relative to their `noise`. If it is not given, this is the standard
+            deviation of the samples in the first round, relative to which `prior` is weighted.
         records: one or more records. Each output is compared at its own samples in each record.
         dt: length of the intervals in which the inputs are constant [s].
         between: how inputs act between their samples: "held", "linear" or "averaged", see `records.on_grid`.
@@ -107,11 +107,9 @@ def fit_records(
             are none. You need them for unstable systems, a poor initial model, and process noise.
         prior: standard deviations of learned numbers from their start, by the beginning of their names in `intervals`,
             for example {"log_drag": 0.5, "residual": 0.3}; 0 keeps them, and the others are free.
-        noise: expected size of each output's errors in the first round, relative to which `prior` is weighted; by
-            default the standard deviation of its samples.
         robust: errors beyond this many times their usual size count linearly, for example 3 for data with outliers. In
-            the first round, that size is `noise`, or a tenth of its default. By default all errors are squared.
-        rounds: number of fits, each with outputs weighted by the errors of the previous round.
+            the first round, that size is the noise, or a tenth of its default. By default all errors are squared.
+        rounds: number of fits; outputs without known noise are weighted by their errors in the previous round.
         max_steps: maximum number of Levenberg–Marquardt steps in each round.
         starts: number of searches in the first round, of which the best continues. The first begins at the model, and
             the others at numbers drawn from `prior`; numbers without a prior are not drawn.
@@ -131,6 +129,9 @@ def fit_records(
         checks.count(name, number)
     if any(model.process) and segment is None:
         raise ValueError("segment must be given with process noise: it acts between segments")
+    given, seen = model, {name for each in records for name, signal in each.signals.items() if len(signal)}
+    kept = [name for name, h in model.outputs.items() if name in seen or not isinstance(h, Measured)]
+    model = model.only(kept or model.outputs)
     records = completed(records, tuple(model.outputs), model.angles)
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
     record_search.check_signals(model, records, gridded, dt)
@@ -142,9 +143,12 @@ def fit_records(
         for name in (name for name, each in y.items() if not len(each)):
             raise ValueError(f"records: no record has a sample of {name}")
         widest = {name: 1.0 if name in model.angles else np.inf for name in y}  # [rad]: whole turns do not matter
-        deviation = {name: np.clip(each.std(axis=0), TINY, widest[name]) for name, each in y.items()}
-        known = {name: np.full_like(deviation[name], size) for name, size in (noise or {}).items()}
-        scale = {name: jnp.asarray(each) for name, each in (deviation | known).items()}
+        deviation = {name: np.clip(_variation(model, name, each), TINY, widest[name]) for name, each in y.items()}
+        for name, sizes in model.noise.items():
+            if len(sizes) not in (1, len(deviation[name])):
+                raise ValueError(f"noise of {name} must be one number or {len(deviation[name])}, got {len(sizes)}")
+        known = {name: jnp.broadcast_to(jnp.array(sizes), deviation[name].shape) for name, sizes in model.noise.items()}
+        scale = {name: jnp.asarray(each) for name, each in deviation.items()} | known
         # Plain least squares in the first round would follow outliers to another minimum.
         cautious = robust if known.keys() == scale.keys() else robust / 10
         problem = Problem(model, scale, cautious, dt, RK4() if solver is None else solver, substeps)
@@ -157,8 +161,8 @@ def fit_records(
         search = record_search.Search(problem, centres, near, theta, segments, spread, most=most)
         (search, theta, own), total = record_search.approached(search, segment), 0
         if any(model.process):
-            noise = np.array(model.process) * np.sqrt(steps * dt)
-            search = search._replace(off=np.maximum(noise, CONTINUOUS * record_search.sizes_of(search, theta, own)))
+            walked = np.array(model.process) * np.sqrt(steps * dt)
+            search = search._replace(off=np.maximum(walked, CONTINUOUS * record_search.sizes_of(search, theta, own)))
         else:
             own = own[:, : model.space.tangent_size]
             search = search._replace(centres=search.centres[:, :1], off=None)
@@ -171,8 +175,12 @@ def fit_records(
             theta, own, total = end.theta, end.own, total + end.steps
             errors = search.errors(theta, own)
             if i < rounds - 1:
-                search = search.weighted(errors, robust)
+                search = search.weighted(errors, robust, known)
         found = _result(search, end._replace(steps=total), records, gridded, errors, robust, level)
+        sizes = {k: v.tolist() for k, v in search.weighted(errors, robust, known).problem.scale.items()}
+        own = {"outputs": {**given.outputs, **found.model.outputs}, "angles": given.angles}
+        fitted = dataclasses.replace(found.model, noise={**given.noise, **sizes}, **own)
+        found = dataclasses.replace(found, model=fitted)
     warn_of_steps(found.discretisation, f"a smaller dt, or substeps={2 * substeps}")
     if found.status != Status.OK:
         checks.warn(f"records: the fit {found.status.message}; check all units and the model")
@@ -184,6 +192,13 @@ def fit_records(
     if found.directions:
         checks.warn(f"records: no sample determines {'; '.join(found.directions)}")
     return found
+
+
+def _variation(model: StateSpaceModel, name: str, y: Float[Array | np.ndarray, "n k"]) -> Float[np.ndarray, " e"]:
+    """Return the standard deviation of an output's samples, compared as its errors are."""
+    if not isinstance(model.outputs[name], Measured):
+        return np.std(np.asarray(y), axis=0)
+    return np.std(jax.vmap(lambda each: model.error(name, each, jnp.asarray(y[0])))(jnp.asarray(y)), axis=0)
 
 
 def _result(search: record_search.Search, end: End, records, gridded, errors, robust, level: float) -> RecordFit:
@@ -234,7 +249,7 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
         if np.abs(np.linalg.eigvals(rates)).max() * problem.dt / problem.substeps > FASTEST:
             return np.inf  # the search stops where the solver becomes unstable, and half the step changes nothing
     now, fine = found.y, fine.y
-    size = {name: FINE * np.std(segments.y[name][segments.there[name]], axis=0) for name in now}
+    size = {name: FINE * _variation(problem.model, name, segments.y[name][segments.there[name]]) for name in now}
     size = {name: jnp.asarray(each + size_of(errors[name], problem.robust)) for name, each in size.items()}
     # Shifted samples give the same errors as half the step, without compiling again.
     moved = segments._replace(y={name: each - (fine[name] - now[name]) for name, each in segments.y.items()})

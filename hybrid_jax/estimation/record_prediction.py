@@ -1,6 +1,5 @@
 """Simulate a model with the inputs of a record, and predict from its last samples."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -49,7 +48,7 @@ def simulate(
     Raises:
         ValueError: if the record lacks an input or all outputs.
     """
-    model = _of_outputs(model, record)
+    model = _measured_in(record, model)
     gridded = [on_grid(record, model.inputs, tuple(model.outputs), dt, between, begin)]
     with jax.enable_x64(True):
         model = in_double(model)
@@ -71,13 +70,13 @@ def predict(
     if the past is too short for this.
 
     Args:
-        model: a model with known numbers; its start is the expected state at the first time of the past.
+        model: a model with known numbers and noise; its start is the expected state at the first time of the past.
         past: the last samples; it should be longer if more states are hidden.
         future: the inputs from the end of the past on, and the times of the outputs' samples to predict; the values of
             outputs are not read.
         dt: length of the intervals in which inputs are constant [s].
         between: how inputs act between samples.
-        options: other arguments of `fit_records`, such as noise, robust, segment, solver and substeps.
+        options: other arguments of `fit_records`, such as robust, segment, solver and substeps.
 
     Raises:
         ValueError: if a record lacks an input or all outputs, or inputs begin long after the past.
@@ -92,7 +91,7 @@ def predict(
         t, values = np.append(before.t[earlier], after.t), np.concatenate([before.values[earlier], after.values])
         joined[name] = Signal(t, values, after.axes, after.source)
     still = eqx.tree_at(lambda model: model.field, model, Frozen(model.field))
-    still = _of_outputs(still, past)
+    still = _measured_in(past, still)
     if np.isinf(model.spread).any():  # a search from the model's start may end in a local minimum
         lengths = (np.ptp(past.signals[name].t) for name in still.outputs if past.signals.get(name))
         options = {"segment": max(lengths, default=0.0) / 10} | options
@@ -104,10 +103,8 @@ def predict(
     return y
 
 
-def _of_outputs(model: StateSpaceModel, record: Record) -> StateSpaceModel:
-    """Return the model with the outputs that a record has."""
-    seen = {name: h for name, h in model.outputs.items() if record.signals.get(name)} or model.outputs
-    return dataclasses.replace(model, outputs=seen, angles=[name for name in model.angles if name in seen])
+def _measured_in(record: Record, model: StateSpaceModel) -> StateSpaceModel:
+    return model.only([name for name in model.outputs if record.signals.get(name)] or model.outputs)
 
 
 def _warn_if_short(model: StateSpaceModel, past: Record, known: RecordFit, states: Float[np.ndarray, "t d"]) -> None:

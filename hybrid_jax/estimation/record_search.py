@@ -120,9 +120,9 @@ class Search(NamedTuple):
         found = self.predicted(theta, own).errors
         return {name: np.asarray(each)[self.segments.there[name]] for name, each in found.items()}
 
-    def weighted(self, errors: dict[str, Float[np.ndarray, "n k"]], robust: float = np.inf) -> "Search":
-        """Weight outputs by their errors; errors above `robust` times the usual one count less."""
-        sizes = {name: jnp.asarray(size_of(each, robust)) for name, each in errors.items()}
+    def weighted(self, errors: dict[str, Float[np.ndarray, "n k"]], robust: float = np.inf, known=()) -> "Search":
+        """Weight outputs by their errors or `known` sizes; errors above `robust` times the usual one count less."""
+        sizes = {name: jnp.asarray(size_of(each, robust)) for name, each in errors.items()} | dict(known)
         return self._replace(problem=dataclasses.replace(self.problem, scale=sizes, robust=robust))
 
     def part(self, kept) -> "Search":
