@@ -15,7 +15,8 @@ from experiments.paper.conditions import Noise
 from experiments.worlds.world import DT, World
 from hybrid_jax.adaptation import Adaptation, FineTune, Method, Parameter
 
-PHYSICS = "Ix", "Iy", "Iz", "k", "drag", "aerodynamic_moment", "rate_damping"  # learned without a network
+# Learned without a network.
+PHYSICS = "Ix", "Iy", "Iz", "k", "drag", "aerodynamic_moment", "rate_damping", "translational_lift"
 CHANGING = 1.0  # m/s² and rad/s²: the filter's prior of a disturbance
 
 

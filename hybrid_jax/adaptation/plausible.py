@@ -21,6 +21,7 @@ from hybrid_jax.trajectories import Trajectories
 
 # Parameters of a corrected rigid body; the others are its own, θ_p.
 GROUPS = {"efficiency": "efficiency", "reaction_torque": "reaction_torque", "added_drag": "drag"}
+GROUPS |= {"wind": "wind", "wind[2]": "updraft"}
 GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
 
 # The groups of parameters that each candidate fits. A candidate applies if the field has all of its groups.
@@ -31,6 +32,7 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "theta_reaction_torque": ("theta", "reaction_torque"),
     "disturbance": ("theta", "disturbance"),
     "force": ("theta", "force"),
+    "wind": ("theta", "wind", "updraft"),
     "drag": ("theta", "drag"),
     "efficiency": ("theta", "efficiency"),
     "force_torque": ("theta", "force", "torque"),
@@ -45,6 +47,8 @@ WORDS = {
     "reaction_torque": "a factor of all reaction torques",
     "disturbance": "a constant disturbance",
     "force": "a constant force",
+    "wind": "a steady horizontal wind",
+    "updraft": "an updraft",
     "torque": "a constant torque",
     "drag": "drag along each axis of the body",
     "efficiency": "the efficiency of each rotor",
@@ -61,6 +65,8 @@ class Plausible:
         relative: each parameter of another system, relative to the source's value; a parameter that is 0 is free. It
             is absolute for a logarithm, whose name should begin with log_.
         force: constant force over the mass [m/s²].
+        wind: horizontal components of a steady wind [m/s].
+        updraft: its vertical component [m/s].
         torque: constant torque over the inertia [rad/s²].
         drag: added drag over the mass [1/s].
         efficiency: logarithm of each rotor's efficiency.
@@ -75,6 +81,8 @@ class Plausible:
     relative: float = 1.0
     force: float = 2.0
     torque: float = 5.0
+    wind: float = 3.0
+    updraft: float = 0.5
     drag: float = 0.5
     efficiency: float = 0.3
     reaction_torque: float = 0.3

@@ -1,6 +1,6 @@
 """Equations of motion of a multirotor on the entries of θ_p, x and u, without stacking them; see `rigid_body`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from functools import partial
 
 import jax
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax import rotation
-from hybrid_jax.dynamics.terms import Terms, nominal_values
+from hybrid_jax.dynamics.terms import OF_AIR, Terms, nominal_values
 from hybrid_jax.rotation import Rows
 from hybrid_jax.vehicle import BODY_RATES, QUATERNION, VELOCITY, Vehicle
 
@@ -24,11 +24,15 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     attitude = rotation.matrix(q)
     acceleration = (thrust / constants["mass"][0]) * jnp.stack([row[2] for row in attitude]) + gravity
     velocity = [dot(column, v) for column in zip(*attitude, strict=True)]
-    force = _specific_force(constants, velocity, torque)
+    air = velocity
+    if is_present(wind := constants["wind"]):
+        relative = [part - one for part, one in zip(v, wind, strict=True)]
+        air = [dot(column, relative) for column in zip(*attitude, strict=True)]
+    force = _specific_force(constants, air, torque)
     faster = _velocity_error(constants, velocity, force)
     turning = rotation.derivative(q, omega)
     if is_present(moment := constants["aerodynamic_moment"]):
-        torque = [part + dot(moment[3 * i : 3 * i + 3], velocity) for i, part in enumerate(torque)]
+        torque = [part + dot(moment[3 * i : 3 * i + 3], air) for i, part in enumerate(torque)]
     if is_present(damping := constants["rate_damping"]):
         torque = [part - one * rate for part, one, rate in zip(torque, damping, omega, strict=True)]
     inertia = [constants[name][0] for name in ("Ix", "Iy", "Iz")]
@@ -63,14 +67,16 @@ def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
     return k * total, torque
 
 
-def _specific_force(constants: Constants, velocity, torque):
-    """Return the specific force without thrust [m/s², body]: drag, and a cable that the rotors' torque balances."""
+def _specific_force(constants: Constants, air, torque):
+    """Return the specific force without thrust [m/s², body]: drag, lift, and a cable that torque balances."""
     drag, pull, (mass,) = constants["drag"], constants["cable_pull"], constants["mass"]
     x, y, z = 0.0, 0.0, 0.0
     if is_present(drag):
-        x, y, z = (-(factor / mass) * part for factor, part in zip(drag, velocity, strict=True))
+        x, y, z = (-(factor / mass) * part for factor, part in zip(drag, air, strict=True))
     if is_present(added := constants["added_drag"]):
-        x, y, z = (one - factor * part for one, factor, part in zip((x, y, z), added, velocity, strict=True))
+        x, y, z = (one - factor * part for one, factor, part in zip((x, y, z), added, air, strict=True))
+    if is_present(lift := constants["translational_lift"]):
+        z = z + lift[0] / mass * dot(air[:2], air[:2])
     if is_present(pull):
         x, y = x + pull[0] / mass * torque[1], y - pull[1] / mass * torque[0]
     return [x, y, z]
@@ -102,6 +108,12 @@ def in_world(attitude, parts) -> Float[Array, " 3 *b"]:
 def dot(a, b) -> Array:
     first, *others = (left * right for left, right in zip(a, b, strict=True))
     return sum(others, first)
+
+
+def feels_wind(vehicle: Vehicle, terms: Terms, learned: Container[str]) -> bool:
+    """Whether any term depends on the velocity through the air; otherwise no data tell of a wind."""
+    known = nominal_values(vehicle, terms)
+    return any(name in learned or is_present(known[name]) for name in OF_AIR)
 
 
 def is_present(term, absent: float = 0.0) -> bool:

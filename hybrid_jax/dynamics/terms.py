@@ -8,14 +8,16 @@ import numpy as np
 from hybrid_jax import checks
 from hybrid_jax.vehicle import Vehicle, as_tuple, require_numbers
 
-SPEED, RATE = 1.0, 10.0  # m/s and rad/s at which a coefficient of 1 weighs as much as the vehicle
+# m/s, m/s if the coefficient is of a square, and rad/s, at which a coefficient of 1 weighs as much as the vehicle.
+SPEED, FAST, RATE = 1.0, 10.0, 10.0
 POSITIVE = {"mass": (), "Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
 SIGNED = {"torque_gain": (3,), "centre_of_mass": (2,), "drag": (3,), "cable_pull": (2,), "aerodynamic_moment": (3, 3)}
-SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": ()}
+SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": (), "translational_lift": ()}
 SHAPES = POSITIVE | SIGNED  # of all learnable parameters, for four rotors; see `shape_of`
-OF_VELOCITY = {"drag", "aerodynamic_moment", "velocity_lag", "velocity_gain"}  # not identifiable without a velocity
+OF_AIR = {"drag", "aerodynamic_moment", "translational_lift"}  # a wind acts through these
+OF_VELOCITY = OF_AIR | {"velocity_lag", "velocity_gain"}  # not identifiable without a velocity
 # Of a body that has changed; see `rigid_body.corrected`.
-CORRECTIONS = {"efficiency": (4,), "reaction_torque": (), "added_drag": (3,)}
+CORRECTIONS = {"efficiency": (4,), "reaction_torque": (), "added_drag": (3,), "wind": (3,)}
 LOGARITHMIC = (*POSITIVE, "efficiency", "reaction_torque")
 Three = tuple[float, float, float]
 NONE = (0.0, 0.0, 0.0)
@@ -36,6 +38,7 @@ class Terms:
         rate_damping: B about x, y and z [N m s].
         velocity_gain: S, the ratio of the position's derivative to the logged velocity.
         velocity_lag: λ, time constant of the estimated velocity for forces across the thrust [s].
+        translational_lift: L, force along z over the squared speed along x and y [N s²/m²].
         motor_time_constant: lag of the rotors behind logged motor values [s]; applied to logs, not by the field.
     """
 
@@ -47,6 +50,7 @@ class Terms:
     rate_damping: Three = NONE
     velocity_gain: Three = (1.0, 1.0, 1.0)
     velocity_lag: float = 0.0
+    translational_lift: float = 0.0
     motor_time_constant: float = 0.0
 
     def __post_init__(self):
@@ -82,7 +86,7 @@ def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...
     k, (ix, iy, iz) = vehicle.thrust_coefficient, vehicle.inertia
     own = {"Ix": (ix,), "Iy": (iy,), "Iz": (iz,), "k": (k,), "k_rotors": (k,) * vehicle.rotors}
     own |= {"mass": (vehicle.mass,), "torque_coefficient": (vehicle.torque_coefficient,)}
-    own |= {"efficiency": (1.0,) * vehicle.rotors, "reaction_torque": (1.0,), "added_drag": NONE}
+    own |= {"efficiency": (1.0,) * vehicle.rotors, "reaction_torque": (1.0,), "added_drag": NONE, "wind": NONE}
     return own | {name: tuple(np.ravel(getattr(terms, name)).tolist()) for name in SIGNED}
 
 
@@ -91,5 +95,6 @@ def units_of(vehicle: Vehicle) -> dict[str, float]:
     weight = vehicle.mass * vehicle.gravity
     arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / vehicle.rotors
     forces = {"drag": weight / SPEED, "aerodynamic_moment": weight * arm / SPEED, "rate_damping": weight * arm / RATE}
+    forces["translational_lift"] = weight / FAST**2
     places = {"centre_of_mass": arm, "cable_pull": 1 / arm}
-    return forces | places | dict.fromkeys(("torque_gain", "velocity_gain", "velocity_lag", "added_drag"), 1.0)
+    return forces | places | dict.fromkeys((*CORRECTIONS, "torque_gain", "velocity_gain", "velocity_lag"), 1.0)

@@ -22,7 +22,7 @@ def body(drag, vehicle=hj.IRIS):
 SOURCE = body(0.5)  # one for all tests: its constants are part of the programs
 
 
-def flown(seed, size, noise=1.0, count=100, steps=10, force=None, drag=1.0, vehicle=hj.IRIS):
+def flown(seed, size, noise=1.0, count=100, steps=10, force=None, drag=1.0, vehicle=hj.IRIS, truth=None):
     """Windows of hover, of a `size` from 0 to 1, about 1 m/s; every measured state has its own noise."""
     rng = np.random.default_rng(seed)
     x0 = np.zeros((count, 13))
@@ -32,7 +32,7 @@ def flown(seed, size, noise=1.0, count=100, steps=10, force=None, drag=1.0, vehi
     x0[:, 7:10], x0[:, 10:13] = 2 * size * rng.normal(size=(count, 3)), 1.2 * size * rng.normal(size=(count, 3))
     shakes = 0.12 * rng.normal(size=(count, 1, 4)) + 0.05 * rng.normal(size=(count, steps, 4))
     u = (hj.IRIS.hover_speed * (1 + size * shakes)).astype(np.float32)
-    truth = body(drag, vehicle)
+    truth = truth or body(drag, vehicle)
     truth = truth if force is None else hj.Hybrid(truth, ConstantDisturbance(jnp.array([force, *[0.0] * 5])))
     x = np.asarray(hj.rollout_batch(truth, x0.astype(np.float32), u, 0.01))
     x0, x = (a + noise * NOISE * rng.normal(size=a.shape) for a in (x0, x))
@@ -84,6 +84,15 @@ def test_other_propellers_are_found_by_their_reaction_torque():
     found = hj.adapt(SOURCE, flown(0, 1.0, drag=0.5, vehicle=other))
     assert found.chosen == "reaction_torque"
     np.testing.assert_allclose(found.parameters["reaction_torque"].value, 1.6, rtol=0.03)
+
+
+def test_a_wind_is_found_by_drag_and_lift():
+    terms, wind = Terms(drag=(0.5, 0.4, 0.2), translational_lift=0.05), [3.0, -2.0, 0.3]
+    windy = hj.RigidBody({"wind": jnp.array(wind)}, hj.IRIS, terms)
+    found = hj.adapt(hj.rigid_body(hj.IRIS, terms=terms), flown(0, 1.0, truth=windy))
+    assert found.chosen == "wind"
+    assert "new physical parameters, a steady horizontal wind and an updraft" in found.report()
+    np.testing.assert_allclose([found.parameters[f"wind[{i}]"].value for i in range(3)], wind, atol=0.3)
 
 
 @pytest.mark.slow

@@ -12,11 +12,13 @@ import hybrid_jax as hj
 from experiments.flying.changes import DOUBLED_DRAG, LOADED, WEAK_ROTOR, loaded
 from hybrid_jax.dynamics.disturbance import with_disturbance, without_zeros
 from hybrid_jax.dynamics.rigid_body import corrected, hold_corrections, uncorrected
+from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.sim.domain import SOURCE
 
+KNOWN = Terms(drag=(0.3, 0.2, 0.1))
 BODY = hj.rigid_body(hj.IRIS)
 U = jnp.array([640.0, 660.0, 650.0, 630.0])
 
@@ -73,6 +75,19 @@ def test_it_can_be_what_the_simulator_flies(domain, efficiency, drag):
         x, u = moving().astype(float), U.astype(float)
         after = domain.quadrotor().step(x, u, jnp.zeros(()), 1e-4)
         np.testing.assert_allclose((after - x)[7:] / 1e-4, field(x, u)[7:], rtol=2e-3, atol=2e-3)
+
+
+def test_in_a_wind_the_accelerations_are_those_at_the_velocity_through_the_air():
+    names, wind = ("drag", "aerodynamic_moment", "translational_lift"), jnp.array([2.0, -3.0, 0.5])
+    deviations = {name: 0.01 * (1 + leaf) for name, leaf in hj.rigid_body(hj.IRIS, names).deviations.items()}
+    body, x = hj.RigidBody(deviations, hj.IRIS), moving()
+    windy = hj.RigidBody(deviations | {"wind": wind, "added_drag": jnp.full(3, 0.2)}, hj.IRIS)
+    still = hj.RigidBody(deviations | {"added_drag": jnp.full(3, 0.2)}, hj.IRIS)
+    np.testing.assert_allclose(windy(x, U)[3:], still(x.at[7:10].add(-wind), U)[3:], rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(windy(x, U)[:3], x[7:10])
+    assert jnp.abs(windy(x, U) - still(x, U))[7:].min() > 1e-3
+    has_wind = ["wind" in corrected(each).deviations for each in (body, hj.rigid_body(hj.IRIS, (), KNOWN), BODY)]
+    assert has_wind == [True, True, False]  # nothing tells of the air around a body without aerodynamics
 
 
 def test_a_load_moves_the_centre_of_mass_and_adds_to_the_inertia():

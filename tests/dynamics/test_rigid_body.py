@@ -21,7 +21,7 @@ ALL = tuple(name for name in SHAPES if name not in ("mass", "k"))
 KNOWN = Terms(
     torque_gain=(0.9, 1.1, 0.8), centre_of_mass=(0.01, -0.02), drag=(0.3, 0.4, 0.1), cable_pull=(4.0, 3.0),
     aerodynamic_moment=((0.0, -0.02, 0.0), (0.03, 0.0, 0.01), (0.0, 0.005, 0.0)), rate_damping=(0.02, 0.03, 0.01),
-    velocity_gain=(0.95, 0.9, 1.02), velocity_lag=0.2,
+    velocity_gain=(0.95, 0.9, 1.02), velocity_lag=0.2, translational_lift=0.03,
 )  # fmt: skip
 
 
@@ -51,6 +51,7 @@ def newton_euler(x, u, vehicle, terms, k):
     attitude = np.eye(3) + 2 * w * skew + 2 * skew @ skew
     velocity, rates = attitude.T @ x[VELOCITY], x[BODY_RATES]
     force, torque = -np.diag(terms.drag) @ velocity, np.zeros(3)
+    force[2] += terms.translational_lift * (velocity[0] ** 2 + velocity[1] ** 2)
     for place, sign, speed, one in zip(vehicle.rotor_positions, vehicle.spin, u, k, strict=True):
         lift = np.array([0, 0, one * speed**2])
         force = force + lift

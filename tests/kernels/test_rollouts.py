@@ -49,7 +49,9 @@ FIELDS = {
     "no input, a number of units that fills no vector": lambda: network(5, 0, hidden=9, activation="tanh"),
     "a force and a torque": lambda: Hybrid(RigidBody(THETA, HEXACOPTER, wrench=True), network(13, 6)),
     "a vehicle's terms": lambda: Hybrid(
-        rigid_body(ODD, ("Ix", "k_rotors", "drag", "centre_of_mass"), Terms(drag=(0.3, 0.2, 0.1))),
+        rigid_body(
+            ODD, ("Ix", "k_rotors", "drag", "centre_of_mass"), Terms(drag=(0.3, 0.2, 0.1), translational_lift=0.1)
+        ),
         network(13, 4, norm="none", activation="tanh"),
     ),
     "a skip around a norm": lambda: Hybrid(BODY, LinearSkip(jnp.ones((13, 17)) / 10, network(13, 4))),
