@@ -21,7 +21,8 @@ def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parame
 
     Sources with different seeds differ in what their networks absorbed. The variance between them replaces the bound
     that a single result has, as in multiple imputation (Rubin, Multiple Imputation for Nonresponse in Surveys, 1987,
-    Sec. 3.1).
+    Sec. 3.1). It does not show what all networks absorbed alike, for example a drag that physics lacks: a parameter
+    that most results call effective remains so, without an interval.
 
     Args:
         results: adaptations of sources that were trained with different seeds, all to the same windows.
@@ -43,8 +44,11 @@ def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parame
     for name in (name for name in results[0].parameters if all(name in own for own in fitted)):
         values, variances, degrees = np.array([own[name] for own in estimates]).T
         centre, away = combined(values, variances, level, min(degrees))
+        value, unit = _at(results[0], name, centre), results[0].parameters[name].unit
         low, high = sorted(_at(results[0], name, end) for end in (centre - away, centre + away))
-        found[name] = Parameter(_at(results[0], name, centre), low, high, results[0].parameters[name].unit)
+        reasons = [why for each in results if (why := each.parameters[name].effective)]
+        most = 2 * len(reasons) > len(results)
+        found[name] = Parameter(value, unit=unit, effective=reasons[0]) if most else Parameter(value, low, high, unit)
     return found
 
 

@@ -10,6 +10,7 @@ from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation.pooling import combined, satterthwaite
+from hybrid_jax.adaptation.results import Parameter
 
 
 def test_the_interval_holds_errors_within_and_between_sources():
@@ -33,6 +34,10 @@ def test_sources_that_differ_widen_the_interval():
     bounded = [replace(each, covariance=4 * each.covariance, absorbed=3 * np.diag(each.covariance)) for each in results]
     assert hj.pool([replace(each, degrees=16 * each.degrees) for each in bounded])["log_length"] == pooled
     assert pooled.value == pytest.approx(np.mean([each.parameters["log_length"].value for each in results]), abs=1e-5)
+    effective = [{"log_length": replace(each.parameters["log_length"], effective="why")} for each in results]
+    most = [replace(each, parameters=own) for each, own in zip(results[:2], effective, strict=False)]
+    assert hj.pool([*most, results[2]])["log_length"] == Parameter(pooled.value, effective="why")
+    assert hj.pool([most[0], *results[1:]])["log_length"] == pooled
 
 
 class Bias(hj.AbstractVectorField):
