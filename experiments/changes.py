@@ -13,12 +13,11 @@ from jaxtyping import Array
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from experiments.flying.changes import CHANGES
 from experiments.paper import study
 from experiments.paper.conditions import settings
-from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, OneFlight, preset_like
-from experiments.paper.regret import CLAIMS, ERRORS, conclusion, error_figure, error_table, regret_table
-from experiments.paper.study import EVERY, flown, pretrained, source_splits, target_splits, windows_of
+from experiments.paper.config import CHANGED, ONE_FLIGHT, QUICK, SMOKE, OneFlight, preset_like
+from experiments.paper.regret import CLAIMS, ERRORS, TAGS, conclusion, error_figure, error_tables, regret_table
+from experiments.paper.study import EVERY, target_splits, windows_of
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import FINE_TUNED, HYBRID
@@ -28,6 +27,8 @@ from experiments.runner import command
 from experiments.runner.cache import identity_of
 from experiments.runner.options import Named, distinct
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
+from experiments.worlds.flights import WORLDS, dataset, sources
+from experiments.worlds.world import World
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate
 from hybrid_jax.adaptation.expectation import errors_at_ends, expected_errors
@@ -39,10 +40,9 @@ from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.metrics import window_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
-from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS, STATE_SIZE
+from hybrid_jax.vehicle import STATE_SIZE
 
 NAME = "changes"
 INSIDE = "expected_inside"  # column: see `_share_inside`
@@ -52,9 +52,10 @@ METHOD, OFFSET = Auto(), 0.3
 L2_SP = FineTune(l2_sp=1e-2)
 HEAD = """\
 A hybrid that was trained on source flight adapts to a changed vehicle with the first N windows of 0.1 s of **one**
-flight and nothing else. `hj.adapt` takes one of several candidates, or keeps the source model. Regret: the test error
-of the candidate that it took over the error of the best one in hindsight. ρ: the share of the source's test error that
-adaptation removes. Test error: L^T_MSE over 1 s of other flights.
+flight and nothing else: in our simulator, and in RotorPy, which others wrote. `hj.adapt` takes one of several
+candidates, or keeps the source model. Regret: the test error of the candidate that it took over the error of the best
+one in hindsight. ρ: the share of the source's test error that adaptation removes. Test error: L^T_MSE over 1 s of other
+flights.
 
 - **source**: not adapted. **theta**: Ix, Iy and k by least squares
 - **force**, **torque**, **drag**, **efficiency**, and several of these: fitted with Ix, Iy, k; efficiency is one for
@@ -84,27 +85,33 @@ PRESETS = {
     "paper": ChangesConfig(),
     "quick": preset_like(ChangesConfig, replace(QUICK, **ONE_FLIGHT, draws=4)),
     "smoke": preset_like(
-        ChangesConfig, replace(SMOKE, **ONE_FLIGHT), sizes=(20,), changes=("external_force",), compared=("fine_tune",)
+        ChangesConfig,
+        replace(SMOKE, **ONE_FLIGHT),
+        sizes=(20,),
+        worlds=("hummingbird",),
+        changes=("external_force",),
+        compared=("fine_tune",),
     ),
 }
 
 
 def experiment(config: ChangesConfig, console: Console) -> None:
     stages = stages_of(config, console)
-    source = flown(SOURCE, source_splits(config), config, stages)
-    fields = pretrained(HYBRID, IRIS, config, stages, source).fields
-    chosen = [domain for domain in CHANGES if domain.name in config.changes]
-    rows = Results(
-        [row for domain in chosen for row in adapted(domain, fields, source.splits["train"], config, stages)],
-        ("domain", "candidate", "draw", "seed"),
-    )
-    stages.publish(NAME, config, rows, report)
+    rows = [row for name in config.worlds for row in of_world(WORLDS[name], config, stages)]
+    stages.publish(NAME, config, Results(rows, TAGS), report)
+
+
+def of_world(world: World, config: ChangesConfig, stages: Stages) -> list[Row]:
+    fields, learned_from = sources(world, config, stages)
+    chosen = [change for change in CHANGED if change in config.changes]
+    rows = [row for change in chosen for row in adapted(world, change, fields, learned_from, config, stages)]
+    return [{"world": world.name, **row} for row in rows]
 
 
 def report(record: Mapping[str, Any]) -> Report:
     rows = rows_in(record)
     verdicts = evaluate_claims(CLAIMS, rows)
-    tables = [verdict_table(verdicts, "Hypotheses"), regret_table(rows), error_table(rows)]
+    tables = [verdict_table(verdicts, "Hypotheses"), regret_table(rows), *error_tables(rows)]
     return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
 
 
@@ -114,10 +121,15 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
 
 
 def adapted(
-    domain: Domain, fields: AbstractVectorField, learned_from: Trajectories, config: ChangesConfig, stages: Stages
+    world: World,
+    change: str,
+    fields: AbstractVectorField,
+    learned_from: Trajectories,
+    config: ChangesConfig,
+    stages: Stages,
 ) -> list[Row]:
-    """Return the rows of a domain: every candidate, and the methods to compare with, for every draw and seed."""
-    target = flown(domain, target_splits(config), config, stages)
+    """Return the rows of a change: every candidate, and the methods to compare with, for every draw and seed."""
+    target = dataset(world, change, target_splits(config), config, stages)
     pool, test, drawn = target.splits["train"], target.splits["test"], windows_of(METHOD, config.sizes[0], config)[0]
 
     flights, seeds = pool[drawn[:: config.seeds]], range(config.seeds)
@@ -129,15 +141,15 @@ def adapted(
 
         def row(seed: int, i: int) -> Row:
             taken = bool(found.taken[seed] == i)
-            tags = {"domain": domain.name, "candidate": found.names[i], "draw": draw, "seed": seed, "taken": taken}
+            tags = {"domain": change, "candidate": found.names[i], "draw": draw, "seed": seed, "taken": taken}
             numbers = dict(zip(ERRORS, found.errors[seed, i], strict=True))
             return tags | numbers | {"probability": found.probability[seed, i], INSIDE: inside[seed] if taken else None}
 
         return [row(seed, i) for seed in seeds for i in range(len(found.names))], {}
 
     jobs = {f"flight {draw}": partial(of_draw, draw) for draw in range(config.draws)}
-    found = stages.kept(f"adapt {domain.name}", jobs, identity_of(config.described(), fields, target))
-    return rows_of(found) + compared(fields, config, stages, target)
+    found = stages.kept(f"adapt {target.config['domain']}", jobs, identity_of(config.described(), fields, target))
+    return rows_of(found) + [{"domain": change, **row} for row in compared(fields, config, stages, target)]
 
 
 def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages, target: Dataset) -> list[Row]:
@@ -151,7 +163,7 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
     rows = []
     for name in config.compared:
         errors = np.asarray(_errors(fits[name]().fields, target.splits["test"], settings(config)), float)
-        tags = {"domain": target.config["domain"], "candidate": name, "probability": None, "taken": False}
+        tags = {"candidate": name, "probability": None, "taken": False}
         for i, own in enumerate(errors.tolist()):
             case = {"draw": i // config.seeds, "seed": i % config.seeds}
             rows.append(tags | {INSIDE: None} | case | dict(zip(ERRORS, own, strict=True)))

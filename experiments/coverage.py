@@ -3,22 +3,21 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 
 import hybrid_jax as hj
-from experiments.flying.changes import CHANGES
-from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
-from experiments.paper.known_body import coverage, known_body_table
-from experiments.paper.study import flown, pretrained, source_splits, target_splits, windows_of
+from experiments.paper.config import CHANGED, ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
+from experiments.paper.study import target_splits, windows_of
 from experiments.reporting import names
 from experiments.reporting.claims import Claim, Part, Undecided, all_of, verdict_table
 from experiments.reporting.claims import evaluate as evaluate_claims
-from experiments.reporting.names import HYBRID
 from experiments.reporting.plots import METHODS as COLOURS
 from experiments.reporting.plots import STYLE, legend_below, name_lines, note, subplots
 from experiments.reporting.report import Report, rows_in
@@ -28,16 +27,15 @@ from experiments.runner import command
 from experiments.runner.cache import identity_of
 from experiments.runner.options import Count
 from experiments.runner.stages import Found, Stages, rows_of, stages_of
+from experiments.worlds.flights import WORLDS, dataset, sources
+from experiments.worlds.world import World
 from hybrid_jax.adaptation.adapting import METHODS
 from hybrid_jax.adaptation.pooling import SOURCES
 from hybrid_jax.adaptation.results import Parameter
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
-from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS
 
 NAME = "coverage"
 LEVEL, ASKED, MOST = 0.95, 0.9, 0.99  # of the intervals, and the least and largest share that may hold the truth
@@ -46,9 +44,9 @@ RIGHT: tuple[Change, ...] = ("parameter_shift", "external_force", "doubled_drag"
 HEAD = """\
 Hybrids that were trained on source flight, with different seeds, adapt to the same N windows of one flight by
 `hj.adapt`, and `hj.pool` pools the interval of each of θ_p over the sources. Coverage: the share of flights whose
-pooled 95 % interval contains the truth. A parameter that was not fitted has no interval and does not count; where
-rotors lost thrust, their efficiencies take the place of k. One source: the share of intervals that are not pooled, of
-parameters that are not called effective.
+pooled 95 % interval contains the truth. A parameter that was not fitted, or that most sources call effective, has no
+interval and does not count; where rotors lost thrust, their efficiencies take the place of k. One source: the share of
+intervals that are not pooled, of parameters that are not called effective.
 """
 
 
@@ -64,8 +62,6 @@ class CoverageConfig(OneFlight):
     """Also adapt to the same flights without noise."""
     changes: tuple[Change, ...] = RIGHT
     """Changes of the vehicle; by default all that keep its mass."""
-    repeats: Count = 100
-    """Recordings of a known rigid body, each with its own fit."""
 
     def __post_init__(self):
         OneFlight.__post_init__(self)
@@ -76,62 +72,65 @@ class CoverageConfig(OneFlight):
 SHORT: dict[str, Any] = ONE_FLIGHT | {"seeds": SOURCES}
 PRESETS = {
     "paper": CoverageConfig(),
-    "quick": preset_like(CoverageConfig, replace(QUICK, **SHORT, draws=20), repeats=20),
+    "quick": preset_like(CoverageConfig, replace(QUICK, **SHORT, draws=20)),
     "smoke": preset_like(
-        CoverageConfig, replace(SMOKE, **SHORT), sizes=(20,), changes=("parameter_shift",), clean=False,
-        repeats=4,
+        CoverageConfig, replace(SMOKE, **SHORT), sizes=(20,), worlds=("hummingbird",), changes=("parameter_shift",),
+        clean=False,
     ),
 }  # fmt: skip
 
 
 def experiment(config: CoverageConfig, console: Console) -> None:
     stages = stages_of(config, console)
-    source = flown(SOURCE, source_splits(config), config, stages)
-    fields = pretrained(HYBRID, IRIS, config, stages, source).fields
+    rows = [row for name in config.worlds for row in of_world(WORLDS[name], config, stages)]
+    tags = ("world", "domain", "noise", "draw", "parameter")
+    stages.publish(NAME, config, Results(rows, tags), report)
+
+
+def of_world(world: World, config: CoverageConfig, stages: Stages) -> list[Row]:
+    fields, learned_from = sources(world, config, stages)
     levels = {0.0: "none"} if config.clean and config.noise else {}
     levels |= {config.noise: f"{config.noise:g}" if config.noise else "none"}
-    rows = Results(
-        [
-            {**row, "noise": label}
-            for domain in CHANGES
-            if domain.name in config.changes
-            for noise, label in levels.items()
-            for row in adapted(domain, fields, source.splits["train"], replace(config, noise=noise), stages)
-        ],
-        ("domain", "noise", "draw", "parameter"),
-    )
-    if not hosts.is_main_process():
-        return
-    known = stages.timed("known body", lambda: coverage(config.repeats, console))
-    stages.publish(NAME, config, rows, report, known_body=known.rows)
+    return [
+        {"world": world.name, **row, "noise": label}
+        for change in CHANGED
+        if change in config.changes
+        for noise, label in levels.items()
+        for row in adapted(world, change, fields, learned_from, replace(config, noise=noise), stages)
+    ]
 
 
 def report(record: Mapping[str, Any]) -> Report:
-    rows, known = rows_in(record), Results(record["known_body"], ("case", "noise_on", "parameter"))
+    rows = rows_in(record)
     verdicts = evaluate_claims(CLAIMS, rows)
-    tables = [verdict_table(verdicts, "Hypotheses"), worst_table(rows), pooled_table(rows), known_body_table(known)]
+    tables = [verdict_table(verdicts, "Hypotheses"), worst_table(rows), pooled_table(rows)]
     return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
 
 
 def adapted(
-    domain: Domain, fields: AbstractVectorField, learned_from: Trajectories, config: CoverageConfig, stages: Stages
+    world: World,
+    change: str,
+    fields: AbstractVectorField,
+    learned_from: Trajectories,
+    config: CoverageConfig,
+    stages: Stages,
 ) -> list[Row]:
     """Return a row for each flight and parameter: whether pooled and single intervals contain the true value."""
     splits = {"train": target_splits(config)["train"]}
-    flights = flown(domain, splits, config, stages)
+    flights = dataset(world, change, splits, config, stages)
     pool = flights.splits["train"]
-    drawn, truth = windows_of(METHODS["auto"], config.sizes[0], config)[0], nominal(domain.vehicle)
+    drawn, truth = windows_of(METHODS["auto"], config.sizes[0], config)[0], nominal(world.changed(change))
 
     def of_draw(draw: int) -> Found:
         windows = pool[drawn[draw * config.seeds]]  # the same for all sources
         results = [hj.adapt(lane(fields, seed), windows, learned_from=learned_from) for seed in range(config.seeds)]
         pooled = hj.pool(results) if all(each.covariance is not None for each in results) else {}
-        tags: dict[str, Any] = {"domain": domain.name, "draw": draw}
+        tags: dict[str, Any] = {"domain": change, "draw": draw}
         own = {name: [each.parameters[name] for each in results] for name in LEARNED}
         rows = [tags | {"parameter": name} | _compared(pooled.get(name), own[name], truth[name]) for name in LEARNED]
         return rows, {}
 
-    name = f"intervals {domain.name}, noise {config.noise:g}"
+    name = f"intervals {flights.config['domain']}, noise {config.noise:g}"
     jobs = {f"flight {draw}": partial(of_draw, draw) for draw in range(config.draws)}
     return rows_of(stages.kept(name, jobs, identity_of(config.described(), fields, flights)))
 
@@ -142,8 +141,9 @@ def _compared(pooled: Parameter | None, own: Sequence[Parameter], true: float) -
     if pooled is None:
         return dict.fromkeys(columns)
     alone = [one.low <= true <= one.high for one in own if one.has_interval]
-    half = 100 * (pooled.high - pooled.low) / (2 * true)
-    numbers = bool(pooled.low <= true <= pooled.high), 100 * (pooled.value / true - 1), half
+    inside, half = bool(pooled.low <= true <= pooled.high), 100 * (pooled.high - pooled.low) / (2 * true)
+    inside, half = (inside, half) if pooled.has_interval else (None, None)
+    numbers = inside, 100 * (pooled.value / true - 1), half
     effective = sum(one.effective is not None for one in own)
     return dict(zip(columns, (*numbers, float(np.mean(alone)) if alone else None, effective), strict=True))
 
@@ -151,13 +151,13 @@ def _compared(pooled: Parameter | None, own: Sequence[Parameter], true: float) -
 def worst_table(rows: Results) -> Table:
     """Return a line for each change: of its parameters and noises, the one whose intervals are right least often."""
     lines = []
-    for change, group in rows.where(lambda row: row["inside"] is not None).group("domain").items():
+    for (world, change), group in rows.where(lambda row: row["inside"] is not None).group("world", "domain").items():
         case, own = min(_cases(group).items(), key=lambda case: np.mean(case[1]["inside"]))
-        name, _, noise = case.split(", ")
+        *_, name, noise = case.split(", ")
         shares = (percentage(own, column) for column in ("inside", "alone"))
         wide = f"{np.median(own.numbers('half_width')):.2f}"
-        lines.append((names.label(change), f"{name}, {noise}", str(len(own)), *shares, wide))
-    header = ("change", "lowest for", "flights", "coverage [%]", "one source [%]", "half-width [%], median")
+        lines.append((names.label(world), names.label(change), f"{name}, {noise}", str(len(own)), *shares, wide))
+    header = ("world", "change", "lowest for", "flights", "coverage [%]", "one source [%]", "half-width [%], median")
     return Table(f"Lowest coverage of pooled 95 % intervals of {SOURCES} sources or more", header, lines)
 
 
@@ -183,7 +183,9 @@ def pooled_table(rows: Results) -> Table:
         "half-width [%], median": text("half_width", ".2f", np.median),
     }
     title = f"Do pooled 95 % intervals of {SOURCES} sources or more contain the truth?"
-    return tabulate(title, rows.group("domain", "noise", "parameter"), columns, ("change", "noise", "θ_p"))
+    return tabulate(
+        title, rows.group("world", "domain", "noise", "parameter"), columns, ("world", "change", "noise", "θ_p")
+    )
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
@@ -194,48 +196,59 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
 
 @mpl.rc_context(STYLE)
 def coverage_figure(rows: Results) -> Figure:
-    """Draw the share of pooled and single-source intervals that contain the truth, a panel for each noise."""
+    """Draw the share of intervals that contain the truth, a panel for each world and noise."""
     fitted = rows.where(lambda row: row["inside"] is not None)
-    noises, changes = fitted.unique("noise"), fitted.unique("domain")
-    figure, (panels,) = subplots(1.5 + 0.52 * len(changes), 1, len(noises), sharey=True)
+    worlds, noises, changes = (fitted.unique(column) for column in ("world", "noise", "domain"))
+    figure, panels = subplots(
+        1.5 + 0.52 * len(worlds) * len(changes), len(worlds), len(noises), sharex=True, sharey=True
+    )
+    for (world, noise), axes in zip(product(worlds, noises), panels.flat, strict=True):
+        _draw_shares(axes, fitted.where(world=world, noise=noise), changes)
+        name_lines(axes, [*map(names.label, changes)])
+        axes.set_title(f"{names.label(str(world))},\n{'without noise' if noise == 'none' else 'with sensor noise'}")
+    for axes in panels[-1]:
+        axes.set_xlabel("intervals that contain\nthe true value [%]")
+    meaning = "Ix, Iy: moments of inertia; k: thrust coefficient"
+    return legend_below(figure, "Do 95 % intervals contain the true value?", meaning)
+
+
+def _draw_shares(axes: Axes, rows: Results, changes: list) -> None:
     kinds = {
         "alone": ("one source", COLOURS["fine-tuned"], "s"),
         "inside": ("three sources, pooled", COLOURS["adapted"], "o"),
     }
-    for axes, noise in zip(panels, noises, strict=True):
-        axes.axvline(100 * LEVEL, color="0.4", linestyle=":", label="nominal 95 %")
-        for (domain, parameter), own in fitted.where(noise=noise).group("domain", "parameter").items():
-            y = changes.index(domain) + 0.22 * (LEARNED.index(parameter) - 1)
-            shares = {column: float(share) for column in kinds if (share := percentage(own, column)) != EMPTY}
-            axes.plot([*shares.values()], [y] * len(shares), color="0.8", zorder=1)
-            for column, share in shares.items():
-                label, colour, marker = kinds[column]
-                axes.plot(share, y, marker, ms=4, color=colour, label=label, clip_on=False)
-            edge = {"xycoords": axes.get_yaxis_transform()}
-            note(axes, parameter, (0.0, y), (3, 0), va="center", color="0.4", **edge)
-        axes.set(title="without noise" if noise == "none" else "with sensor noise")
-        axes.set_xlim(min(80.0, axes.get_xlim()[0]), 100.5)
-        axes.set_xlabel("intervals that contain\nthe true value [%]")
-        name_lines(axes, [*map(names.label, changes)])
-    meaning = "Ix, Iy: moments of inertia; k: thrust coefficient"
-    return legend_below(figure, "Do 95 % intervals contain the true value?", meaning)
+    axes.axvline(100 * LEVEL, color="0.4", linestyle=":", label="nominal 95 %")
+    for (domain, parameter), own in rows.group("domain", "parameter").items():
+        y = changes.index(domain) + 0.22 * (LEARNED.index(parameter) - 1)
+        shares = {column: float(share) for column in kinds if (share := percentage(own, column)) != EMPTY}
+        axes.plot([*shares.values()], [y] * len(shares), color="0.8", zorder=1)
+        for column, share in shares.items():
+            label, colour, marker = kinds[column]
+            axes.plot(share, y, marker, ms=4, color=colour, label=label, clip_on=False)
+        edge = {"xycoords": axes.get_yaxis_transform()}
+        note(axes, parameter, (0.0, y), (3, 0), va="center", color="0.4", **edge)
+    axes.set_xlim(min(80.0, axes.get_xlim()[0]), 100.5)
 
 
 def conclusion(rows: Results) -> list[str]:
     fitted = rows.where(lambda row: row["inside"] is not None)
     if not len(fitted):
         return ["No parameter was fitted, so there are no intervals."]
-    shares = {case: np.mean(own["inside"]) for case, own in _cases(fitted).items()}
-    worst = min(shares, key=shares.__getitem__)
+    cases = {case: np.mean(own["inside"]) for case, own in _cases(fitted).items()}
+    worst = min(cases, key=cases.__getitem__)
     trust = (
         "So they are not too narrow, after changes of these kinds."
-        if shares[worst] >= ASKED
+        if cases[worst] >= ASKED
         else "Where it is below that, something acts that no parameter stands for, and the interval does not show it."
     )
+    worlds = fitted.group("world").items()
+    pooled, alone = (
+        " and ".join(f"{percentage(own, column)}%{count.format(len(own), names.label(world))}" for world, own in worlds)
+        for column, count in (("inside", " of {} in the {}"), ("alone", ""))
+    )
     return [
-        f"Of {len(fitted)} pooled 95 % intervals {np.mean(fitted['inside']):.0%} contain the true value, "
-        f"of single sources {percentage(fitted, 'alone')}%.",
-        f"The fewest do for {worst}: {shares[worst]:.0%} (required: {ASKED:.0%}). {trust}",
+        f"Of the pooled 95 % intervals {pooled} contain the true value, of single sources' {alone}.",
+        f"The fewest do for {worst}: {cases[worst]:.0%} (required: {ASKED:.0%}). {trust}",
     ]
 
 
@@ -257,8 +270,8 @@ def _covers(rows: Results) -> Part:
 
 
 def _cases(rows: Results) -> dict[str, Results]:
-    """Return the rows of each parameter, change and noise by their names."""
-    groups = rows.group("parameter", "domain", "noise").items()
+    """Return the rows of each parameter and noise, after each change in each world, by their names."""
+    groups = rows.group("world", "domain", "parameter", "noise").items()
     return {f"{names.label(*of)}, {'no noise' if noise == 'none' else 'noise'}": own for (*of, noise), own in groups}
 
 

@@ -60,7 +60,7 @@ def test_its_links_lead_somewhere(page):
 
 def test_its_table_is_that_of_the_reports():
     lines = [[cell.strip(" *") for cell in line.split("|")[2:-1]] for line in README.splitlines() if line[:2] == "| "]
-    ways, changes = ("source", "fine_tune", AUTO), committed("changes").group("domain")
+    ways, changes = ("source", "fine_tune", AUTO), committed("changes").where(world="iris").group("domain")
     flight = {domain: [of_each_case(own, way).mean() for way in ways] for domain, own in changes.items()}
     paper, expected = (("hybrid", "source_only"), ("hybrid", "fine_tuned"), ("constant_disturbance", "fine_tuned")), []
     for name, domain in (("param_shift", "parameter_shift"), ("external_force", "external_force")):

@@ -1,7 +1,6 @@
-"""Prediction models of the Iris, estimators that adapt them in the air, and the truth after each change."""
+"""Prediction models of a vehicle, estimators that adapt them in the air, and the truth after each change."""
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -10,36 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from experiments.flying.changes import DOUBLED_DRAG, LOST_THRUST, OFF_CENTRE_LOAD, WEAK_ROTOR, weak_rotor
 from experiments.flying.plant import wind_force
+from experiments.online.worlds import body_of
 from hybrid_jax.control import Hardware, Observer, advance
 from hybrid_jax.control.observer import MOTION
 from hybrid_jax.dynamics import ConstantDisturbance, Hybrid, with_disturbance
 from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, ravel_learned
-from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
+from hybrid_jax.dynamics.rigid_body import RigidBody, corrected, rigid_body
 from hybrid_jax.dynamics.terms import Terms, units_of
 from hybrid_jax.online import Hypothesis, OnlineAdaptation
 from hybrid_jax.rotation import body_z
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.forces import DRAG_COEFFICIENT
 from hybrid_jax.vehicle import IRIS, QUATERNION
 
-CHANGES: Mapping[str, Domain] = {
-    "parameter_shift": PARAMETER_SHIFT,
-    "off_centre_load": OFF_CENTRE_LOAD,
-    "external_force": EXTERNAL_FORCE,
-    "weak_rotor": WEAK_ROTOR,
-    "doubled_drag": DOUBLED_DRAG,
-    "nothing": SOURCE,
-}
-CHANGE_NAMES = {
-    "parameter_shift": "other inertia",
-    "off_centre_load": "load of 20 % off centre",
-    "external_force": "side wind",
-    "weak_rotor": "one rotor 15 % weaker",
-    "doubled_drag": "twice the drag",
-    "nothing": "no change",
-}
 AGENTS = {
     "unadapted": "not adapted",
     "observer": "disturbance observer",
@@ -54,44 +36,53 @@ NAMES = (  # of the entries of θ before the disturbance
     *(f"efficiency {i}" for i in range(4)),
 )
 PARTS = len(NAMES)
-# Logarithms of inertia and efficiency, 1 cm or so of the arm, and half the vehicle's own drag or more.
-PRIOR = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3, "centre_of_mass": 0.05, "efficiency": 0.2, "added_drag": 0.3}
-DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)  # m/s², rad/s²
-PROCESS = (0.0,) * 7 + (0.003,) * 3 + (0.005,) * 3  # m/s² and rad/s² of a white noise, √s
-INERTIA = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3}
-# One e-fold of mass, which the model does not have, is one less of all accelerations.
-MASS = {"efficiency": -1.0, "Ix": -1.0, "Iy": -1.0, "Iz": -1.0, "added_drag": -DRAG_COEFFICIENT / IRIS.mass}
-FORCES = ("disturbance[vx]", "disturbance[vy]", "disturbance[vz]")
-HYPOTHESES = (
-    Hypothesis("inertia", INERTIA),
-    Hypothesis("load", INERTIA | {"centre_of_mass": 0.05}, ({name: 0.2 * size for name, size in MASS.items()},)),
-    *(Hypothesis(f"rotor {i}", {f"efficiency[{i}]": 0.2}) for i in range(IRIS.rotors)),
-    Hypothesis("drag", {"added_drag": 0.3}),
-    Hypothesis("wind", dict.fromkeys(FORCES, 3.0), rates=dict.fromkeys(FORCES, 1.5), lead=0.1),
-)
+# Logarithms of inertia and efficiency, 1 cm or so of the Iris's arm; the same for all vehicles.
+PRIOR = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3, "centre_of_mass": 0.05, "efficiency": 0.2}
+DRAG = 0.3 / (DRAG_COEFFICIENT / IRIS.mass)  # of the vehicle's own drag
+ACCELERATION, TURNING = 3.0, 5.0  # m/s², rad/s²: of the Iris; about as large a share of weight and weight times arm
+INERTIA = {name: PRIOR[name] for name in ("Ix", "Iy", "Iz")}
 
 
-def nominal() -> AbstractVectorField:
-    """The Iris with drag and without ground effect; inertia, centre of mass, efficiencies and drag may change."""
-    body = rigid_body(IRIS, LEARNED, Terms(drag=(DRAG_COEFFICIENT, DRAG_COEFFICIENT, DRAG_COEFFICIENT)))
-    return corrected(body, ("efficiency", "added_drag"))
+def own_drag(world: str) -> Float[np.ndarray, "3"]:
+    """Return a vehicle's drag along its axes before a change [1/s]."""
+    return body_of(world).drag / body_of(world).vehicle.mass
 
 
-def true_theta(domain: Domain) -> Float[np.ndarray, " 12"]:
+def hypotheses(world: str) -> tuple[Hypothesis, ...]:
+    # One e-fold of mass, which the model does not have, is one less of all accelerations.
+    drag = {f"added_drag[{i}]": size for i, size in enumerate(own_drag(world).tolist())}
+    mass = dict.fromkeys(("efficiency", *INERTIA), -0.2) | {name: -0.2 * size for name, size in drag.items()}
+    forces = [f"disturbance[v{axis}]" for axis in "xyz"]
+    return (
+        Hypothesis("inertia", INERTIA),
+        Hypothesis("load", INERTIA | {"centre_of_mass": PRIOR["centre_of_mass"]}, (mass,)),
+        *(Hypothesis(f"rotor {i}", {f"efficiency[{i}]": PRIOR["efficiency"]}) for i in range(IRIS.rotors)),
+        Hypothesis("drag", {name: DRAG * size for name, size in drag.items()}),
+        Hypothesis("wind", dict.fromkeys(forces, ACCELERATION), rates=dict.fromkeys(forces, 1.5), lead=0.1),
+    )
+
+
+def nominal(world: str) -> RigidBody:
+    """The vehicle without ground effect; its inertia, centre of mass, efficiencies and drag may change."""
+    own = body_of(world)
+    drag, damping = tuple(own.drag.tolist()), tuple(own.damping.tolist())
+    body = rigid_body(own.vehicle, LEARNED, Terms(drag=drag, rate_damping=damping, translational_lift=own.lift))
+    return corrected(body, ("efficiency", "added_drag"))  # type: ignore  # a rigid body as well
+
+
+def true_theta(world: str, change: str) -> Float[np.ndarray, " 12"]:
     """Return `nominal`'s θ after a change; since its mass is fixed, another mass changes all other parameters."""
-    vehicle, share = domain.vehicle, IRIS.mass / domain.vehicle.mass
-    inertia = np.log(share * np.divide(vehicle.inertia, IRIS.inertia))
-    centre = np.subtract(IRIS.rotor_positions, vehicle.rotor_positions)[0] / units_of(IRIS)["centre_of_mass"]
-    efficiency = np.full(IRIS.rotors, math.log(share))
-    if weak_rotor in domain.forces:
-        efficiency[0] += math.log(1 - LOST_THRUST)
-    drag = np.full(3, domain.drag_coefficient / vehicle.mass - DRAG_COEFFICIENT / IRIS.mass)
-    return np.concatenate([inertia, drag, centre, efficiency])
+    before, (vehicle, drag, _, _, lost) = body_of(world).vehicle, body_of(world, change)
+    share = before.mass / vehicle.mass
+    inertia = np.log(share * np.divide(vehicle.inertia, before.inertia))
+    centre = np.subtract(before.rotor_positions, vehicle.rotor_positions)[0] / units_of(before)["centre_of_mass"]
+    efficiency = math.log(share) + np.log1p([-lost, *[0.0] * (before.rotors - 1)])
+    return np.concatenate([inertia, drag / vehicle.mass - own_drag(world), centre, efficiency])
 
 
-def with_theta(theta: Float[Array | np.ndarray, " 12"]) -> AbstractVectorField:
+def with_theta(world: str, theta: Float[Array | np.ndarray, " 12"]) -> AbstractVectorField:
     """Return `nominal` with other parameters, in the order of `true_theta`."""
-    return ravel_learned(nominal())[1](jnp.asarray(theta, float))
+    return ravel_learned(nominal(world))[1](jnp.asarray(theta, float))
 
 
 class FixedModel(AbstractEstimator):
@@ -118,7 +109,7 @@ class L1(AbstractEstimator):
     and Scaramuzza, "Performance, precision, and payloads: adaptive nonlinear MPC for quadrotors", 2021).
     """
 
-    field: AbstractVectorField
+    field: RigidBody
     gain: float = eqx.field(static=True)  # of the predictor [rad/s]
     cutoff: Float[Any, ""]  # of the filter [rad/s]
     period: float = eqx.field(static=True)
@@ -149,9 +140,10 @@ class L1(AbstractEstimator):
 
     def _added(self, u, accelerations):
         """Add these accelerations, along the thrust and about the three axes, to the speeds u."""
-        mixer = IRIS.mixer / np.array([IRIS.mass, *IRIS.inertia])[:, None]
+        vehicle = self.field.vehicle
+        mixer = vehicle.mixer / np.array([vehicle.mass, *vehicle.inertia])[:, None]
         squares = jnp.square(u) + jnp.asarray(np.linalg.inv(mixer), u.dtype) @ accelerations
-        return jnp.sqrt(jnp.clip(squares, 1.0, IRIS.max_rotor_speed**2))
+        return jnp.sqrt(jnp.clip(squares, 1.0, vehicle.max_rotor_speed**2))
 
 
 def fixed_model(
@@ -161,11 +153,15 @@ def fixed_model(
     return FixedModel(Observer(as_numpy(with_disturbance(field)), numbers[0], period), *numbers[1:])
 
 
-def online(hardware: Hardware, period: float) -> OnlineAdaptation:
-    sizes = np.maximum(hardware.sizes(), 1e-4)
-    return OnlineAdaptation(
-        nominal(), period, tuple(sizes.tolist()), PRIOR, DISTURBANCE, process=PROCESS, hypotheses=HYPOTHESES
-    )
+def online(world: str, hardware: Hardware, period: float) -> OnlineAdaptation:
+    # The angular acceleration of weight times arm, over that of the Iris.
+    own, iris = (units_of(each)["aerodynamic_moment"] / each.inertia[0] for each in (body_of(world).vehicle, IRIS))
+    sizes, turning = np.maximum(hardware.sizes(), 1e-4), own / iris
+    prior = PRIOR | {f"added_drag[{i}]": DRAG * size for i, size in enumerate(own_drag(world).tolist())}
+    disturbance = (ACCELERATION,) * 3 + (TURNING * turning,) * 3
+    process = (0.0,) * 7 + (0.003,) * 3 + (0.005 * turning,) * 3  # m/s² and rad/s² of a white noise, √s
+    options: Any = {"process": process, "hypotheses": hypotheses(world)}
+    return OnlineAdaptation(nominal(world), period, tuple(sizes.tolist()), prior, disturbance, **options)
 
 
 def as_numpy(tree):

@@ -5,8 +5,10 @@ from typing import Annotated, Literal, get_args
 
 from experiments.flying.scenario import Reference, hardware
 from experiments.runner.options import Named, NotNegative, Positive, Run, distinct
+from experiments.worlds.cases import WORLDS, WorldName
+from experiments.worlds.rotorpy import RotorPy
+from experiments.worlds.world import DT
 from hybrid_jax.control import Controller, Hardware
-from hybrid_jax.vehicle import IRIS
 
 Change = Literal["parameter_shift", "off_centre_load", "external_force", "weak_rotor", "doubled_drag", "nothing"]
 Agent = Literal["unadapted", "observer", "l1", "least_squares", "online", "oracle"]
@@ -16,6 +18,8 @@ Agent = Literal["unadapted", "observer", "l1", "least_squares", "online", "oracl
 class OnlineConfig(Run):
     """Change the simulated vehicle in the air, and fly every agent along every reference through every change."""
 
+    worlds: tuple[WorldName, ...] = get_args(WorldName)
+    """Simulated vehicles. iris: of the other experiments. hummingbird, crazyflie: of RotorPy."""
     seconds: Positive = 4.0
     """Length of a flight after the change [s]."""
     changes: tuple[Change, ...] = get_args(Change)
@@ -29,7 +33,7 @@ class OnlineConfig(Run):
     latency: NotNegative = 0.01
     """Latency from a sample to its command [s], a multiple of 0.01."""
     rotor_lag: NotNegative = 0.03
-    """Time constant of the rotors [s]."""
+    """Time constant of the Iris's rotors [s]; RotorPy's vehicles have their own."""
     bandwidth: Annotated[Positive, Named(name="observer-bandwidth")] = 8.0
     """Bandwidth of the disturbance observer [rad/s]."""
     l1_cutoff: Positive = 8.0
@@ -37,31 +41,33 @@ class OnlineConfig(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        for name in ("changes", "references", "agents"):
+        for name in ("worlds", "changes", "references", "agents"):
             distinct(f"--{name}", getattr(self, name))
         if self.seconds < 1.5:
             raise ValueError(f"--seconds must be at least 1.5, got {self.seconds}")
         if self.distributed:
             raise ValueError("--distributed: this experiment runs in one process")
-        self.hardware().delay(0.01)
+        self.hardware(self.worlds[0]).delay(0.01)
 
-    def hardware(self) -> Hardware:
-        return hardware(self.noise, self.latency, self.rotor_lag)
+    def hardware(self, world: str) -> Hardware:
+        own = WORLDS[world]
+        lag = own.nominal.lag if isinstance(own, RotorPy) else self.rotor_lag
+        return hardware(self.noise, self.latency, lag)
 
-    def controller(self) -> Controller:
-        return Controller(IRIS, rotor_lag=self.rotor_lag)
+    def controller(self, world: str) -> Controller:
+        return Controller(WORLDS[world].vehicle, rotor_lag=self.hardware(world).rotor_lag)
 
     @property
     def periods(self) -> int:
         """Periods of a flight before and after the change, equal since both run the same program."""
-        return round(self.seconds / self.controller().period)
+        return round(self.seconds / DT)
 
 
 PRESETS = {
     "paper": OnlineConfig(),
     "quick": OnlineConfig(preset="quick", seeds=2),
     "smoke": OnlineConfig(
-        preset="smoke", seeds=1, seconds=1.5, changes=("external_force", "nothing"), references=("hover",),
-        agents=("unadapted", "online", "oracle"),
+        preset="smoke", seeds=1, worlds=("hummingbird",), seconds=1.5, changes=("external_force", "nothing"),
+        references=("hover",), agents=("unadapted", "online", "oracle"),
     ),
 }  # fmt: skip

@@ -1,24 +1,26 @@
 """Rows, tables and claims of flights with a change in the air."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from experiments.flying.scenario import REFERENCES
-from experiments.online.agents import AGENTS, CHANGE_NAMES, CHANGES, NAMES, PARTS, true_theta
+from experiments.online.agents import AGENTS, NAMES, PARTS, true_theta
 from experiments.online.flights import Run
-from experiments.reporting.claims import Claim, Part, Undecided, all_of
+from experiments.reporting.claims import OUTCOMES, Claim, Part, Undecided, all_of, every
+from experiments.reporting.names import label
 from experiments.reporting.results import Results, Row
-from experiments.reporting.tables import EMPTY, Table, cross_table
+from experiments.reporting.tables import EMPTY, Cell, Table, cross_table, tabulate
 
 CRASH, RATE = 10.0, 100  # m from the reference; periods in a second
 SETTLED, LEARNED = 1.0, 3.0  # s after the change, from which errors and intervals are judged
 FACTOR, WORSE, COVERED = 1.2, 1.02, 0.9
 STEP_MS, MINUTES, FLIGHTS = 0.2, 5.0, 1440
 Z = 1.959964
-TAGS = ("change", "reference", "agent", "seed")
+BESIDE = "unadapted", "online", "oracle"
+TAGS = ("world", "change", "reference", "agent", "seed")
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ def results_of(run: Run) -> Results:
         row: dict[str, Any] = {**trial._asdict(), "crashed": crashed, "largest": float(np.max(error))}
         row |= {name: rms(part) for name, part in (("first_second", error[:RATE]), ("settled", error[RATE:]))}
         if trial.agent == "online":
-            row |= _intervals(run, i, trial.change)
+            row |= _intervals(run, i)
         rows.append(row)
     return Results(rows, TAGS)
 
@@ -47,11 +49,11 @@ def rms(values: Any) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _intervals(run: Run, i: int, change: str) -> Row:
+def _intervals(run: Run, i: int) -> Row:
     """Return the share of time from LEARNED on with the true value inside each interval; and when it alarmed."""
     late = slice(round(LEARNED * RATE), None)
     theta, std = run.after.theta[i][late, :PARTS], run.after.std[i][late, :PARTS]
-    inside = np.abs(theta - true_theta(CHANGES[change])) <= Z * std
+    inside = np.abs(theta - true_theta(run.trials[i].world, run.trials[i].change)) <= Z * std
     alarms = np.flatnonzero(np.diff(run.after.changes[i], prepend=run.after.changes[i][:1]))
     shares = inside.mean(axis=0) if len(theta) else np.full(PARTS, np.nan)
     first = float(alarms[0]) / RATE if len(alarms) else None
@@ -63,63 +65,80 @@ def error(name: str):
     return lambda row: np.inf if row["crashed"] or row[name] is None else 100 * row[name]
 
 
+def means_of(rows: Results) -> dict[tuple[str, str, str], float]:
+    """Return the mean error by world, change and agent [cm] from SETTLED on, infinite if a flight crashes."""
+    groups = rows.group("world", "change", "agent")
+    return {key: float(np.mean(own.numbers(error("settled")))) for key, own in groups.items()}
+
+
 def conclusion(rows: Results) -> list[str]:
-    means = {
-        key: np.mean(own.where(crashed=False).numbers(error("settled")))
-        for key, own in rows.where(agent=("online", "oracle")).group("change", "agent").items()
-    }
-    ratios = [means[change, "online"] / means[change, "oracle"] for change, agent in means if agent == "online"]
-    if not ratios or len(means) < 2 * len(ratios):
-        return []
-    span = f"{min(ratios):.2f} to {max(ratios):.2f} times"
-    who = "a controller that knows the change"
-    return [f"From {SETTLED:g} s after a change on, a controller that adapts flies {span} as far off as {who}."]
+    means, spans = means_of(rows), []
+    for world, own in rows.group("world").items():
+        if not {"online", "oracle"} <= {*own["agent"]}:
+            return []
+        ratios = [means[world, change, "online"] / means[world, change, "oracle"] for change in own.unique("change")]
+        spans.append(f"{min(ratios):.2f} to {max(ratios):.2f} times ({label(world)})".replace("inf", "∞"))
+    who = "as far off as a controller that knows the change"
+    return [f"From {SETTLED:g} s after a change on, a controller that adapts flies {', '.join(spans)} {who}."]
 
 
 def tables(rows: Results) -> list[Table]:
-    made = []
-    columns = {REFERENCES[name]: {"reference": name} for name in rows.unique("reference")}
-    for change, group in rows.group("change").items():
-        lines = {AGENTS[agent]: own for agent, own in group.group("agent").items()}
-        for title, name in ((f"from {SETTLED:g} s after it on", "settled"), ("in the first second", "first_second")):
+    def cell(own: Results) -> str:
+        if crashes := sum(own["crashed"]):
+            return f"{crashes} of {len(own)} crash"
+        settled, first = (np.mean(own.numbers(error(name))) for name in ("settled", "first_second"))
+        return f"{settled:.2f} ({first:.2f})"
 
-            def cell(own: Results, name=name) -> str:
-                crashes = sum(own["crashed"])
-                text = f"{np.mean(own.numbers(error(name))):.2f}" if not crashes else f"{crashes} of {len(own)} crash"
-                return text if len(own) else EMPTY
+    made, columns = [_beside(rows)], {REFERENCES[name]: {"reference": name} for name in rows.unique("reference")}
+    for (change, world), own in rows.group("change", "world").items():
+        lines = {words: found for agent, words in AGENTS.items() if (found := own.where(agent=agent))}
+        when = f"from {SETTLED:g} s after it on (in the first second; mean over seeds)"
+        made.append(cross_table(f"{label(world)}: position RMSE [cm], {label(change)}, {when}", lines, columns, cell))
+    online = rows.where(agent="online").group("world", "change")
+    return made + ([_found(online, columns), _coverage(online)] if online else [])
 
-            title = f"RMSE of the position [cm], {CHANGE_NAMES[change]}, {title} (mean over seeds; less is better)"
-            made.append(cross_table(title, lines, columns, cell))
-    return [*made, *_found(rows), *_coverage(rows)]
+
+def _beside(rows: Results) -> Table:
+    """Return a line for each change: the errors of three agents in each world."""
+    lines, worlds, means = [], rows.unique("world"), means_of(rows)
+    for change in rows.unique("change"):
+        found = ([means.get((world, change, agent)) for agent in BESIDE] for world in worlds)
+        cells = (" / ".join(EMPTY if n is None else f"{n:.2f}".replace("inf", "∞") for n in each) for each in found)
+        lines.append((label(change), *cells))
+    who = " / ".join(AGENTS[name] for name in BESIDE)
+    title = f"RMSE of the position [cm] from {SETTLED:g} s after a change on: {who} (mean; ∞: one crashes)"
+    return Table(title, ("change", *map(label, worlds)), lines)
 
 
-def _found(rows: Results) -> list[Table]:
-    lines = []
-    for change, group in rows.where(agent="online").group("change").items():
-        own = [CHANGE_NAMES[change]]
-        for reference in rows.unique("reference"):
-            flights = group.where(reference=reference)
-            times = [t for t in flights["first_alarm"] if t is not None]
-            own.append(f"{len(times)} of {len(flights)}" + (f", {1000 * np.median(times):.0f} ms" if times else ""))
-        lines.append(tuple(own))
-    header = ("change", *(REFERENCES[name] for name in rows.unique("reference")))
+def _found(online: Mapping[Any, Results], columns: Mapping[str, Mapping[str, str]]) -> Table:
+    def cell(own: Results) -> str:
+        times = [t for t in own["first_alarm"] if t is not None]
+        return f"{len(times)} of {len(own)}" + (f", {1000 * np.median(times):.0f} ms" if times else "")
+
     title = "Flights in which the filter found a change, and the median time until then"
-    return [Table(title, header, lines)] if lines else []
+    return cross_table(title, {label(*key): own for key, own in online.items()}, columns, cell, "world, change")
 
 
-def _coverage(rows: Results) -> list[Table]:
-    lines = []
-    for change, own in rows.where(agent="online").group("change").items():
-        inside = np.array([[row["inside"][name] for name in NAMES] for row in own], float).mean(axis=0)
-        lines.append((CHANGE_NAMES[change], *(f"{100 * share:.0f}" for share in inside)))
+def _coverage(online: Mapping[Any, Results]) -> Table:
+    share: dict[str, Cell] = {
+        name: lambda own, name=name: f"{100 * own.numbers(lambda row: row['inside'][name], np.nan).mean():.0f}"
+        for name in NAMES
+    }
     title = f"Share of 95 % intervals that contain the true value [%], from {LEARNED:g} s after the change on"
-    return [Table(title, ("change", *NAMES), lines)] if lines else []
+    return tabulate(title, online, share, ("world", "change"))
 
 
-def _compared(e: GoalEvidence, change: str, other: str, factor: float) -> Iterator[Part]:
+def _in_each_world(e: GoalEvidence, judge: Callable[[Results], Part]) -> Part:
+    """Judge each world, and all of them together."""
+    parts = {label(world): judge(own) for world, own in e.rows.group("world").items()}
+    measured = (f"{world} {OUTCOMES[holds]}: {text}" for world, (holds, text) in parts.items())
+    return every(holds for holds, _ in parts.values()), " | ".join(measured)
+
+
+def _compared(rows: Results, change: str, other: str, factor: float) -> Iterator[Part]:
     """On each reference, whether online adaptation's error is at most a factor times another agent's."""
-    for reference in e.rows.unique("reference"):
-        own, others = (e.rows.where(change=change, agent=name, reference=reference) for name in ("online", other))
+    for reference in rows.unique("reference"):
+        own, others = (rows.where(change=change, agent=name, reference=reference) for name in ("online", other))
         if not len(own) or not len(others):
             raise Undecided(f"{AGENTS['online']} or {AGENTS[other]} did not fly")
         excess = own.interval(error("settled"), others, factor)
@@ -128,8 +147,8 @@ def _compared(e: GoalEvidence, change: str, other: str, factor: float) -> Iterat
         yield excess.below(0), f"{REFERENCES[reference]}: {text}"
 
 
-def _no_crash(e: GoalEvidence) -> Part:
-    own, oracle = (e.rows.where(agent=agent).group("change", "reference", "seed") for agent in ("online", "oracle"))
+def _no_crash(rows: Results) -> Part:
+    own, oracle = (rows.where(agent=agent).group("change", "reference", "seed") for agent in ("online", "oracle"))
     if not oracle or not own:
         raise Undecided("the oracle or the online adaptation did not fly")
     lost = {place for place, rows in oracle.items() if any(rows["crashed"])}
@@ -137,14 +156,14 @@ def _no_crash(e: GoalEvidence) -> Part:
     return crashes == 0, f"{crashes} of {len(own)} flights, the oracle {len(lost)}"
 
 
-def _holds_truth(e: GoalEvidence) -> Iterator[Part]:
-    for change, own in e.rows.where(agent="online").group("change").items():
+def _holds_truth(rows: Results) -> Iterator[Part]:
+    for change, own in rows.where(agent="online").group("change").items():
         shares = np.array([list(row["inside"].values()) for row in own], float).mean(axis=1)
         if not np.isfinite(shares).all():
             raise Undecided(f"flights end before {LEARNED:g} s after the change")
         margin = 1.96 * shares.std() / np.sqrt(len(shares))  # flights are independent, parameters of one are not
         holds = True if shares.mean() >= COVERED else False if shares.mean() + margin < COVERED else None
-        yield holds, f"{CHANGE_NAMES[change]}: {shares.mean():.2f}"
+        yield holds, f"{label(change)}: {shares.mean():.2f}"
 
 
 def _fast_step(e: GoalEvidence) -> Part:
@@ -171,15 +190,18 @@ _COVERS = (
 
 
 def claims(changes: list[str]) -> list[Claim[GoalEvidence]]:
+    def of(id: str, text: str, judge: Callable[[Results], Part]) -> Claim[GoalEvidence]:
+        return Claim(id, f"In each world: {text}", lambda e: _in_each_world(e, judge))
+
     def near(letter: str, change: str) -> Claim[GoalEvidence]:
-        text = f"{CHANGE_NAMES[change]}: {_NEAR}"
-        return Claim(f"O1{letter}", text, lambda e: all_of(_compared(e, change, "oracle", FACTOR)))
+        text = f"{label(change)}: {_NEAR}"
+        return of(f"O1{letter}", text, lambda rows: all_of(_compared(rows, change, "oracle", FACTOR)))
 
     return [
         *map(near, "abcdef", changes),
-        Claim("O2", "No flight with online adaptation crashes where the oracle does not.", _no_crash),
-        Claim("O3", _WORSE, lambda e: all_of(_compared(e, "nothing", "unadapted", WORSE))),
-        Claim("O4", _COVERS, lambda e: all_of(_holds_truth(e))),
+        of("O2", "No flight with online adaptation crashes where the oracle does not.", _no_crash),
+        of("O3", _WORSE, lambda rows: all_of(_compared(rows, "nothing", "unadapted", WORSE))),
+        of("O4", _COVERS, lambda rows: all_of(_holds_truth(rows))),
         Claim("O5", f"A step of the filter takes at most {STEP_MS:g} ms on one core.", _fast_step),
         Claim(
             "O6", f"{FLIGHTS} flights take at most {MINUTES:g} minutes on two cores (without compiling).", _fast_table

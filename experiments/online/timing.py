@@ -16,12 +16,12 @@ STEPS = 1000  # that are timed
 
 
 def step_time(hardware: Hardware, period: float) -> float:
-    """Processor time of a step of the filter on one core [ms]."""
+    """Processor time of a step of the filter on one core, for the Iris [ms]."""
     return on_one_core(_step_time, hardware, period)
 
 
 def _step_time(hardware: Hardware, period: float) -> float:
-    adaptation = agents.online(hardware, period)
+    adaptation = agents.online("iris", hardware, period)
     start = jnp.zeros(13).at[2].set(1.5).at[3].set(1.0)
     noise = 0.01 * jax.random.normal(jax.random.key(0), (STEPS, 13))
     u = jnp.full(IRIS.rotors, IRIS.hover_speed)

@@ -34,6 +34,8 @@ else:  # the command line offers what the registries hold
     SolverName = Literal[tuple(SOLVERS)]
     Change = Literal[CHANGED]
     Norm = Literal[tuple(NORMS)]
+Training = Literal["physics_first", "joint"]
+WorldName = Literal["iris", "hummingbird", "crazyflie"]
 ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "near_ground", "body"]
 ResidualOutputs = Literal["all", "accelerations", "wrench", "rotors"]
 
@@ -221,10 +223,16 @@ class OneFlight(Config):
     """Flights with noise. all: before and after the change. target: only after it."""
     changes: tuple[Change, ...] = CHANGED
     """Changes of the vehicle."""
+    source_training: Annotated[Training, options.Named(name="pretraining")] = "joint"
+    """joint: physics and network at once, as in the paper. physics_first: physics with drag and moments by least
+    squares, then the network on what is left."""
+    worlds: tuple[WorldName, ...] = ("iris", "hummingbird")
+    """Simulated vehicles. iris: our own simulator. hummingbird, crazyflie: vehicles of RotorPy."""
 
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--changes", self.changes)
+        distinct("--worlds", self.worlds)
         if len(self.sizes) != 1:
             raise ValueError(f"--n-target must be one number, got {self.sizes}")
 

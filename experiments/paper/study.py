@@ -1,6 +1,6 @@
 """The protocol of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -192,24 +192,31 @@ def assess(
 def flown(
     domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages, file: Path | None = None
 ) -> Dataset:
-    """Return a domain's flights with measurement noise from a file, the cache or the simulator.
-
-    Process 0 reads or flies them; the others receive the same bits and need no file.
+    """Return a domain's flights with measurement noise from a file, which other processes need not have, the cache or
+    the simulator.
     """
 
-    def read() -> tuple[Any, Arrays]:
+    def read() -> Dataset:
         if file is not None:
-            found = chosen_flights(file, domain, splits)
-        else:
-            found = flights(domain, splits, config.data_seed, config.cache)
+            return chosen_flights(file, domain, splits)
+        return flights(domain, splits, config.data_seed, config.cache)
+
+    return received(domain.name, read, domain is SOURCE, config, stages)
+
+
+def received(name: str, read: Callable[[], Dataset], source: bool, config: Config, stages: Stages) -> Dataset:
+    """Return the flights that process 0 reads or flies, with measurement noise; the others receive the same bits."""
+
+    def first() -> tuple[Any, Arrays]:
+        found = read()
         arrays = {f"{name}/{part}": getattr(found.splits[name], part) for name in found.splits for part in ARRAYS}
         steps = {name: windows.dt for name, windows in found.splits.items()}
         return [dict(found.metadata), steps], arrays
 
-    (metadata, steps), arrays = stages.timed(f"flights {domain.name}", lambda: hosts.from_first(read))
-    received = {n: Trajectories(*(arrays[f"{n}/{part}"] for part in ARRAYS), dt=dt) for n, dt in steps.items()}
-    noise = config.noise if config.noise_on == "all" or domain is not SOURCE else 0.0
-    return measured(Dataset(received, metadata), noise, config.data_seed)
+    (metadata, steps), arrays = stages.timed(f"flights {name}", lambda: hosts.from_first(first))
+    splits = {n: Trajectories(*(arrays[f"{n}/{part}"] for part in ARRAYS), dt=dt) for n, dt in steps.items()}
+    noise = config.noise if config.noise_on == "all" or not source else 0.0
+    return measured(Dataset(splits, metadata), noise, config.data_seed)
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:

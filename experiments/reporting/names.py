@@ -43,6 +43,7 @@ LABELS = {
     "outliers": "usual flight with outliers",
     "iris": "Iris (our simulator)",
     "hummingbird": "Hummingbird (RotorPy)",
+    "crazyflie": "Crazyflie (RotorPy)",
 }
 
 

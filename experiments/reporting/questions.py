@@ -29,8 +29,8 @@ QUESTIONS = {
     "coverage": Asked(
         "Do 95 % intervals contain the true value?",
         (
-            "One source model is enough for a parameter that it calls physical; pool three for an effective one.",
-            "This holds where physics has every force that acts; elsewhere an interval can miss the true value.",
+            "Believe an interval of a parameter that is called physical; an effective one has none.",
+            "If a parameter is effective, add the forces that your physics lacks, and train physics first.",
         ),
     ),
     "comparison": Asked(
@@ -54,8 +54,11 @@ QUESTIONS = {
     ),
     "online": Asked(
         "The vehicle changes in the air: how soon does it fly well again?",
-        ("Name the changes that you expect: with such hypotheses the filter is nearly as good as knowing the change.",),
-        "load of 20 % off centre, from 1 s",
+        (
+            "Name the changes that you expect: in our simulator the filter is then nearly as good as knowing them.",
+            "Where your model lacks effects of the vehicle, a disturbance observer may fly closer.",
+        ),
+        "RMSE of the position",
     ),
     "excitation": Asked(
         "How much does a planned flight narrow the intervals?",

@@ -14,7 +14,8 @@ from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.stages import stages_of
-from experiments.worlds.cases import WORLDS, WorldsConfig, adapted
+from experiments.worlds.cases import WorldsConfig, adapted
+from experiments.worlds.flights import WORLDS
 from experiments.worlds.verdicts import (
     CLAIMS,
     conclusion,

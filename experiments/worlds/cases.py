@@ -7,40 +7,27 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 
 import jax
-import numpy as np
 import tyro
 from jaxtyping import PRNGKeyArray
 
 import hybrid_jax as hj
-from experiments.paper.conditions import fresh_fields
-from experiments.paper.config import OneFlight
-from experiments.paper.study import pretrained
-from experiments.reporting.names import HYBRID
+from experiments.paper.config import OneFlight, Training, WorldName
 from experiments.reporting.results import Row
 from experiments.runner.cache import identity_of
 from experiments.runner.options import Count, Named, distinct
 from experiments.runner.stages import Found, Stages, rows_of
-from experiments.worlds.iris import Iris
+from experiments.worlds.flights import LEARNING, WORLDS, trained, usual_flights
 from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
-from experiments.worlds.methods import AUTO, METHODS, PHYSICS, Task
-from experiments.worlds.rotorpy import ROTORPY
-from experiments.worlds.world import CHANGES, MADE_FOR, NOTHING, Flown, World, logged
-from hybrid_jax.adaptation import LeastSquares
+from experiments.worlds.methods import AUTO, METHODS, Task
+from experiments.worlds.world import CHANGES, MADE_FOR, NOTHING, USUAL, World, logged
 from hybrid_jax.io.datasets import Dataset
-from hybrid_jax.networks.mlp import zero_output
-from hybrid_jax.sim import gone_wrong
 from hybrid_jax.sweep.lanes import lane
-from hybrid_jax.training import Settings
-from hybrid_jax.training.objective import scaled_loss
 
-WORLDS: dict[str, World] = {world.name: world for world in (Iris(), *ROTORPY)}
 STEPS, LONG = 10, 100  # intervals of a window to learn from, and to test on
-LEARNING, TESTING = 20.0, 10.0  # s, of a flight
-SPARE = 1.5  # times as many flights are flown as are needed
+TESTING = 10.0  # s, of a flight
 SOURCE, TARGET, TEST, NOISE, TRAINING, LOGGING = range(6)  # purposes of a key
 MANY = 5  # flights to train on in the paper's protocol: 1000 windows
 COMPARED = 6  # sources from which other methods adapt, too
-WorldName = Literal["iris", "hummingbird", "crazyflie"]
 FlightName = Literal["moving", "hover", "near_ground", "short", "noisy", "outliers"]
 if TYPE_CHECKING:
     ChangeName = str
@@ -57,7 +44,6 @@ class Manner(NamedTuple):
     burst: bool = False
 
 
-USUAL: FlightName = "moving"
 FLIGHTS: dict[str, Manner] = {
     USUAL: Manner(),
     "hover": Manner("hover"),
@@ -72,16 +58,16 @@ FLIGHTS: dict[str, Manner] = {
 class WorldsConfig(OneFlight):
     """Adapt to a usual flight after each change, and to other flights, for example a hover, after none."""
 
-    worlds: tuple[WorldName, ...] = ("iris", "hummingbird", "crazyflie")
-    """True systems. iris: the simulator of the other experiments. hummingbird, crazyflie: vehicles of RotorPy."""
     changes: tuple[ChangeName, ...] = CHANGES
     """Which changes of the vehicle."""
+    worlds: tuple[WorldName, ...] = ("iris", "hummingbird", "crazyflie")
+    """Simulated vehicles. iris: our own simulator. hummingbird, crazyflie: vehicles of RotorPy."""
     learn_from: tuple[FlightName, ...] = get_args(FlightName)
     """Flights to adapt to. moving: ten seconds of usual flight. Of the others one draw for each source. near_ground:
     slow. short: three seconds. noisy: sensors three times as noisy. outliers: 0.3 s of outliers."""
-    source_training: Annotated[Literal["physics_first", "joint"], Named(name="pretraining")] = "physics_first"
+    source_training: Annotated[Training, Named(name="pretraining")] = "physics_first"
     """physics_first: physics with drag and moments by least squares, then the network on what is left. joint: physics
-    without these terms and the network at once, as in the paper."""
+    and network at once, as in the paper."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
     """How a log samples them: means over each interval, or values at its start."""
     n_test: Count = 20
@@ -95,7 +81,6 @@ class WorldsConfig(OneFlight):
 
     def __post_init__(self):
         OneFlight.__post_init__(self)
-        distinct("--worlds", self.worlds)
         distinct("--learn-from", self.learn_from)
 
     def cases(self) -> Iterator[tuple[ChangeName, FlightName]]:
@@ -110,13 +95,6 @@ def key_of(world: World, config: WorldsConfig, purpose: int, draw: int = 0) -> P
     return jax.random.fold_in(jax.random.fold_in(key, purpose), draw)
 
 
-def usual_flights(world: World, change: str, flights: int, seconds: float, key: PRNGKeyArray) -> Flown:
-    """Fly without a crash: the pilot of some vehicles turns over now and then."""
-    flown = world.fly(change, USUAL, round(SPARE * flights), seconds, key)
-    kept = np.flatnonzero(~gone_wrong(flown.states))[:flights]
-    return Flown(*(part[kept] for part in flown))
-
-
 def source_flights(world: World, config: WorldsConfig, seed: int) -> Dataset:
     """Fly a source's training and validation flights: each seed has its own, as intervals concern their errors too."""
     numbers = {"train": config.source_train, "validation": config.validating()}
@@ -128,19 +106,6 @@ def source_flights(world: World, config: WorldsConfig, seed: int) -> Dataset:
     windows, first = log(flown, key_of(world, config, LOGGING, seed)), each * flights["train"]
     splits = {"train": windows[: numbers["train"]], "validation": windows[first : first + numbers["validation"]]}
     return Dataset(splits, {"config": {"domain": world.name}})
-
-
-def source_of(world: World, config: WorldsConfig, stages: Stages, own: Dataset) -> hj.AbstractVectorField:
-    """Train a source model on its flights."""
-    one, start = replace(config, seeds=1), None
-    if config.source_training == "physics_first":
-        windows, body = own.splits["train"], hj.rigid_body(world.vehicle, PHYSICS)
-        settings = Settings(objective=scaled_loss(body, windows))
-        physics = LeastSquares(False).solve(body, windows, windows, settings).field
-        fresh: Any = fresh_fields(HYBRID, world.vehicle, one)
-        start = hj.Hybrid(jax.tree.map(lambda leaf: leaf[None], physics), zero_output(fresh.residual))
-        one = replace(one, rates=replace(one.rates, physics=0.0))
-    return lane(pretrained(HYBRID, world.vehicle, one, stages, own, start).fields, 0)
 
 
 def flown_after(world: World, change: str, flight: str, number: int, config: WorldsConfig) -> hj.Trajectories:
@@ -181,7 +146,8 @@ def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
     Each source has flights of its own, to adapt to and to test on as well, so that sources are independent cases.
     """
     flown = [source_flights(world, config, seed) for seed in range(config.seeds)]
-    fields = [source_of(world, config, stages, own) for own in flown]
+    one = replace(config, seeds=1)
+    fields = [lane(trained(world, one, stages, own), 0) for own in flown]
 
     def of_case(change: str, flight: str) -> Found:
         compare, noise = flight == USUAL and change in config.rivals, FLIGHTS[flight].noise * config.noise

@@ -25,7 +25,7 @@ from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY, Vehic
 
 SUBSTEPS = 10  # of an interval: 1 ms, a fifth of the fastest motor's lag
 POSITION_GAIN, VELOCITY_GAIN = np.array([6.5, 6.5, 15.0]), np.array([4.0, 4.0, 9.0])  # 1/s², 1/s
-GUST = np.array([1.3, 0.9, 2.2])  # rad/s
+GUST = 1.3, 0.9, 2.2  # rad/s
 G, LAGGED = 9.81, 0.03  # m/s², s: the lag of a worn motor
 UP = np.array([0.0, 0.0, 1.0])
 Vector = Float[Array, "3"]
@@ -96,15 +96,16 @@ def derivative(
 ) -> tuple[Float[Array, "13"], Float[Array, "4"]]:
     """Return derivatives of state and rotor speeds, for commanded speeds [rad/s] and a wind [m/s, world]."""
     q, rates, inertia, rotors = x[QUATERNION], x[BODY_RATES], jnp.asarray(c.inertia), jnp.asarray(c.rotors)
+    up = jnp.array(UP.tolist())  # after a program in double precision, JAX takes an array of NumPy for float64
     air = rotation.rotate(rotation.conjugate(q), x[VELOCITY] - wind)
     hubs = air + jnp.cross(rates, rotors)
     lift = jnp.asarray(c.efficiency) * c.thrust * speeds**2 + c.lift * jnp.sum(hubs[:, :2] ** 2, axis=1)
-    forces = lift[:, None] * UP - speeds[:, None] * jnp.asarray(c.rotor_drag) * hubs
+    forces = lift[:, None] * up - speeds[:, None] * jnp.asarray(c.rotor_drag) * hubs
     force = forces.sum(axis=0) - jnp.linalg.norm(air) * jnp.asarray(c.parasitic) * air
-    moment = jnp.cross(rotors, forces) - c.flapping * speeds[:, None] * jnp.cross(hubs, UP)
+    moment = jnp.cross(rotors, forces) - c.flapping * speeds[:, None] * jnp.cross(hubs, up)
     reaction = c.torque * jnp.sum(jnp.asarray(c.spin) * jnp.asarray(c.efficiency) * speeds**2)
-    turning = (moment.sum(axis=0) + reaction * UP - jnp.cross(rates, inertia * rates)) / inertia
-    acceleration = rotation.rotate(q, force) / c.mass - G * UP
+    turning = (moment.sum(axis=0) + reaction * up - jnp.cross(rates, inertia * rates)) / inertia
+    acceleration = rotation.rotate(q, force) / c.mass - G * up
     slopes = x[VELOCITY], rotation.derivative(q, rates), acceleration, turning
     return jnp.concatenate(slopes), (command - speeds) / c.lag
 
@@ -133,7 +134,8 @@ def advance(c: Constants, x, speeds, command, t: Scalar):
 
     def slope(state, t):
         x, speeds = state
-        return derivative(c, x, speeds, command, jnp.asarray(c.wind) + jnp.asarray(c.gust) * jnp.sin(GUST * t))
+        wind = jnp.asarray(c.wind) + jnp.asarray(c.gust) * jnp.sin(jnp.array(GUST) * t)
+        return derivative(c, x, speeds, command, wind)
 
     def step(state, t):
         def along(slopes, fraction):

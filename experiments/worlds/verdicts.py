@@ -103,7 +103,11 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
             ratio = own.numbers("ratio")
             y = np.full(len(ratio), names.index(tuple(case)))
             axes.plot(ratio, y, "o", ms=4, alpha=0.7, color=METHODS["adapted"], label="adapted, each flight")
-        axes.set(xscale="log", title=label(str(world)), xlabel="error / error of\nthe source (log scale)")
+        axes.set(
+            xscale="log",
+            title=label(str(world)).replace(" (", "\n("),
+            xlabel="error / error\nof the source\n(log scale)",
+        )
         tick_errors(axes.xaxis, *axes.get_xlim(), room=2.2)
     name_lines(panels[0], [label(*case) for case in names])
     caption = "Error of the adapted model over the source's, by the change and the flight that it adapted to"

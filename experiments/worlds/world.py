@@ -28,7 +28,7 @@ MADE_FOR = (
     "load_and_wind",
     "reaction_torque",
 )
-NOTHING = "nothing"
+NOTHING, USUAL = "nothing", "moving"
 NOT_MADE_FOR = (NOTHING, "motor_lag", "battery")  # no candidate can express them
 CHANGES = (*MADE_FOR, *NOT_MADE_FOR)
 

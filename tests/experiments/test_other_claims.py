@@ -13,8 +13,6 @@ from experiments.reporting.results import Results
 from hybrid_jax.adaptation.results import Parameter
 from hybrid_jax.planning import FlightBounds
 
-TAGS = ("domain", "candidate", "draw", "seed")
-
 
 def choices(taken="theta", theta=0.05, force=0.06, fine_tune=0.5, inside=0.8):
     """Ten seeds and four draws in both experiments of the paper; the source errs by 1."""
@@ -24,9 +22,16 @@ def choices(taken="theta", theta=0.05, force=0.06, fine_tune=0.5, inside=0.8):
             errors = {"source": 1.0, "theta": theta, "force": force, "fine_tune": fine_tune}
             for name, error in errors.items():
                 candidate = {"taken": name == taken, "expected_inside": inside if name == taken else None}
-                tags = {"domain": domain, "candidate": name, "draw": draw, "seed": seed, "test_mse": error}
+                tags = {
+                    "world": "iris",
+                    "domain": domain,
+                    "candidate": name,
+                    "draw": draw,
+                    "seed": seed,
+                    "test_mse": error,
+                }
                 found.append(tags | candidate)
-    return Results(found, TAGS)
+    return Results(found, regret.TAGS)
 
 
 @pytest.mark.parametrize(
@@ -55,10 +60,10 @@ def intervals(inside, flights=100, half_width=2.0):
     """Of each flight whether the interval of Ix contains the truth; k was not fitted."""
     found = []
     for draw in range(flights):
-        tags = {"domain": "weak_rotor", "noise": "1", "draw": draw}
+        tags = {"world": "iris", "domain": "weak_rotor", "noise": "1", "draw": draw}
         numbers = {"inside": draw < inside, "error": 1.6, "half_width": half_width, "alone": 0.5}
         found += [tags | {"parameter": "Ix"} | numbers, tags | {"parameter": "k"} | dict.fromkeys(numbers)]
-    return Results(found, ("domain", "noise", "draw", "parameter"))
+    return Results(found, ("world", "domain", "noise", "draw", "parameter"))
 
 
 FEWER = [({"inside": inside}, holds) for inside, holds in ((97, True), (90, True), (88, None), (80, False))]
