@@ -36,8 +36,8 @@ methods adapt to the same ten seconds:
 
 - **fine_tune**, **l2_sp**: Adam, and Adam with a penalty on the distance from the source's parameters
 - **fine_tune_paper**: Adam on 1000 windows of five flights without noise, another flight says when to stop
-- **white_box**, **kalman_filter**: physics without a network, with inertia, k, drag, aerodynamic moments and a steady
-  force and torque from nominal values, by least squares, and by an extended Kalman filter; they need no source
+- **white_box**, **kalman_filter**: physics without a network, with inertia, k, drag, lift, aerodynamic moments and a
+  steady force and torque from nominal values, by least squares and by an extended Kalman filter; they need no source
 """
 
 NOISY: dict[str, Any] = ONE_FLIGHT | {"noise_on": "all"}
