@@ -144,11 +144,16 @@ def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array
 
     def of_candidate(prior: tuple[Float[Array, " p"], Float[Array, " p"]]):
         change, wide = prior[0], prior[0] + prior[1]
-        root = jnp.sqrt(wide)
-        values, vectors = jnp.linalg.eigh(root[:, None] * information * root)
-        values, along = jnp.maximum(values, 0.0), vectors.T @ (root * pull)
-        evidence = 0.5 * jnp.sum(jnp.square(along) / (1 + values) - jnp.log1p(values))
-        mean = change / jnp.sqrt(jnp.maximum(wide, TINY)) * (vectors @ (along / (1 + values)))
+        wide, free = jnp.maximum(wide, TINY), wide > 0
+        held = jnp.where(free & free[:, None], information, 0.0) + jnp.diag(jnp.where(free, 1 / wide, 1.0))
+        # All eigenvalues are only as exact as the largest, so the matrix is scaled to a unit diagonal.
+        unit = 1 / jnp.sqrt(jnp.diagonal(held))
+        values, vectors = jnp.linalg.eigh(unit[:, None] * held * unit)
+        values = jnp.maximum(values, len(values) * jnp.finfo(values.dtype).eps)
+        along = vectors.T @ jnp.where(free, unit * pull, 0.0)
+        volume = 2 * jnp.log(unit) - jnp.where(free, jnp.log(wide), 0.0) - jnp.log(values)
+        mean = change / wide * unit * (vectors @ (along / values))
+        evidence = 0.5 * jnp.sum(jnp.square(along) / values + volume)
         return mean, evidence
 
     changes = jnp.where(jnp.asarray(free) & around.seen, plausible, 0.0)

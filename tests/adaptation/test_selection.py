@@ -10,7 +10,7 @@ from pendulum import Push, flown, pendulum, pushes
 import hybrid_jax as hj
 from hybrid_jax.adaptation import adapt, selection
 from hybrid_jax.adaptation.selection import STRONG, Fit, alike, blocks_of, correlated, fit_each, posterior
-from hybrid_jax.estimation.normal_equations import NormalEquations
+from hybrid_jax.estimation.normal_equations import NormalEquations, equations_of
 from hybrid_jax.trajectories import windows_of
 
 
@@ -84,3 +84,25 @@ def test_large_gains_of_some_blocks_do_not_hide_the_small_ones_of_others(least, 
         for own in (0 * gains, gains)
     )
     assert selection.surely_lower(after, before, jnp.zeros((10, 1)), blocks) == sure
+
+
+def test_single_precision_suffices_where_a_prior_is_far_wider_than_what_the_windows_determine():
+    rng, p = np.random.default_rng(0), 20
+    jacobian = rng.normal(size=(100, 30, p)) * np.logspace(-2, 2, p)
+    jacobian[..., 1] += jacobian[..., -1] / 100  # the windows hardly distinguish these two
+    errors = rng.normal(size=(100, 30)) - 50 * jacobian[..., 0]
+    free = np.arange(p) == np.array([[-1], [0]])
+    free = np.concatenate([free, ~free[1:], ~free[:1]])  # nothing, the first, all others, all
+
+    def choice(dtype):
+        j, r = jacobian.astype(dtype), errors.astype(dtype)
+        equations = jax.vmap(equations_of)(*map(jnp.asarray, (j, r)))
+        every = np.linalg.lstsq(j.reshape(-1, p), -r.ravel())[0]
+        source = Fit(jnp.zeros(p), equations, jnp.ones((1, p, p)), jnp.ones(()), jnp.ones(p, bool), 1, 0)
+        every = source._replace(theta=jnp.asarray(every), equations=source.at(every))
+        found = jax.jit(posterior)(source, every, jnp.zeros(p), free, jnp.full(p, 100.0), jnp.zeros(p))
+        return int(found.taken), float(found.probability[1])
+
+    with jax.enable_x64(True):
+        exact = choice(np.float64)
+    assert choice(np.float32) == exact == (1, 1)
