@@ -18,6 +18,7 @@ from hybrid_jax.online.tuning import BOUND, Tuning
 
 Each = Callable[[Callable], Callable]  # maps a function over filters, like `jax.vmap`
 Field = Callable[[Array, Array], Array]  # ẋ as a function of x and a
+Scalar = Float[Array, ""]
 
 
 class Belief(NamedTuple):
@@ -111,39 +112,47 @@ def reset_state(
 
 def triangular(belief: Belief, d: int) -> Belief:
     """Make the root square, triangular for a first, by the modified Gram-Schmidt method."""
-    rows, columns = jnp.concatenate([belief.root[d:], belief.root[:d]]), []
-    for i in range(len(rows)):
-        size = jnp.sqrt(jnp.sum(jnp.square(rows[0])))
-        unit = rows[0] / jnp.where(size > 0, size, 1.0)
-        along = rows[1:] @ unit
-        rows = rows[1:] - along[:, None] * unit
-        columns.append(jnp.concatenate([jnp.zeros(i, size.dtype), size[None], along]))
-    root = jnp.stack(columns, axis=1)
-    k = len(root) - d
-    return Belief(belief.z, jnp.concatenate([root[k:], root[:k]]))
+    n = len(belief.root)
+
+    def column(rows, at):  # a unit vector instead of an index, which has no counterpart in C
+        row = at[0] @ rows
+        size = jnp.sqrt(jnp.sum(jnp.square(row)))
+        unit = row / jnp.where(size > 0, size, 1.0)
+        along = at[1] * (rows @ unit)
+        return rows - along[:, None] * unit, along
+
+    rows = jnp.concatenate([belief.root[d:], belief.root[:d]])
+    eye = jnp.eye(n, dtype=rows.dtype)
+    root = jax.lax.scan(column, rows, (eye, jnp.triu(jnp.ones_like(eye))))[1].T
+    return Belief(belief.z, jnp.concatenate([root[n - d :], root[: n - d]]))
+
+
+def measured(row: Float[Array, " m"], root: Float[Array, "n m"], noise: Scalar) -> tuple[Scalar, Array, Array]:
+    """Return the variance of an innovation, the gain for it over its standard deviation, and the root after it.
+
+    `row` is the measured row of the root, or a combination of rows, and `noise` the variance of the measurement.
+    """
+    variance, column = jnp.sum(jnp.square(row)) + noise, root @ row
+    # Potter's update subtracts column columnᵀ / variance from the covariance without a difference of squares.
+    return variance, column / jnp.sqrt(variance), root - column[:, None] * row / (variance + jnp.sqrt(noise * variance))
 
 
 def correct(belief: Belief, sample: Sample, model: FilterModel) -> tuple[Belief, Correction]:
     """Process each measured number of a sample; innovations are clipped."""
-    (z, root), variances, clip = belief, model.variances, model.tuning.clip
-    errors, white, sizes, gains, likelihood = [], [], [], [], jnp.zeros((), z.dtype)
-    for i, noise in enumerate(variances):
-        used = sample.used[i]
-        row = jnp.where(used, root[i], 0.0)
-        variance, column = jnp.sum(jnp.square(row)) + noise, root @ row
+
+    def process(belief, number):
+        (z, root), (own, x, used, noise) = belief, number
+        variance, gain, after = measured(jnp.where(used, own @ root, 0.0), root, noise)
         size = jnp.sqrt(variance)
-        errors.append(jnp.where(used, (sample.x[i] - z[i]) / size, 0.0))
-        error = jnp.clip(errors[-1], -clip, clip)
-        gain = column / size
-        # Potter's update subtracts column columnᵀ / variance from the covariance without a difference of squares.
-        z, root = z + gain * error, root - column[:, None] * row / (variance + jnp.sqrt(noise * variance))
-        likelihood = likelihood - jnp.where(used, jnp.square(error) + jnp.log(variance), 0.0) / 2
-        white.append(error)
-        sizes.append(size)
-        gains.append(gain)
-    errors, white, sizes, gains = map(jnp.stack, (errors, white, sizes, gains))
-    correction = Correction(errors, white, sizes, gains, likelihood)
-    return model.project(Belief(z, root)), correction
+        error = jnp.where(used, (x - own @ z) / size, 0.0)
+        white = jnp.clip(error, -model.tuning.clip, model.tuning.clip)
+        likelihood = jnp.where(used, -(jnp.square(white) + jnp.log(variance)) / 2, 0.0)
+        return Belief(z + gain * white, after), Correction(error, white, size, gain, likelihood)
+
+    own = jnp.eye(len(sample.x), len(belief.z), dtype=belief.z.dtype)
+    numbers = own, sample.x, sample.used, model.variances
+    belief, found = jax.lax.scan(process, belief, numbers)
+    return model.project(belief), found._replace(log_likelihood=jnp.sum(found.log_likelihood))
 
 
 def limit_covariance(belief: Belief, prior: Float[Array, " k"]) -> Belief:
