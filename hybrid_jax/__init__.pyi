@@ -46,7 +46,7 @@ from .integrate import RK4, SOLVERS, rollout, rollout_batch
 from .io import Model, check_savable, load, portable, save
 from .networks import grid_network, residual_network
 from .networks.standardise import with_scaling
-from .online import Hypothesis, OnlineAdaptation
+from .online import ExtendedKalmanFilter, Hypothesis, OnlineAdaptation
 from .planning import Excitation, FlightBounds, InputBounds, excitation
 from .records import Record
 from .training import Settings, Stage, fit, fit_gauss_newton, fit_in_stages, rates_by_group
@@ -62,7 +62,8 @@ __all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "w
 __all__ += ["Model", "check_savable", "load", "portable", "save"]
 __all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]
 __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridge", "Solution", "Source", "adapt"]
-__all__ += ["Excitation", "FlightBounds", "Hypothesis", "InputBounds", "OnlineAdaptation", "excitation"]
+__all__ += ["Excitation", "FlightBounds", "InputBounds", "excitation"]
+__all__ += ["ExtendedKalmanFilter", "Hypothesis", "OnlineAdaptation"]
 __all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]
 __all__ += ["Record", "StateSpaceModel", "fit_records", "predict", "simulate", "with_hidden"]
 __all__ += ["adapt_records", "fit_disturbance", "observe"]

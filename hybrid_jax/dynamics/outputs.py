@@ -1,8 +1,10 @@
 """Partially measured systems: ẋ = f(x, u), y = h(x, u)."""
 
 import inspect
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,8 +23,12 @@ def _numbers(values) -> tuple[float, ...]:
     return tuple(float(each) for each in values)
 
 
-def _numbers_by_name(values) -> dict[str, tuple[float, ...]]:
-    return {name: _numbers(np.ravel(each)) for name, each in values.items()}
+def _numbers_by_name(values) -> Mapping[str, tuple[float, ...]]:
+    return _ordered({name: _numbers(np.ravel(each)) for name, each in values.items()})
+
+
+def _ordered(outputs: Any) -> Any:
+    return outputs if outputs is None else OrderedDict(outputs)  # JAX sorts the keys of a dict
 
 
 class Measured(eqx.Module):
@@ -66,7 +72,7 @@ class StateSpaceModel(eqx.Module):
 
     field: AbstractVectorField
     inputs: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    outputs: Mapping[str, Output] = None  # pyright: ignore[reportAssignmentType]
+    outputs: Mapping[str, Output] = eqx.field(converter=_ordered, default=None)  # pyright: ignore[reportAssignmentType]
     start: tuple[float, ...] = eqx.field(static=True, converter=_numbers, default=())
     spread: tuple[float, ...] = eqx.field(static=True, converter=_numbers, default=())
     process: tuple[float, ...] = eqx.field(static=True, converter=_numbers, default=())
@@ -75,7 +81,7 @@ class StateSpaceModel(eqx.Module):
 
     def __post_init__(self):
         if self.outputs is None:
-            self.outputs = {one.name: Measured((at.start, at.stop), one) for at, one in self.space.parts}
+            self.outputs = _ordered({one.name: Measured((at.start, at.stop), one) for at, one in self.space.parts})
             self.angles = (*self.angles, *(one.name for one in self.space.quantities if isinstance(one, Angle)))
 
     def __check_init__(self):

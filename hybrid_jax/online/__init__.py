@@ -3,6 +3,7 @@
 from hybrid_jax.online.estimator import OnlineAdaptation
 from hybrid_jax.online.hypotheses import Hypothesis
 from hybrid_jax.online.state import Flags, OnlineState
+from hybrid_jax.online.state_estimation import ExtendedKalmanFilter, StateEstimate
 from hybrid_jax.online.tuning import Tuning
 
-__all__ = ["Flags", "Hypothesis", "OnlineAdaptation", "OnlineState", "Tuning"]
+__all__ = ["ExtendedKalmanFilter", "Flags", "Hypothesis", "OnlineAdaptation", "OnlineState", "StateEstimate", "Tuning"]

@@ -1,5 +1,6 @@
 """Laws of the closed loop, with a rigid body as the plant, and of its observer."""
 
+from dataclasses import replace
 from functools import cache, partial
 
 import equinox as eqx
@@ -11,7 +12,7 @@ import pytest
 import hybrid_jax as hj
 from hybrid_jax import control
 from hybrid_jax.control.cost import deviations
-from hybrid_jax.dynamics import ConstantDisturbance, DisturbanceModel
+from hybrid_jax.dynamics import ConstantDisturbance, DisturbanceModel, RandomWalk
 from hybrid_jax.networks.mlp import InputScaling
 
 CONTROLLER = control.Controller(hj.IRIS)
@@ -92,6 +93,22 @@ def test_a_model_with_a_past_carries_its_state_and_removes_the_wind():
     np.testing.assert_allclose(flight.estimates, hj.observe(model, flown)[0, :-1], atol=2e-3)
     np.testing.assert_allclose(flight.estimates[-1, 13 + 6 :], WIND, atol=0.02)
     assert np.linalg.norm(flight.x[-1, :3] - reference[0, :3]) < 0.01
+
+
+def test_a_filter_of_a_hidden_force_removes_the_wind():
+    """The controller plans with the force that the filter estimates from noisy positions and attitudes."""
+    field, reference = hj.with_hidden(BODY, RandomWalk((7, 8, 9))), reference_of("hover")
+    spread, walk = (*np.full(12, 0.1), 3.0, 3.0, 3.0), (*np.zeros(12), 0.3, 0.3, 0.3)
+    system = hj.StateSpaceModel(field, ("u",), start=(*reference[0], 0, 0, 0), spread=spread, process=walk)
+    noise = {"position": 0.002, "attitude": 0.004, "velocity": 0.02, "body rates": 0.02}
+    kalman = hj.ExtendedKalmanFilter(replace(system.only(noise), noise=noise), CONTROLLER.period)
+    pushed = plant(hj.Hybrid(BODY, ConstantDisturbance(WIND)))
+    given = {"hardware": control.Hardware(noise=(0.002, 0.002, 0.02, 0.02)), "key": jax.random.key(0)}
+    flight = jax.jit(
+        lambda: control.fly(pushed, field, reference, reference[0], CONTROLLER, estimator=kalman, **given)
+    )()
+    np.testing.assert_allclose(flight.estimates.x[-1, 13:], WIND[:3], atol=0.3)
+    assert np.linalg.norm(flight.x[-1, :3] - reference[0, :3]) < 0.02
 
 
 def test_hidden_states_that_nothing_estimates_are_refused():

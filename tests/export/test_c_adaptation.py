@@ -1,6 +1,7 @@
 """The C of an `OnlineAdaptation` is the filter, through samples that are missing and after a change."""
 
 import ctypes
+from dataclasses import replace
 from functools import cache
 
 import equinox as eqx
@@ -13,8 +14,8 @@ from fields import double
 from jax.flatten_util import ravel_pytree
 
 import hybrid_jax as hj
-from hybrid_jax.export import export_adaptation_c
-from hybrid_jax.export.c.adaptation import _about
+from hybrid_jax.export import export_adaptation_c, export_filter_c
+from hybrid_jax.export.c.filters import _about
 from hybrid_jax.integrate import rk4_step
 from hybrid_jax.online.estimator import OnlineAdaptation
 
@@ -75,11 +76,10 @@ def filter_with(hypotheses):
     return OnlineAdaptation(NOMINAL[hypotheses], DT, 1e-3, disturbance=2.0, process=1e-2, **own)
 
 
-def compiled(folder, adaptation, precise, size, sizes):
-    """The two functions of the C, each of arrays and of one array that it fills."""
-    source = export_adaptation_c(folder, adaptation, double=precise, **sizes)[1]
-    run("gcc", *C99, "-O0", "-fPIC", "-shared", source, "-o", folder / "adaptation.so", "-lm")
-    library = ctypes.CDLL(str(folder / "adaptation.so"))
+def compiled(source, precise, size):
+    """The two functions of the C, each of arrays and then of numbers, and of one array that it fills."""
+    run("gcc", *C99, "-O0", "-fPIC", "-shared", source, "-o", source.with_suffix(".so"), "-lm")
+    library = ctypes.CDLL(str(source.with_suffix(".so")))
     dtype, real = (np.float64, ctypes.c_double) if precise else (np.float32, ctypes.c_float)
 
     def filled(function, *arrays, numbers=()):
@@ -88,10 +88,10 @@ def compiled(folder, adaptation, precise, size, sizes):
         function(*places[:-1], *map(real, numbers), places[-1])
         return held[-1]
 
-    def update(state, x, u, periods):
-        return filled(library.adaptation_update, state, x, u, numbers=[periods])
+    def update(state, x, u, *numbers):
+        return filled(library[f"{source.stem}_update"], state, x, u, numbers=numbers)
 
-    return lambda x: filled(library.adaptation_begin, x), update
+    return lambda *given: filled(library[f"{source.stem}_begin"], *given), update
 
 
 def with_covariances(state):
@@ -122,7 +122,8 @@ def test_c_is_the_filter(precise, allowed, hypotheses, tmp_path):
         exact, update_of_jax = in_double(hypotheses)
         state = exact.begin(jnp.asarray(first, float))
         flat, unravel = ravel_pytree(state)
-        begin, update = compiled(tmp_path, adaptation, precise, flat.size, sizes)
+        source = export_adaptation_c(tmp_path, adaptation, double=precise, **sizes)[1]
+        begin, update = compiled(source, precise, flat.size)
         flown = begin(first)
         np.testing.assert_array_equal(flown, np.asarray(flat, flown.dtype))
         for x, u, periods in samples:
@@ -137,7 +138,32 @@ def test_c_is_the_filter(precise, allowed, hypotheses, tmp_path):
         assert error(unravel(jnp.asarray(flown, float)), state) < 10 * allowed
 
 
+def test_c_is_the_filter_of_hidden_states(tmp_path):
+    """Of a quadrotor of which position and attitude are measured in turn, with an unknown force."""
+    field = hj.with_hidden(hj.rigid_body(hj.IRIS), hj.dynamics.RandomWalk((7, 8, 9)))
+    start, spread = (0.0, 0.0, 2.0, 1.0, *np.zeros(12)), (*np.full(12, 0.1), 2.0, 2.0, 2.0)
+    system = hj.StateSpaceModel(field, ("speeds",), start=start, spread=spread, process=(*np.zeros(12), 1, 1, 1))
+    seen = replace(system.only(["position", "attitude"]), noise={"position": 0.01, "attitude": 0.02})
+    kalman = hj.ExtendedKalmanFilter(seen, DT)
+    source, rng = export_filter_c(tmp_path, kalman, double=True)[1], np.random.default_rng(0)
+    speeds = hj.IRIS.hover_speed + 40 * rng.normal(size=(8, 4))
+    samples = [0, 0, 2, 1, 0, 0, 0] + 0.01 * rng.normal(size=(8, 7))
+    samples[::2, :3], samples[1::2, 3:] = np.nan, np.nan
+    with jax.enable_x64(True):
+        exact = double(kalman)
+        jitted = jax.jit(lambda *given: exact.update(*given))
+        state = exact.begin(samples[0])
+        flat, unravel = ravel_pytree(state)
+        begin, update = compiled(source, True, flat.size)
+        flown = begin(samples[0], speeds[0])
+        for x, u in zip(samples[1:], speeds[1:], strict=True):
+            state, flown = jitted(state, x, u), update(flown, x, u)
+        assert error(unravel(jnp.asarray(flown)), state) < 1e-12
+
+
 def test_names_of_a_model_cannot_leave_their_comment():
-    said = _about(["k*/ int main(void) {} /*", "disturbance[vx]", "β\n#error"], {"trusted": (0, 1), "*/\\\n": (1, 2)})
+    said = _about(
+        "adapts", {"trusted": (0, 1), "*/\\\n": (1, 2)}, ["k*/ int main(void) {} /*", "disturbance[vx]", "β\n#error"]
+    )
     assert "changes of k___int_main_void_______, disturbance[vx], ___error,\n" in said
     assert "state: trusted at 0 (1),\n   ____ at 1 (2).\n" in said
