@@ -189,6 +189,9 @@ def _judge(
     free, added = np.stack([*free_parameters(larger).values()]), effect.total if effect else 0.0
     own = None if source is None else source.own
     nothing = selection.unchanged(own, around, added, quantities, learned_from, shares)
+    # A source may err in its force and drag; a wind, which could explain the same errors again, is not its own.
+    air = np.isin(groups_of(names_of(larger)), ("wind", "updraft"))
+    nothing = nothing._replace(apparent=jnp.where(air, 0.0, nothing.apparent))
     found = selection.posterior(around, every, start, free, sizes, nothing.apparent)
     rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
     return found, nothing, selection.without_others(every, rows[1], start).astype(sizes.dtype), rows

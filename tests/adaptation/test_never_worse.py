@@ -67,7 +67,11 @@ def test_hover_changes_what_the_source_does_not_err_on_its_own_motion(force, tak
     found = hj.adapt(SOURCE, hover, learned_from=moving)
     assert "force" in found.rejected or taken
     assert (found.chosen == "source") != taken
-    assert "hj.excitation plans an experiment" in found.report()
+    if taken:
+        pushed = found.parameters["disturbance[vx]"]
+        assert pushed.low < force < pushed.high < 1.2 * force
+    else:
+        assert "hj.excitation plans an experiment" in found.report()
 
 
 @pytest.mark.parametrize(("share", "reason"), [(0.99, "left out of the fit"), (0.9, "the source's own errors")])
