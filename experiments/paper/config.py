@@ -223,9 +223,9 @@ class OneFlight(Config):
     """Flights with noise. all: before and after the change. target: only after it."""
     changes: tuple[Change, ...] = CHANGED
     """Changes of the vehicle."""
-    source_training: Annotated[Training, options.Named(name="pretraining")] = "joint"
-    """joint: physics and network at once, as in the paper. physics_first: physics with drag and moments by least
-    squares, then the network on what is left."""
+    source_training: Annotated[Training, options.Named(name="pretraining")] = "physics_first"
+    """physics_first: physics with drag and moments by least squares, then the network on what is left. joint: physics
+    and network at once, as in the paper."""
     worlds: tuple[WorldName, ...] = ("iris", "hummingbird")
     """Simulated vehicles. iris: our own simulator. hummingbird, crazyflie: vehicles of RotorPy."""
 

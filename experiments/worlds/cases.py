@@ -11,10 +11,10 @@ import tyro
 from jaxtyping import PRNGKeyArray
 
 import hybrid_jax as hj
-from experiments.paper.config import OneFlight, Training, WorldName
+from experiments.paper.config import OneFlight, WorldName
 from experiments.reporting.results import Row
 from experiments.runner.cache import identity_of
-from experiments.runner.options import Count, Named, distinct
+from experiments.runner.options import Count, distinct
 from experiments.runner.stages import Found, Stages, rows_of
 from experiments.worlds.flights import LEARNING, WORLDS, trained, usual_flights
 from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
@@ -65,9 +65,6 @@ class WorldsConfig(OneFlight):
     learn_from: tuple[FlightName, ...] = get_args(FlightName)
     """Flights to adapt to. moving: ten seconds of usual flight. Of the others one draw for each source. near_ground:
     slow. short: three seconds. noisy: sensors three times as noisy. outliers: 0.3 s of outliers."""
-    source_training: Annotated[Training, Named(name="pretraining")] = "physics_first"
-    """physics_first: physics with drag and moments by least squares, then the network on what is left. joint: physics
-    and network at once, as in the paper."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
     """How a log samples them: means over each interval, or values at its start."""
     n_test: Count = 20
