@@ -132,3 +132,11 @@ def test_the_start_of_a_body_is_corrected_in_the_tangent_space_of_its_attitude()
     assert (fit.starts_error.shape, (fit.starts_error[:, 3:5] > 0).all()) == ((2, 12), True)
     assert np.sqrt(np.mean(np.square(fit.model.noise["attitude"]))) == pytest.approx(2e-3, rel=0.2)  # of q: half of it
     assert float(fit.model.field.deviations["k"]) == pytest.approx(0.1, abs=5e-3)
+
+
+def test_outputs_keep_their_order_through_jax():
+    outputs = {"rate": lambda x, u: x[1], "angle": angle}
+    model = dataclasses.replace(model_of(pendulum()), outputs=outputs, noise={"rate": 0.1, "angle": 0.2})
+    through = jax.tree.map(lambda leaf: leaf, model)
+    assert [*through.outputs] == [*model.only(["rate", "angle"]).outputs] == ["rate", "angle"]
+    assert [*through.noise] == ["rate", "angle"]
