@@ -172,7 +172,7 @@ def against_oracle(part, world="iris"):
     return {case: online / oracle for case, (online, oracle) in means.items()}
 
 
-TUNED, WORDS = ("fine_tune", "source"), {0: "none", 4: "four"}
+TUNED, WORDS = ("fine_tune", "source"), {0: "none", 5: "five"}
 
 
 def of_changes():
