@@ -5,7 +5,6 @@ a function of its record, so that neither its words nor its pictures can be
 older than the program: a test makes all of them and compares.
 """
 
-import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ from experiments.paper import outcome
 from experiments.reaction_diffusion import __main__ as reaction_diffusion
 from experiments.real_flight import report as real_flight
 from experiments.reporting.plots import save_figures
-from experiments.reporting.report import JSON_NAME, PAGE_NAME, Report, lines_of, markdown_page, to_json
+from experiments.reporting.report import JSON_NAME, PAGE_NAME, Report, lines_of, markdown_page, read_record, to_json
 from experiments.worlds import __main__ as worlds
 
 REFERENCE = Path(__file__).parents[1] / "docs/reference"
@@ -40,7 +39,7 @@ REPORTS: Mapping[str, Callable[[Mapping[str, Any]], Report]] = {
 
 
 def report_of(folder: Path) -> Report:
-    record = json.loads((folder / JSON_NAME).read_text("utf-8"))
+    record = read_record(folder)
     return REPORTS[record["experiment"]](record)
 
 

@@ -14,7 +14,7 @@ from experiments.online.results import error
 from experiments.paper.outcome import FLOOR
 from experiments.paper.regret import AUTO, ERRORS, NEAR, of_each_case, over, regret
 from experiments.reporting.names import label
-from experiments.reporting.results import Results
+from experiments.reporting.report import read_record, rows_in
 from experiments.reporting.tables import measured
 from experiments.worlds.verdicts import EACH, MEAN
 from hybrid_jax import trajectories
@@ -58,8 +58,7 @@ COMPARED = {
 @cache
 def committed(name):
     """The rows of a report in docs/reference."""
-    report = json.loads((REFERENCE / name / "report.json").read_text())
-    return Results(report["rows"], report.get("tags", ()))
+    return rows_in(read_record(REFERENCE / name))
 
 
 def lines(page):

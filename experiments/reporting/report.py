@@ -15,13 +15,13 @@ from experiments.reporting import claims
 from experiments.reporting.claims import Verdict
 from experiments.reporting.plots import save_figures
 from experiments.reporting.questions import QUESTIONS, Asked
-from experiments.reporting.results import Results, leaves
+from experiments.reporting.results import Results, by_column, by_row, leaves
 from experiments.reporting.tables import Table, markdown, narrowed, plain, print_table
 from hybrid_jax.cli.page import Page, document
 from hybrid_jax.cli.page import Table as Cells
 from hybrid_jax.io.files import json_value, write_atomic
 
-FORMAT = 2  # of report.json
+FORMAT = 3  # of report.json
 PRINTED = 5  # lines of a table in a terminal
 JSON_NAME, CSV_NAME, PAGE_NAME, HTML_NAME = "report.json", "rows.csv", "report.md", "report.html"
 MEANINGLESS = "The smoke preset only shows that everything works: its numbers mean nothing, so no hypothesis is judged."
@@ -115,8 +115,15 @@ def rows_in(record: Mapping[str, Any]) -> Results:
 
 
 def to_json(report: Report) -> dict[str, Any]:
-    judged = claims.to_json(report.claims)
-    return json_value({"format": FORMAT, **report.record, **judged, "figures": report.captions()})
+    """Return the values of report.json: rows by column, as names would else take half of it."""
+    judged, rows = claims.to_json(report.claims), by_column(report.record["rows"])
+    return json_value({"format": FORMAT, **report.record, "rows": rows, **judged, "figures": report.captions()})
+
+
+def read_record(folder: str | Path) -> dict[str, Any]:
+    """Return the record of a report.json, with its verdicts and captions."""
+    record = json.loads((Path(folder) / JSON_NAME).read_text("utf-8"))
+    return record | {"rows": by_row(record["rows"])}
 
 
 def lines_of(record: dict[str, Any]) -> str:

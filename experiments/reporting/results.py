@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, overload
 
 import numpy as np
@@ -146,3 +147,14 @@ def leaves(tree: Mapping[str, Any], between: str, prefix: str = "") -> Iterator[
             yield from leaves(value, between, f"{prefix}{name}{between}")
         else:
             yield f"{prefix}{name}", value
+
+
+def by_column(rows: Iterable[Row]) -> list[dict[str, list[Any]]]:
+    """Return a mapping from names to columns for each run of rows that have the same names."""
+    runs = ((names, [row.values() for row in own]) for names, own in groupby(rows, list))
+    return [dict(zip(names, map(list, zip(*values, strict=True)), strict=True)) for names, values in runs]
+
+
+def by_row(tables: Iterable[Mapping[str, Sequence[Any]]]) -> list[Row]:
+    """Return the rows that `by_column` was given."""
+    return [dict(zip(table, row, strict=True)) for table in tables for row in zip(*table.values(), strict=True)]

@@ -24,6 +24,7 @@ from experiments.identification import emps, record, tanks
 from experiments.paper.config import SMOKE
 from experiments.paper.lanes import physics_in
 from experiments.paper.study import placeholder, study
+from experiments.reporting.report import read_record
 from experiments.runner.command import MINUTES
 from hybrid_jax.sim import PARAMETER_SHIFT, SplitSpec
 from hybrid_jax.vehicle import IRIS
@@ -42,7 +43,7 @@ def folder(tmp_path_factory):
 def test_every_row_has_a_model_that_loads_and_predicts(folder):
     at_rest = placeholder(SplitSpec(2, 5))
     out = folder / "out" / "param_shift"
-    rows = json.loads((out / "report.json").read_text())["rows"]
+    rows = read_record(out)["rows"]
     assert len(list((out / "models").iterdir())) == len(rows)
     for row in rows:
         model = hybrid_jax.load(out / "models" / f"{row['model']}-{row['mode']}-{row['n_train']}-seed{row['seed']}.npz")

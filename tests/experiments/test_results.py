@@ -1,5 +1,6 @@
 """The table of results and the cells of its rows; intervals have their nominal coverage, and limits are exact."""
 
+import json
 import math
 
 import numpy as np
@@ -8,7 +9,7 @@ import scipy
 from reports import ERRORS, changed, make_rows, row
 
 from experiments.paper.lanes import BASELINES, DOMAINS, TAGS, by_domain, cells, gain, with_rho
-from experiments.reporting.results import Results
+from experiments.reporting.results import Results, by_column, by_row
 from experiments.reporting.statistics import Estimate, mean_interval, ratio_of_stds, share_interval, share_of_gap
 
 
@@ -73,6 +74,14 @@ def test_pairs_are_of_the_same_seed():
 def test_malformed_rows_are_refused(rows, words):
     with pytest.raises(ValueError, match=words):
         Results(rows, ("seed",))
+
+
+def test_columns_give_the_same_rows_in_their_order():
+    """Also where rows have other columns, the same ones in another order, or nothing to tell."""
+    rows = [{"seed": 0, "mse": 0.1}, {"seed": 1, "mse": None}, {"seed": 1}, {"mse": 0.2, "seed": 2}, {"seed": 3}]
+    found = by_row(json.loads(json.dumps(by_column(rows))))
+    assert [[*row.items()] for row in found] == [[*row.items()] for row in rows]
+    assert by_column(rows[:2]) == [{"seed": [0, 1], "mse": [0.1, None]}]
 
 
 REPEATS, SEEDS = 2000, 10

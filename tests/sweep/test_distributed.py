@@ -1,6 +1,5 @@
 """Several processes are one run: the same rows as one process, and none is waited for when it is gone."""
 
-import json
 import os
 import shutil
 import signal
@@ -12,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from experiments.reporting.report import read_record
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("all_cores")]
 
@@ -94,7 +95,7 @@ def alone(tmp_path_factory):
 
 
 def rows(out):
-    return json.loads((out / "param_shift" / "report.json").read_text())["rows"]
+    return read_record(out / "param_shift")["rows"]
 
 
 def with_flights(alone, folder):
