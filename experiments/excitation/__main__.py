@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
@@ -13,22 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from rich.console import Console
 
-from experiments.excitation.results import (
-    CLAIMS,
-    DESIGNED,
-    FLIGHTS,
-    RANDOM,
-    DesignEvidence,
-    Flown,
-    conclusion,
-    described,
-    draw,
-    margin_table,
-    margins,
-    tables,
-)
+from experiments.excitation import results
+from experiments.excitation.results import DESIGNED, FLIGHTS, RANDOM, DesignEvidence, Flown, margins
 from experiments.flying.changes import CHANGES
-from experiments.paper.conditions import Noise, measure
+from experiments.paper.conditions import measure, sensor_noise
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results, Row
@@ -114,32 +102,23 @@ def experiment(config: ExcitationConfig, console: Console) -> None:
     flights = stages.timed("flights", lambda: flown(config, domain, design), "compiling and flying")
     jobs = [partial(fitted, config, domain, flights, name, seed) for name in FLIGHTS for seed in range(config.seeds)]
     rows = Results([row for found in stages.parts("fits", jobs) for row in found], ("flight", "parameter", "seed"))
-    extra = {"design": described(design), "flown": margins(config.bounds, flights[DESIGNED, 0][0])}
+    extra = {"design": results.described(design), "flown": margins(config.bounds, flights[DESIGNED, 0][0])}
     stages.publish(NAME, config, rows, report, **extra)
 
 
 def report(record: Mapping[str, Any]) -> Report:
     rows, planned, flown = rows_in(record), record["design"]["margins"], record["flown"]
-    verdicts = evaluate(CLAIMS, DesignEvidence(rows, flown))
-    made = [verdict_table(verdicts, "Hypotheses"), *tables(rows), margin_table(planned, flown)]
-    return Report(record, draw(rows), made, conclusion(rows), verdicts, HEAD)
+    verdicts = evaluate(results.CLAIMS, DesignEvidence(rows, flown))
+    made = [verdict_table(verdicts, "Hypotheses"), *results.tables(rows), results.margin_table(planned, flown)]
+    return Report(record, results.draw(rows), made, results.conclusion(rows), verdicts, HEAD)
 
 
 def designed(config: ExcitationConfig) -> Excitation:
     model = with_disturbance(rigid_body(IRIS, config.parameters))
-    noise = sizes(noise_of(config)).tolist()
+    noise = sensor_noise(config.noise).tolist()
     search = {name: getattr(config, name) for name in ("seconds", "bandwidth", "starts", "steps")}
     given = {"noise": noise, "window": STEPS * DT, "dt": DT} | search
     return excitation(model, config.parameters, config.bounds, jax.random.key(0), **given)
-
-
-def noise_of(config: ExcitationConfig) -> Noise:
-    return Noise(**{name: config.noise * size for name, size in asdict(Noise()).items()})
-
-
-def sizes(noise: Noise) -> Float[Array, "13"]:
-    groups = (3, noise.position), (4, noise.quaternion), (3, noise.velocity), (3, noise.body_rates)
-    return jnp.concatenate([jnp.full(count, size) for count, size in groups])
 
 
 def flown(config: ExcitationConfig, domain: Domain, design: Excitation) -> dict[tuple[str, int], Flown]:
@@ -185,7 +164,7 @@ def fitted(
     states, inputs = flights[name, seed]
     key = jax.random.fold_in(jax.random.key(2 + seed), FLIGHTS.index(name))
     log = jnp.asarray(states, jnp.float32), jnp.asarray(inputs, jnp.float32)
-    found = jax.device_get(_fit(config.parameters, noise_of(config), *log, key))
+    found = jax.device_get(_fit(config.parameters, sensor_noise(config.noise), *log, key))
     truth = nominal(domain.vehicle)
     return [
         {
@@ -200,12 +179,12 @@ def fitted(
 
 
 @eqx.filter_jit
-def _fit(parameters: tuple[str, ...], noise: Noise, states: Array, inputs: Array, key: PRNGKeyArray):
+def _fit(parameters: tuple[str, ...], noise: np.ndarray, states: Array, inputs: Array, key: PRNGKeyArray):
     log, n = measure(states, noise, key), len(inputs) // STEPS * STEPS
     windows = Trajectories(
         log[:n:STEPS], inputs[:n].reshape(-1, STEPS, inputs.shape[1]), log[1 : n + 1].reshape(-1, STEPS, 13), DT
     )
-    scale = sizes(noise)
+    scale = jnp.asarray(noise, jnp.float32)
     found = fit_least_squares(with_disturbance(rigid_body(IRIS, parameters)), windows, scale=scale)
     covariance = covariance_of(found.field, windows, scale=scale, cluster=len(windows) // BLOCKS)
     told = information_of(found.field, states, inputs, DT, STEPS, scale)

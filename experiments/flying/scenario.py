@@ -1,18 +1,17 @@
 """References, and the hardware between controller and vehicle."""
 
 from collections.abc import Mapping
-from dataclasses import astuple
 from typing import TYPE_CHECKING, Literal
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from experiments.paper.conditions import Noise
 from hybrid_jax import control
 from hybrid_jax.control import Controller, Hardware, sample
 from hybrid_jax.control.cost import Scalar
 from hybrid_jax.control.references import Path
+from hybrid_jax.vehicle import SENSOR_NOISE
 
 ALTITUDE = 1.5  # m
 
@@ -52,5 +51,5 @@ def sampled(controller: Controller, seconds: float) -> Float[np.ndarray, "k n 13
 
 def hardware(noise: float, latency: float, rotor_lag: float) -> Hardware:
     """The hardware between controller and vehicle; noise 1 is typical of motion capture and a gyroscope."""
-    m, quaternion, speed, rate = (noise * size for size in astuple(Noise()))
-    return Hardware(latency, rotor_lag, (m, quaternion, speed, rate))
+    m, quaternion, speed, rate = SENSOR_NOISE
+    return Hardware(latency, rotor_lag, (noise * m, noise * quaternion, noise * speed, noise * rate))

@@ -2,7 +2,7 @@
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any, cast
 
 import equinox as eqx
@@ -13,7 +13,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from experiments.paper.config import HELD_BACK, AllPatience, AllRates, Config, Encoding, Stopping, column
 from experiments.paper.expert_augmentation import expert_augmented
-from experiments.runner.options import NotNegative
 from hybrid_jax import rotation
 from hybrid_jax.dynamics import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, perturbed
@@ -28,7 +27,7 @@ from hybrid_jax.training import Settings, fitting
 from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config
 from hybrid_jax.training.loss import REGULARISERS
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, VELOCITY, Vehicle
+from hybrid_jax.vehicle import QUATERNION, SENSOR_NOISE, Vehicle
 
 FORCES = 6  # v̇ and ω̇ are the last outputs of every residual network
 FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # outputs of `multirotor_network` that are forces
@@ -184,34 +183,23 @@ def _key(seed, purpose: int) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.key(seed), purpose)
 
 
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviation of the white measurement noise on each entry of a group of the state."""
-
-    position: NotNegative = SENSOR_NOISE[0]
-    """[m], motion capture."""
-    quaternion: NotNegative = SENSOR_NOISE[1]
-    """Of each component, motion capture: about 0.2 degrees."""
-    velocity: NotNegative = SENSOR_NOISE[2]
-    """[m/s], differentiated motion capture."""
-    body_rates: NotNegative = SENSOR_NOISE[3]
-    """[rad/s], gyroscope."""
+def sensor_noise(level: float) -> Float[np.ndarray, "13"]:
+    """Return the size of white noise on each entry of a sample; 1 is typical of motion capture and a gyroscope."""
+    return level * np.repeat(SENSOR_NOISE, [3, 4, 3, 3])
 
 
-def measure(x: Float[Array, "*n 13"], noise: Noise, key: PRNGKeyArray) -> Float[Array, "*n 13"]:
+def measure(
+    x: Float[Array, "*n 13"], noise: Float[Array | np.ndarray, "13"], key: PRNGKeyArray
+) -> Float[Array, "*n 13"]:
     """Add white noise to the states and normalise quaternions."""
-    sizes = np.zeros(13)
-    for group, size in zip((POSITION, QUATERNION, VELOCITY, BODY_RATES), asdict(noise).values(), strict=True):
-        sizes[group] = size
-    noisy = x + jnp.asarray(sizes, x.dtype) * jax.random.normal(key, x.shape, x.dtype)
+    noisy = x + jnp.asarray(noise, x.dtype) * jax.random.normal(key, x.shape, x.dtype)
     return noisy.at[..., QUATERNION].set(rotation.normalise(noisy[..., QUATERNION]))
 
 
 def measured(dataset: Dataset, level: float, seed: int) -> Dataset:
     if not level:
         return dataset
-    noise = Noise(**{name: level * size for name, size in asdict(Noise()).items()})
-    splits = dict(dataset.splits)
+    noise, splits = sensor_noise(level), dict(dataset.splits)
     for name, windows in dataset.splits.items():
         if not name.startswith("test"):
             start_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode())))
@@ -222,4 +210,4 @@ def measured(dataset: Dataset, level: float, seed: int) -> Dataset:
                 touching = 1 + np.flatnonzero((windows.x0[1:] == windows.x[:-1, -1]).all(axis=1))
                 x0[touching] = x[touching - 1, -1]
             splits[name] = Trajectories(x0, windows.u, x, windows.dt)
-    return Dataset(splits, {**dataset.metadata, "noise": asdict(noise)})
+    return Dataset(splits, {**dataset.metadata, "noise": level})

@@ -6,7 +6,7 @@ THETA_P_ONLY, THETA_D_ONLY = "theta_p_only", "theta_d_only"
 LEAST_SQUARES, CONSTANT_DISTURBANCE = "least_squares", "constant_disturbance"
 THRUST, HOLD, CHOSEN = "thrust", "hold", "chosen"
 FINE_TUNED, TARGET_ONLY, SOURCE_ONLY = "fine_tuned", "target_only", "source_only"
-SCRATCH, ZERO_SHOT, NOMINAL = "scratch", "zero_shot", "nominal"
+SCRATCH = "scratch"
 UNCHANGED, PARAMETER_SHIFT, EXTERNAL_FORCE = "source", "parameter_shift", "external_force"
 LABELS = {
     HYBRID: "hybrid",
@@ -23,7 +23,6 @@ LABELS = {
     HOLD: "constant state",
     CHOSEN: "chosen",
     FINE_TUNED: "fine-tuned",
-    ZERO_SHOT: "zero-shot",
     TARGET_ONLY: "target-only",
     SOURCE_ONLY: "source-only",
     UNCHANGED: "unchanged vehicle",

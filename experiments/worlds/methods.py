@@ -1,17 +1,15 @@
 """Common methods of adapting a vehicle's model to ten seconds of flight, beside `hj.adapt`."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import hybrid_jax as hj
-from experiments.paper.conditions import Noise
+from experiments.paper.conditions import sensor_noise
 from experiments.worlds.world import DT, World
 from hybrid_jax.adaptation import Adaptation, FineTune, Method, Parameter
 
@@ -68,8 +66,7 @@ def white_box(task: Task) -> Model:
 
 def kalman_filter(task: Task) -> Model:
     """Estimate the same parameters by an extended Kalman filter, sample by sample."""
-    noise = task.noise * np.repeat([*asdict(Noise()).values()], [3, 4, 3, 3])
-    physics = hj.rigid_body(task.world.vehicle, PHYSICS)
+    noise, physics = sensor_noise(task.noise), hj.rigid_body(task.world.vehicle, PHYSICS)
     online = hj.OnlineAdaptation(physics, DT, tuple(noise.tolist()), disturbance=CHANGING)
     x, u = (jnp.asarray(part).reshape(-1, part.shape[-1]) for part in (task.windows.x, task.windows.u))
     state = _filtered(online, jnp.asarray(task.windows.x0[0]), x, u)

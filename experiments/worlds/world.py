@@ -1,7 +1,6 @@
 """The interface of a world, its references, and the logs of its vehicle."""
 
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -9,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from experiments.paper.conditions import Noise, measure
+from experiments.flying import changes
+from experiments.paper.conditions import measure, sensor_noise
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
@@ -18,16 +18,7 @@ DT = 0.01  # s, a decision of the pilot and an interval of the log
 SETTLING = 3.0  # s, flown before the log begins: after a second some vehicles still turn over
 TONES = 3
 BURST, WILD = slice(400, 430), 50.0  # samples of an outlier burst, and how many times the usual noise they have
-MADE_FOR = (
-    "parameter_shift",
-    "external_force",
-    "doubled_drag",
-    "weak_rotor",
-    "off_centre_load",
-    "gusty_wind",
-    "load_and_wind",
-    "reaction_torque",
-)
+MADE_FOR = (*(domain.name for domain in changes.CHANGES), "reaction_torque")
 NOTHING, USUAL = "nothing", "moving"
 NOT_MADE_FOR = (NOTHING, "motor_lag", "battery")  # no candidate can express them
 CHANGES = (*MADE_FOR, *NOT_MADE_FOR)
@@ -135,8 +126,7 @@ def logged(
     """
 
     def with_noise(states: np.ndarray, level: float, key: PRNGKeyArray) -> np.ndarray:
-        sizes = Noise(**{name: level * size for name, size in asdict(Noise()).items()})
-        return np.array(measure(jnp.asarray(states, jnp.float32), sizes, key))
+        return np.array(measure(jnp.asarray(states, jnp.float32), sensor_noise(level), key))
 
     parts = []
     for i, states in enumerate(flights.states):

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from pendulum import Push, pendulum, pushes, swings
 
 import hybrid_jax as hj
-from experiments.paper.conditions import Noise, measure
+from experiments.paper.conditions import measure, sensor_noise
 from hybrid_jax import IRIS, AbstractVectorField, Hybrid, fit_least_squares, rigid_body, with_disturbance
 from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals
@@ -139,8 +139,8 @@ def fitted(measured, key):
     x0 = jnp.zeros((100, 13)).at[:, 3].set(1.0) + SPREAD * jax.random.normal(keys[0], (100, 13))
     x0 = x0.at[:, QUATERNION].set(normalise(x0[:, QUATERNION]))
     u = IRIS.hover_speed + 40 * jax.random.normal(keys[1], (100, 10, 4))
-    x = measure(hj.rollout_batch(truth, x0, u, 0.01), Noise(), keys[2])
-    windows = hj.Trajectories(jnp.where(measured, measure(x0, Noise(), keys[3]), x0), u, x, 0.01)
+    x = measure(hj.rollout_batch(truth, x0, u, 0.01), sensor_noise(1.0), keys[2])
+    windows = hj.Trajectories(jnp.where(measured, measure(x0, sensor_noise(1.0), keys[3]), x0), u, x, 0.01)
     found = fit_least_squares(rigid_body(IRIS), windows)
     around, true = intervals(found.field, covariance_of(found.field, windows), 0.95), truth.theta()
     return found.converged, jnp.stack([jnp.stack(around[name]) / true[name] for name in true])

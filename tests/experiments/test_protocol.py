@@ -14,7 +14,7 @@ from surface import refusal
 
 from experiments import ablation
 from experiments.make_flights import chosen_flights
-from experiments.paper.conditions import Noise, adaptation, fresh_fields, measured, pretraining, subsets
+from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, subsets
 from experiments.paper.config import PAPER, PRESETS, AdaptationConfig, Stopping, column
 from experiments.paper.study import drawn_splits, placeholder, pretrained
 from hybrid_jax.dynamics.composition import Hybrid
@@ -22,7 +22,7 @@ from hybrid_jax.io.datasets import Dataset, save_dataset
 from hybrid_jax.sim import PARAMETER_SHIFT, SOURCE, SplitSpec
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, SENSOR_NOISE
 
 # The paper's tables, written down a second time: N → (rate of θ_d, minimum, patience).
 HYBRID = {100: (1e-3, 100, 20), 300: (1e-4, 300, 50), 500: (1e-4, 300, 50), 700: (1e-4, 300, 50), 1000: (1e-3, 100, 20)}
@@ -215,8 +215,8 @@ def test_noise_has_its_size_and_spares_the_test_split():
     np.testing.assert_array_equal(noisy.splits["test"].x, x)
     off = noisy.splits["train"].x - x
     # 4000 draws of a normal: its spread is known to 1.1 %.
-    np.testing.assert_allclose(off[..., 0].std(), 2 * Noise().position, rtol=0.05)
-    np.testing.assert_allclose(off[..., 12].std(), 2 * Noise().body_rates, rtol=0.05)
+    np.testing.assert_allclose(off[..., 0].std(), 2 * SENSOR_NOISE[0], rtol=0.05)
+    np.testing.assert_allclose(off[..., 12].std(), 2 * SENSOR_NOISE[3], rtol=0.05)
     np.testing.assert_allclose(np.linalg.norm(noisy.splits["train"].x0[:, 3:7], axis=1), 1, rtol=1e-6)
 
 
