@@ -18,8 +18,7 @@ from experiments.paper.conditions import settings
 from experiments.paper.config import CHANGED, ONE_FLIGHT, QUICK, SMOKE, OneFlight, preset_like
 from experiments.paper.regret import CLAIMS, ERRORS, TAGS, conclusion, error_figure, error_tables, regret_table
 from experiments.paper.study import EVERY, target_splits, windows_of
-from experiments.reporting.claims import evaluate as evaluate_claims
-from experiments.reporting.claims import verdict_table
+from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.names import FINE_TUNED, HYBRID
 from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results, Row
@@ -110,7 +109,7 @@ def of_world(world: World, config: ChangesConfig, stages: Stages) -> list[Row]:
 
 def report(record: Mapping[str, Any]) -> Report:
     rows = rows_in(record)
-    verdicts = evaluate_claims(CLAIMS, rows)
+    verdicts = evaluate(CLAIMS, rows)
     tables = [verdict_table(verdicts, "Hypotheses"), regret_table(rows), *error_tables(rows)]
     return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
 

@@ -16,8 +16,7 @@ import hybrid_jax as hj
 from experiments.paper.config import CHANGED, ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
 from experiments.paper.study import target_splits, windows_of
 from experiments.reporting import names
-from experiments.reporting.claims import Claim, Part, Undecided, all_of, verdict_table
-from experiments.reporting.claims import evaluate as evaluate_claims
+from experiments.reporting.claims import Claim, Part, Undecided, all_of, evaluate, verdict_table
 from experiments.reporting.plots import METHODS as COLOURS
 from experiments.reporting.plots import STYLE, legend_below, name_lines, note, subplots
 from experiments.reporting.report import Report, rows_in
@@ -102,7 +101,7 @@ def of_world(world: World, config: CoverageConfig, stages: Stages) -> list[Row]:
 
 def report(record: Mapping[str, Any]) -> Report:
     rows = rows_in(record)
-    verdicts = evaluate_claims(CLAIMS, rows)
+    verdicts = evaluate(CLAIMS, rows)
     tables = [verdict_table(verdicts, "Hypotheses"), worst_table(rows), pooled_table(rows)]
     return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
 

@@ -27,20 +27,8 @@ else:  # the command line offers what the registry holds
     Activation = Literal[tuple(ACTIVATIONS)]
 
 # Options that --help lists; --help-all lists all.
-COMMON = {
-    "preset",
-    "out",
-    "fresh",
-    "seeds",
-    "sizes",
-    "models",
-    "methods",
-    "changes",
-    "compared",
-    "references",
-    "agents",
-}
-COMMON |= {"over", "parts", "change", "parameters", "noise", "seconds", "worlds"}
+COMMON = {"preset", "out", "fresh", "seeds", "sizes", "models", "methods", "changes", "compared", "references"}
+COMMON |= {"agents", "over", "parts", "change", "parameters", "noise", "seconds", "worlds"}
 COMMON |= {"vehicle", "source", "target", "simulated", "learn", "columns", "n", "folds"}
 # Options that do not affect the results.
 UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id", "timeout")

@@ -8,23 +8,14 @@ from typing import Any
 from rich.console import Console
 
 from experiments.paper.config import BOTH_ENDS, ONE_FLIGHT, SMOKE, preset_like
-from experiments.reporting.claims import evaluate as evaluate_claims
-from experiments.reporting.claims import verdict_table
+from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.stages import stages_of
+from experiments.worlds import verdicts
 from experiments.worlds.cases import WorldsConfig, adapted
 from experiments.worlds.flights import WORLDS
-from experiments.worlds.verdicts import (
-    CLAIMS,
-    conclusion,
-    coverage_table,
-    draw,
-    expectation_table,
-    method_table,
-    ratio_table,
-)
 
 NAME = "worlds"
 HEAD = """\
@@ -74,12 +65,11 @@ def experiment(config: WorldsConfig, console: Console) -> None:
 
 def report(record: Mapping[str, Any]) -> Report:
     rows = rows_in(record)
-    verdicts = evaluate_claims(CLAIMS, rows)
-    tables = [verdict_table(verdicts, "Hypotheses"), *(table(rows) for table in TABLES)]
-    return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
+    judged = evaluate(verdicts.CLAIMS, rows)
+    tables = [verdict_table(judged, "Hypotheses"), *verdicts.tables(rows)]
+    return Report(record, verdicts.draw(rows), tables, verdicts.conclusion(rows), judged, HEAD)
 
 
-TABLES = ratio_table, coverage_table, expectation_table, method_table
 ABOUT = "Does adaptation to one flight ever make a model worse, in our simulator or in RotorPy?"
 main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 

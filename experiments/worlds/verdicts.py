@@ -30,6 +30,10 @@ def _sound(own: Results) -> bool:
     return bool(ratio.mean() <= MEAN and ratio.max() <= EACH)
 
 
+def tables(rows: Results) -> list[Table]:
+    return [ratio_table(rows), coverage_table(rows), expectation_table(rows), method_table(rows)]
+
+
 def ratio_table(rows: Results) -> Table:
     lines = []
     for case, own in _cases(rows).items():
