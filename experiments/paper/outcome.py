@@ -17,10 +17,10 @@ from experiments.paper.tables import altitudes, by_size, conclusion, meaning, pa
 from experiments.reporting import names
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import FINE_TUNED, PHYSICS_ONLY, label
-from experiments.reporting.report import Report, rows_in, write_report
+from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results
 from experiments.reporting.tables import over_seeds
-from experiments.runner.run_record import record_of
+from experiments.runner.stages import stages_of
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.integrate import compact
 from hybrid_jax.metrics import predict
@@ -65,19 +65,18 @@ def adapt_and_report(experiment: str, domain: Domain, floor: float, config: Adap
 
     `floor` is the share of the test error that no model ẋ = f(x, u) can remove.
     """
-    found = study(domain, IRIS, config, console)
+    stages = stages_of(config, console)
+    found = study(domain, IRIS, config, stages)
     if not hosts.is_main_process():
         return
-    out = config.out / experiment
-    save_models(out / "models", found.lanes, found.rows)
+    save_models(config.out / experiment / "models", found.lanes, found.rows)
     lowest = bands(found.target.splits["test"])
     counted = ", ".join(f"{np.sum(lowest == i)} {band}" for i, band in enumerate(BANDS.values()))
-    notes = [*found.notes, f"Test windows by lowest altitude: {counted}."]
     extra: dict[str, Any] = {"truth_theta": nominal(domain.vehicle)}
     extra |= {"flights": {"source": found.source.metadata, "target": found.target.metadata}}
     extra |= ({FLOOR: floor} if floor else {}) | paths(found)
-    record = record_of(experiment, config, found.rows, found.seconds, notes, **extra)
-    write_report(out, report(record), Console())
+    note = f"Test windows by lowest altitude: {counted}."
+    stages.publish(experiment, config, found.rows, report, note, **extra)
 
 
 def report(record: Mapping[str, Any]) -> Report:

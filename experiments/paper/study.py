@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from experiments.make_flights import chosen_flights, flights
 from experiments.paper.conditions import adaptation, fresh_fields, held_back, measured, pretraining, settings, subsets
@@ -18,7 +17,7 @@ from experiments.paper.lanes import Fit, Lanes, by_altitude, fit_of, lanes_of, r
 from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
-from experiments.runner.stages import Stage, Stages, stages_of
+from experiments.runner.stages import Stage, Stages
 from hybrid_jax.adaptation import METHODS, LeastSquares, Method
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.datasets import ARRAYS, Dataset
@@ -46,23 +45,20 @@ SOLVED: Mapping[str, Method] = {
 
 @dataclass(frozen=True)
 class Study:
-    """The outcome of an experiment: flights, trained models, rows, seconds by stage, and notes on these."""
+    """The outcome of an experiment: flights, trained models and rows."""
 
     source: Dataset
     target: Dataset
     lanes: list[Lanes]
     rows: Results
-    seconds: dict[str, float]
-    notes: list[str]
 
 
-def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: Console) -> Study:
+def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, stages: Stages) -> Study:
     """Run the protocol on a target domain, from models around the nominal θ_p of the vehicle before the change."""
-    stages = stages_of(config, console)
     source, target, *models = protocol(domain, vehicle, config, stages)
     results = stages.run([source, target, *models])
     lanes = [result for result in results.values() if isinstance(result, Lanes)]
-    return Study(results[source], results[target], lanes, rows_of(lanes), stages.seconds, stages.notes())
+    return Study(results[source], results[target], lanes, rows_of(lanes))
 
 
 def protocol(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, stages: Stages) -> list[Stage]:

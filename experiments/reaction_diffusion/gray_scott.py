@@ -7,12 +7,13 @@ import jax
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import Config
-from experiments.reaction_diffusion.models import error, joined, pieces, weights, with_weights
+from experiments.reaction_diffusion.models import error, pieces, weights, with_weights
 from experiments.reaction_diffusion.systems import D_U, D_V, SCOTT_COARSE, Conversion, gray_scott, patterns
 from experiments.reporting.results import Row
 from experiments.runner.stages import Found, Kept, rows_of
 from hybrid_jax.networks import GridNetwork, zero_output
 from hybrid_jax.networks.normalisation import ChannelScaling
+from hybrid_jax.trajectories import concatenate
 
 PART = "gray_scott"
 TRAINED_IN = tuple((f, k) for f in (0.030, 0.039) for k in (0.058, 0.062))
@@ -39,7 +40,7 @@ def source_model(config: Config, kept: Kept) -> Any:
     """Train a hybrid on one trajectory in each of the four environments, with F and k of each."""
     parts = [patterns(gray_scott(TRAINED_IN, True, config.points), e, 1, (TRAIN, e)) for e in range(len(TRAINED_IN))]
     physics = gray_scott([GUESS] * len(TRAINED_IN), False, config.points)
-    data = joined([pieces(part, EVERY) for part in parts])
+    data = concatenate([pieces(part, EVERY) for part in parts])
     hj.check_grid(physics.grid, data, diffusivity=(D_U, D_V), substeps=SCOTT_COARSE.substeps)
     size = {"outputs": 1, "hidden": min(UNITS, config.hidden)}
     network = hj.residual_network(2, 0, jax.random.key(0), **size, activation="tanh", norm="none", scaling=SCALING)

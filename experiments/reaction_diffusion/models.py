@@ -1,6 +1,5 @@
 """Shared by the studies: weights as a vector, forecasts and their error, and windows from trajectories."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -42,7 +41,3 @@ def pieces(data: hj.Trajectories, every: int, steps: int = 1, first: int = 0) ->
         return found.reshape(len(part) * len(starts), length, part.shape[-1])
 
     return hj.Trajectories(each(states, 1)[:, 0], each(data.u, steps), each(states[:, 1:], steps), data.dt)
-
-
-def joined(parts: Sequence[hj.Trajectories]) -> hj.Trajectories:
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

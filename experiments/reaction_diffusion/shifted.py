@@ -10,11 +10,12 @@ import jax
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import Config
 from experiments.reaction_diffusion.forecast import GUESS, scaling
-from experiments.reaction_diffusion.models import error, joined, pieces, weights, with_weights
+from experiments.reaction_diffusion.models import error, pieces, weights, with_weights
 from experiments.reaction_diffusion.systems import COARSE, A, B, K, fitzhugh_nagumo, plane, reacting
 from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, NO_PHYSICS, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Row
 from experiments.runner.stages import Found, Kept, rows_of
+from hybrid_jax.trajectories import concatenate
 
 PART, AUTO = "shifted", "auto"
 SOURCE, TARGET, TEST = 20, 21, 22  # first numbers of the seeds of data
@@ -44,7 +45,7 @@ def by_parameters(field, data: hj.Trajectories, method: str) -> tuple[hj.Abstrac
     # The same number of windows for every N, as they are dear. Each trajectory's begin a window later than those of the
     # one before it: of eight trajectories they would all be beginnings, which say little of what comes after.
     every, each = WINDOW * len(data), range(len(data))
-    windows = joined([pieces(data[i : i + 1], every, WINDOW, WINDOW * i) for i in each])
+    windows = concatenate([pieces(data[i : i + 1], every, WINDOW, WINDOW * i) for i in each])
     with warnings.catch_warnings(action="ignore"):  # the step is coarse for speed, and all errors count as changes
         result = hj.adapt(field, windows, method=method, settings=hj.Settings(solver=COARSE))
     return result.field, result.chosen

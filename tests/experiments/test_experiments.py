@@ -26,6 +26,7 @@ from experiments.paper.lanes import physics_in
 from experiments.paper.study import placeholder, study
 from experiments.reporting.report import read_record
 from experiments.runner.command import MINUTES
+from experiments.runner.stages import stages_of
 from hybrid_jax.sim import PARAMETER_SHIFT, SplitSpec
 from hybrid_jax.vehicle import IRIS
 
@@ -130,11 +131,11 @@ def test_an_out_that_is_a_file_is_refused_and_kept(tmp_path):
 @pytest.mark.parametrize("pattern", ["flights-source-*.npz", "stages/pre-training-hybrid-*.npz"])
 def test_a_truncated_file_in_the_cache_is_named_and_nothing_is_overwritten(pattern, folder):
     file = min((folder / "cache").glob(pattern))
-    content = file.read_bytes()
+    content, config = file.read_bytes(), replace(SMOKE, cache=folder / "cache")
     file.write_bytes(content[: len(content) // 2])
     try:
         with pytest.raises(ValueError, match=re.escape(str(file))):
-            study(PARAMETER_SHIFT, IRIS, replace(SMOKE, cache=folder / "cache"), Console(quiet=True))
+            study(PARAMETER_SHIFT, IRIS, config, stages_of(config, Console(quiet=True)))
         assert file.read_bytes() == content[: len(content) // 2]
     finally:
         file.write_bytes(content)
