@@ -11,7 +11,7 @@ from rich.console import Console
 
 from experiments.external_force import FLOOR
 from experiments.paper import figures
-from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, preset_like
+from experiments.paper.config import QUICK, SMOKE, Config, Kind, preset_like
 from experiments.paper.lanes import rows_of
 from experiments.paper.study import adapted, assess, flown, pretrained, source_splits, target_splits
 from experiments.paper.tables import CHOICES, ablation_tables
@@ -21,7 +21,7 @@ from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval
 from experiments.reporting.tables import Table
 from experiments.runner import command
-from experiments.runner.options import Target
+from experiments.runner.options import Several, Target
 from experiments.runner.run_record import record_of
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import nominal
@@ -64,10 +64,10 @@ class AblationConfig(Config):
     Defaults: 3000 source trajectories, a third of the paper's, at most 400 epochs, and N = 100.
     """
 
-    over: tuple[Choice, ...] = get_args(Choice)
+    over: Several[Choice] = get_args(Choice)
     """Which choices to change. residual: what f_d sees and adds to. weight: λ. form: of the regulariser. norm: of f_d.
     start: θ_p off by 20, 50, 100 %. source: amount of source flight. noise: of the sensors. solver: the integrator."""
-    sizes: Annotated[tuple[int, ...], Target] = (100,)
+    sizes: Annotated[Several[int], Target] = (100,)
     """N, target trajectories to adapt to."""
     pool: int | None = 1000
     """Target trajectories from which a seed draws its N."""
@@ -75,10 +75,6 @@ class AblationConfig(Config):
     """Source trajectories for pre-training."""
     max_epochs: int = 400
     """Cap, in pre-training and in fine-tuning."""
-
-    def __post_init__(self):
-        Config.__post_init__(self)
-        distinct("--over", self.over)
 
 
 PRESETS = {

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from experiments.paper import study
 from experiments.paper.conditions import settings
@@ -25,8 +24,8 @@ from experiments.reporting.results import Results, Row
 from experiments.runner import command
 from experiments.runner.cache import identity_of
 from experiments.runner.options import Named, distinct
-from experiments.runner.stages import Found, Stages, rows_of, stages_of
-from experiments.worlds.flights import WORLDS, dataset, sources
+from experiments.runner.stages import Found, Stages, rows_of
+from experiments.worlds.flights import Sources, dataset, in_each_world, sources
 from experiments.worlds.world import World
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate
@@ -70,14 +69,9 @@ flights.
 class ChangesConfig(OneFlight):
     """Adapt to one flight after each change of the vehicle, and test every candidate to see what the choice missed."""
 
-    compared: Annotated[tuple[Compared, ...], Named(name="methods")] = get_args(Compared)
+    compared: Annotated[tuple[Compared, ...], Named(name="methods"), partial(distinct, least=0)] = get_args(Compared)
     """Methods to compare with. fine_tune: Adam, as in the paper. fine_tune_offset: with --rates.offset 0.3. l2_sp: with
     a penalty on the distance from the source's parameters."""
-
-    def __post_init__(self):
-        OneFlight.__post_init__(self)
-        if self.compared:
-            distinct("--methods", self.compared)
 
 
 PRESETS = {
@@ -94,16 +88,10 @@ PRESETS = {
 }
 
 
-def experiment(config: ChangesConfig, console: Console) -> None:
-    stages = stages_of(config, console)
-    rows = [row for name in config.worlds for row in of_world(WORLDS[name], config, stages)]
-    stages.publish(NAME, config, Results(rows, TAGS), report)
-
-
 def of_world(world: World, config: ChangesConfig, stages: Stages) -> list[Row]:
-    fields, learned_from = sources(world, config, stages)
+    known = sources(world, config, stages)
     chosen = [change for change in CHANGED if change in config.changes]
-    rows = [row for change in chosen for row in adapted(world, change, fields, learned_from, config, stages)]
+    rows = [row for change in chosen for row in adapted(world, change, known, config, stages)]
     return [{"world": world.name, **row} for row in rows]
 
 
@@ -119,23 +107,17 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
     return {"errors": (error_figure(rows), about)}
 
 
-def adapted(
-    world: World,
-    change: str,
-    fields: AbstractVectorField,
-    learned_from: Trajectories,
-    config: ChangesConfig,
-    stages: Stages,
-) -> list[Row]:
+def adapted(world: World, change: str, known: Sources, config: ChangesConfig, stages: Stages) -> list[Row]:
     """Return the rows of a change: every candidate, and the methods to compare with, for every draw and seed."""
     target = dataset(world, change, target_splits(config), config, stages)
     pool, test, drawn = target.splits["train"], target.splits["test"], windows_of(METHOD, config.sizes[0], config)[0]
 
     flights, seeds = pool[drawn[:: config.seeds]], range(config.seeds)
+    shared, learned = settings(config), alike(known.windows, pool[drawn[0]])
 
     def of_draw(draw: int) -> Found:
         own = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
-        found = jax.device_get(_candidates(fields, own, flights, test, settings(config), alike(learned_from, own[0])))
+        found = jax.device_get(_candidates(known.fields, own, flights, test, shared, learned))
         inside = [_share_inside(found.ends[seed], np.delete(found.flown[seed], draw, 0)) for seed in seeds]
 
         def row(seed: int, i: int) -> Row:
@@ -147,8 +129,8 @@ def adapted(
         return [row(seed, i) for seed in seeds for i in range(len(found.names))], {}
 
     jobs = {f"flight {draw}": partial(of_draw, draw) for draw in range(config.draws)}
-    found = stages.kept(f"adapt {target.config['domain']}", jobs, identity_of(config.described(), fields, target))
-    return rows_of(found) + [{"domain": change, **row} for row in compared(fields, config, stages, target)]
+    found = stages.kept(f"adapt {target.config['domain']}", jobs, identity_of(config.described(), known.fields, target))
+    return rows_of(found) + [{"domain": change, **row} for row in compared(known.fields, config, stages, target)]
 
 
 def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages, target: Dataset) -> list[Row]:
@@ -237,7 +219,7 @@ def _share_inside(ends: np.ndarray, flown: np.ndarray) -> float | None:
 
 
 ABOUT = "One flight of ten seconds after a change of the vehicle: which method is chosen, and is it the right one?"
-main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
+main = partial(command.run, NAME, ABOUT, partial(in_each_world, NAME, TAGS, of_world, report), presets=PRESETS)
 
 if __name__ == "__main__":
     main()

@@ -22,7 +22,7 @@ from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER
 from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.options import Target, distinct, factors
+from experiments.runner.options import Several, Target, factors
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.io.datasets import Dataset
@@ -40,9 +40,9 @@ DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 class ComparisonConfig(AllModels):
     """Adapt one pre-trained model by every method with N trajectories, and test predictions over 0.1 s."""
 
-    sizes: Annotated[tuple[int, ...], Target] = (100,)
+    sizes: Annotated[Several[int], Target] = (100,)
     """N, target trajectories to adapt to; rates and patience are those of the nearest size in the paper's table."""
-    methods: tuple[Method, ...] = get_args(Method)
+    methods: Several[Method] = get_args(Method)
     """Methods to compare."""
     encoding: Encoding = field(default_factory=Encoding)
 
@@ -54,7 +54,6 @@ class ComparisonConfig(AllModels):
 
     def __post_init__(self):
         Config.__post_init__(self)
-        distinct("--methods", self.methods)
         if min(self.sizes) <= len(LEARNED):
             raise ValueError(f"--n-target must each be more than the {len(LEARNED)} of θ_p, got {self.sizes}")
         factors("--encoding.box", self.encoding.box)

@@ -10,7 +10,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from rich.console import Console
 
 import hybrid_jax as hj
 from experiments.paper.config import CHANGED, ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
@@ -24,19 +23,18 @@ from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import EMPTY, Table, tabulate
 from experiments.runner import command
 from experiments.runner.cache import identity_of
-from experiments.runner.options import Count
-from experiments.runner.stages import Found, Stages, rows_of, stages_of
-from experiments.worlds.flights import WORLDS, dataset, sources
+from experiments.runner.options import Count, Several
+from experiments.runner.stages import Found, Stages, rows_of
+from experiments.worlds.flights import Sources, dataset, in_each_world, sources
 from experiments.worlds.world import World
 from hybrid_jax.adaptation.adapting import METHODS
 from hybrid_jax.adaptation.pooling import SOURCES
 from hybrid_jax.adaptation.results import Parameter
-from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.sweep.lanes import lane
-from hybrid_jax.trajectories import Trajectories
 
 NAME = "coverage"
+TAGS = "world", "domain", "noise", "draw", "parameter"
 LEVEL, ASKED, MOST = 0.95, 0.9, 0.99  # of the intervals, and the least and largest share that may hold the truth
 WIDEST, FEW = 2.0, 20  # times what 95 % of the errors need, of which fewer flights say nothing
 RIGHT: tuple[Change, ...] = ("parameter_shift", "external_force", "doubled_drag", "weak_rotor", "gusty_wind")
@@ -59,7 +57,7 @@ class CoverageConfig(OneFlight):
     """Number of flights; each source adapts to one at a time."""
     clean: bool = True
     """Also adapt to the same flights without noise."""
-    changes: tuple[Change, ...] = RIGHT
+    changes: Several[Change] = RIGHT
     """Changes of the vehicle; by default all that keep its mass."""
 
     def __post_init__(self):
@@ -79,15 +77,8 @@ PRESETS = {
 }  # fmt: skip
 
 
-def experiment(config: CoverageConfig, console: Console) -> None:
-    stages = stages_of(config, console)
-    rows = [row for name in config.worlds for row in of_world(WORLDS[name], config, stages)]
-    tags = ("world", "domain", "noise", "draw", "parameter")
-    stages.publish(NAME, config, Results(rows, tags), report)
-
-
 def of_world(world: World, config: CoverageConfig, stages: Stages) -> list[Row]:
-    fields, learned_from = sources(world, config, stages)
+    known = sources(world, config, stages)
     levels = {0.0: "none"} if config.clean and config.noise else {}
     levels |= {config.noise: f"{config.noise:g}" if config.noise else "none"}
     return [
@@ -95,7 +86,7 @@ def of_world(world: World, config: CoverageConfig, stages: Stages) -> list[Row]:
         for change in CHANGED
         if change in config.changes
         for noise, label in levels.items()
-        for row in adapted(world, change, fields, learned_from, replace(config, noise=noise), stages)
+        for row in adapted(world, change, known, replace(config, noise=noise), stages)
     ]
 
 
@@ -106,14 +97,7 @@ def report(record: Mapping[str, Any]) -> Report:
     return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
 
 
-def adapted(
-    world: World,
-    change: str,
-    fields: AbstractVectorField,
-    learned_from: Trajectories,
-    config: CoverageConfig,
-    stages: Stages,
-) -> list[Row]:
+def adapted(world: World, change: str, known: Sources, config: CoverageConfig, stages: Stages) -> list[Row]:
     """Return a row for each flight and parameter: whether pooled and single intervals contain the true value."""
     splits = {"train": target_splits(config)["train"]}
     flights = dataset(world, change, splits, config, stages)
@@ -122,7 +106,8 @@ def adapted(
 
     def of_draw(draw: int) -> Found:
         windows = pool[drawn[draw * config.seeds]]  # the same for all sources
-        results = [hj.adapt(lane(fields, seed), windows, learned_from=learned_from) for seed in range(config.seeds)]
+        fields = [lane(known.fields, seed) for seed in range(config.seeds)]
+        results = [hj.adapt(field, windows, learned_from=known.windows) for field in fields]
         pooled = hj.pool(results) if all(each.covariance is not None for each in results) else {}
         tags: dict[str, Any] = {"domain": change, "draw": draw}
         own = {name: [each.parameters[name] for each in results] for name in LEARNED}
@@ -131,7 +116,7 @@ def adapted(
 
     name = f"intervals {flights.config['domain']}, noise {config.noise:g}"
     jobs = {f"flight {draw}": partial(of_draw, draw) for draw in range(config.draws)}
-    return rows_of(stages.kept(name, jobs, identity_of(config.described(), fields, flights)))
+    return rows_of(stages.kept(name, jobs, identity_of(config.described(), known.fields, flights)))
 
 
 def _compared(pooled: Parameter | None, own: Sequence[Parameter], true: float) -> dict[str, Any]:
@@ -281,7 +266,7 @@ CLAIMS = (
 )  # fmt: skip
 
 ABOUT = "Intervals of the physical parameters after adaptation to one flight of ten seconds: do they contain the truth?"
-main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
+main = partial(command.run, NAME, ABOUT, partial(in_each_world, NAME, TAGS, of_world, report), presets=PRESETS)
 
 if __name__ == "__main__":
     main()

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, get_args
 
 from experiments.flying.scenario import Reference, hardware
 from experiments.paper.config import QUICK, SMOKE, AllModels, Config, ResidualInputs, preset_like
-from experiments.runner.options import Count, Named, NotNegative, Positive, distinct
+from experiments.runner.options import Count, Named, NotNegative, Positive, Several, distinct
 from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.vehicle import IRIS
 
@@ -22,7 +22,7 @@ class ClosedLoopConfig(AllModels):
 
     seconds: Positive = 10.0
     """Length of a flight [s]."""
-    references: tuple[Reference, ...] = get_args(Reference)
+    references: Several[Reference] = get_args(Reference)
     """References flown at home."""
     away: Positive = 60.0
     """Distance of flights away from home [m]."""
@@ -61,7 +61,6 @@ class ClosedLoopConfig(AllModels):
 
     def __post_init__(self):
         Config.__post_init__(self)
-        distinct("--references", self.references)
         if self.away_references is not None:
             distinct("--away-references", self.away_references)
         unknown = [name for name in self.flown_away if name not in self.references]

@@ -21,7 +21,7 @@ from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results, Row
 from experiments.runner import command
-from experiments.runner.options import Count, Named, NotNegative, Positive, Run, distinct
+from experiments.runner.options import Count, Named, NotNegative, Positive, Run, Several
 from experiments.runner.stages import stages_of
 from hybrid_jax import control
 from hybrid_jax.control import Controller
@@ -65,7 +65,7 @@ class ExcitationConfig(Run):
     """Length of each flight [s]."""
     change: Change = "parameter_shift"
     """The change before the flight."""
-    parameters: Annotated[tuple[Parameter, ...], Named(name="learn")] = get_args(Parameter)
+    parameters: Annotated[Several[Parameter], Named(name="learn")] = get_args(Parameter)
     """Parameters to identify."""
     noise: NotNegative = 1.0
     """Sensor noise; 1 is typical."""
@@ -82,7 +82,6 @@ class ExcitationConfig(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        distinct("--learn", self.parameters)
         if not self.noise:
             raise ValueError("--noise must be above 0: without noise there are no intervals to compare")
         if not 3 <= self.seconds <= random_flight.SECONDS:

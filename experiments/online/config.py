@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
 from experiments.flying.scenario import Reference, hardware
-from experiments.runner.options import Named, NotNegative, Positive, Run, distinct
+from experiments.runner.options import Named, NotNegative, Positive, Run, Several
 from experiments.worlds.cases import WORLDS, WorldName
 from experiments.worlds.rotorpy import RotorPy
 from experiments.worlds.world import DT
@@ -18,15 +18,15 @@ Agent = Literal["unadapted", "observer", "l1", "least_squares", "online", "oracl
 class OnlineConfig(Run):
     """Change the simulated vehicle in the air, and fly every agent along every reference through every change."""
 
-    worlds: tuple[WorldName, ...] = get_args(WorldName)
+    worlds: Several[WorldName] = get_args(WorldName)
     """Simulated vehicles. iris: of the other experiments. hummingbird, crazyflie: of RotorPy."""
     seconds: Positive = 4.0
     """Length of a flight after the change [s]."""
-    changes: tuple[Change, ...] = get_args(Change)
+    changes: Several[Change] = get_args(Change)
     """Changes in the air."""
-    references: tuple[Reference, ...] = ("hover", "figure_eight", "fast_figure_eight", "low_pass")
+    references: Several[Reference] = ("hover", "figure_eight", "fast_figure_eight", "low_pass")
     """References to fly."""
-    agents: tuple[Agent, ...] = get_args(Agent)
+    agents: Several[Agent] = get_args(Agent)
     """Agents to compare."""
     noise: NotNegative = 1.0
     """White noise on the measured states; 1 is typical of motion capture and a gyroscope."""
@@ -41,8 +41,6 @@ class OnlineConfig(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        for name in ("worlds", "changes", "references", "agents"):
-            distinct(f"--{name}", getattr(self, name))
         if self.seconds < 1.5:
             raise ValueError(f"--seconds must be at least 1.5, got {self.seconds}")
         if self.distributed:

@@ -8,7 +8,7 @@ from experiments.flying.changes import CHANGES
 from experiments.paper.rates import AllPatience, AllRates, Patience, Rates, Stopping
 from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
 from experiments.runner import options
-from experiments.runner.options import Activation, Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
+from experiments.runner.options import Activation, Count, CountFromZero, NotNegative, Positive, Run, Several, factors
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.networks.mlp import NORMS
@@ -62,7 +62,7 @@ class Encoding:
 class Config(Run):
     """Experiments in simulation share most of their options."""
 
-    sizes: Annotated[tuple[int, ...], options.Target] = TABLE_SIZES
+    sizes: Annotated[Several[int], options.Target] = TABLE_SIZES
     """N, target trajectories to train on. Rates and patience are those of the nearest size in the paper's table."""
     pool: int | None = None
     """Target trajectories from which a seed draws its N; by default as many as the largest N."""
@@ -120,7 +120,6 @@ class Config(Run):
     def __post_init__(self):
         Run.__post_init__(self)
         factors("--init-range", self.guess)
-        distinct("--n-target", self.sizes)
         batch = f"--batch-size {self.batch_size}"
         if min(self.sizes) < self.batch_size:
             raise ValueError(f"--n-target must each be at least {batch}, got {self.sizes}")
@@ -189,7 +188,7 @@ class AllModels(Config):
 class AdaptationConfig(AllModels):
     """Pre-train on source flight, adapt to the target with N short trajectories, and test."""
 
-    models: tuple[Model, ...] = MODELS
+    models: Several[Model] = MODELS
     """Which models to compare. constant_disturbance: the source's hybrid with θ_p and a constant
     disturbance fitted by least squares."""
     target_only: bool = True
@@ -199,16 +198,12 @@ class AdaptationConfig(AllModels):
     target_flights: Path | None = None
     """The same for the target, with the splits train, validation and test."""
 
-    def __post_init__(self):
-        Config.__post_init__(self)
-        distinct("--models", self.models)
-
 
 @dataclass(frozen=True)
 class OneFlight(Config):
     """After a change you have one short flight with sensor noise, and no other data."""
 
-    sizes: Annotated[tuple[int, ...], options.Target] = (100,)
+    sizes: Annotated[Several[int], options.Target] = (100,)
     """N, windows of 0.1 s: one number."""
     draw: Annotated[Literal["random", "contiguous"], options.Named(name="sampling")] = "contiguous"
     """Which N target trajectories. contiguous: from the start of one flight (ten seconds for 100
@@ -221,18 +216,16 @@ class OneFlight(Config):
     """White noise on the states of all flights but the test flights; 1 is typical of motion capture and a gyroscope."""
     noise_on: Literal["all", "target"] = "target"
     """Flights with noise. all: before and after the change. target: only after it."""
-    changes: tuple[Change, ...] = CHANGED
+    changes: Several[Change] = CHANGED
     """Changes of the vehicle."""
     source_training: Annotated[Training, options.Named(name="pretraining")] = "physics_first"
     """physics_first: physics with drag and moments by least squares, then the network on what is left. joint: physics
     and network at once, as in the paper."""
-    worlds: tuple[WorldName, ...] = ("iris", "hummingbird")
+    worlds: Several[WorldName] = ("iris", "hummingbird")
     """Simulated vehicles. iris: our own simulator. hummingbird, crazyflie: vehicles of RotorPy."""
 
     def __post_init__(self):
         Config.__post_init__(self)
-        distinct("--changes", self.changes)
-        distinct("--worlds", self.worlds)
         if len(self.sizes) != 1:
             raise ValueError(f"--n-target must be one number, got {self.sizes}")
 

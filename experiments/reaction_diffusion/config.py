@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, get_args
 
-from experiments.runner.options import Count, Named, Run, Target, distinct
+from experiments.runner.options import Count, Named, Run, Several, Target
 
 
 class Case(NamedTuple):
@@ -45,14 +45,14 @@ class Config(Run):
 
     seeds: Count = 10
     """Trials: initial weights and training trajectories. Forecasts use at most three."""
-    parts: tuple[Part, ...] = get_args(Part)
+    parts: Several[Part] = get_args(Part)
     """Which parts to run. forecast: as APHYNITY. shifted: adapt to changed equations. gray_scott: as Neural Context
     Flows."""
-    cases: tuple[CaseName, ...] = tuple(case.name for case in CASES)
+    cases: Several[CaseName] = tuple(case.name for case in CASES)
     """Lines of the table of forecasts."""
-    shifts: Annotated[tuple[Shift, ...], Named(name="changes")] = get_args(Shift)
+    shifts: Annotated[Several[Shift], Named(name="changes")] = get_args(Shift)
     """parameter_shift: a × 2, b ÷ 2, k × 2. new_term: u_t has a term that is not in the source."""
-    sizes: Annotated[tuple[Count, ...], Target] = (1, 2, 4, 8)
+    sizes: Annotated[Several[Count], Target] = (1, 2, 4, 8)
     """Trajectories to adapt to."""
     points: Count = 32
     """Grid points along each axis."""
@@ -73,9 +73,6 @@ class Config(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        for option, chosen in (("parts", self.parts), ("cases", self.cases), ("changes", self.shifts)):
-            distinct(f"--{option}", chosen)
-        distinct("--n-target", self.sizes)
         if self.sizes != tuple(sorted(self.sizes)):
             raise ValueError(f"--n-target must be in ascending order, got {self.sizes}")
         if self.points < 8:

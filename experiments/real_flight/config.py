@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from experiments.runner.options import Count, Named, Positive, Run, Target, distinct
+from experiments.runner.options import Count, Named, Positive, Run, Several, Target
 from hybrid_jax.cli.logs import FlightOptions
 from hybrid_jax.dynamics.vehicle_file import check_learned
 
@@ -37,9 +37,9 @@ class RealFlightConfig(FlightOptions, Run):
     """Parameters to learn, instead of the vehicle file's."""
     dt: Positive = 0.01
     """Interval of the models [s]."""
-    horizon: tuple[Count, ...] = (10, 50)
+    horizon: Several[Count] = (10, 50)
     """Numbers of intervals after which errors are measured."""
-    n: Annotated[tuple[Count, ...], Target] = (100, 600)
+    n: Annotated[Several[Count], Target] = (100, 600)
     """Numbers of target windows of ten intervals to adapt to, spread evenly over the training flights."""
     folds: Count = 3
     """Without --test: number of folds, or as many as there are names."""
@@ -52,8 +52,6 @@ class RealFlightConfig(FlightOptions, Run):
     def __post_init__(self):
         Run.__post_init__(self)
         _ = self.reading  # topics are checked before anything is read
-        distinct("--horizon", self.horizon)
-        distinct("--n-target", self.n)
         check_learned(self.learn)
         if self.simulated and any(getattr(self, name) for name in PATHS):
             raise ValueError(f"--simulated makes its own logs: leave out {', '.join(OPTIONS.values())}")

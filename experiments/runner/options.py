@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_type_hints
 
 import platformdirs
 import tyro
@@ -14,13 +14,23 @@ from hybrid_jax import checks
 from hybrid_jax.cli.help import option_of
 from hybrid_jax.networks.mlp import ACTIVATIONS
 
+Value = TypeVar("Value")
+
+
+def distinct(option: str, names: Sequence[Any], least: int = 1) -> None:
+    """Raise ValueError if an option lists too little, or something twice."""
+    if len(names) < least or len(set(names)) < len(names):
+        raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
+
+
 Named = tyro.conf.arg
 Target = Named(name="n-target")  # N, the same option of all commands
-# Numbers with a rule, which `check_numbers` applies wherever an option's type mentions them.
+# Types with a rule, which `check_rules` applies wherever an option's type mentions them.
 Count = Annotated[int, checks.count]
 CountFromZero = Annotated[int, partial(checks.count, least=0)]
 Positive = Annotated[float, checks.positive]
 NotNegative = Annotated[float, checks.not_negative]
+Several = Annotated[tuple[Value, ...], distinct]
 if TYPE_CHECKING:
     Activation = str
 else:  # the command line offers what the registry holds
@@ -68,35 +78,31 @@ class Run:
             raise ValueError("--coordinator, --processes and --process-id need --distributed")
         if not 0 < self.saving <= 1:
             raise ValueError(f"--checkpoint-share must be above 0 and at most 1, got {self.saving}")
-        check_numbers("--", self)
+        check_rules("--", self)
 
     def described(self) -> dict[str, Any]:
         return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
 
 
-def check_numbers(prefix: str, options: Any) -> None:
-    """Check every number of a dataclass whose type has a rule, such as `Count` or `tuple[Positive, ...] | None`."""
+def check_rules(prefix: str, options: Any) -> None:
+    """Apply to every option of a dataclass the rules of its type, such as `Count` or `tuple[Positive, ...] | None`."""
     for name, hint in get_type_hints(type(options), include_extras=True).items():
-        option = f"{prefix}{option_of(name, getattr(hint, '__metadata__', ()))}"
-        value = getattr(options, name)
+        own, value = getattr(hint, "__metadata__", ()), getattr(options, name)
+        option = f"{prefix}{option_of(name, own)}"
         if is_dataclass(value):
-            check_numbers(f"{option}.", value)
+            check_rules(f"{option}.", value)
         if value is None or isinstance(value, str):  # a word that stands for a number
             continue
-        for rule in _rules(hint):
-            for number in value if isinstance(value, tuple) else (value,):
-                rule(option, number)
+        for rule in filter(callable, own):
+            rule(option, value)
+        for rule in (rule for part in get_args(hint) for rule in _rules(part)):
+            for entry in value if isinstance(value, tuple) else (value,):
+                rule(option, entry)
 
 
 def _rules(hint: Any) -> list[Any]:
     own = [rule for rule in getattr(hint, "__metadata__", ()) if callable(rule)]
     return own + [rule for part in get_args(hint) for rule in _rules(part)]
-
-
-def distinct(option: str, names: Sequence[Any]) -> None:
-    """Raise ValueError if an option lists nothing, or something twice."""
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
 
 
 def factors(option: str, value: tuple[float, float]) -> None:

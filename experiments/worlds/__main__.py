@@ -5,19 +5,16 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from rich.console import Console
-
 from experiments.paper.config import BOTH_ENDS, ONE_FLIGHT, SMOKE, preset_like
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.report import Report, rows_in
-from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.stages import stages_of
 from experiments.worlds import verdicts
 from experiments.worlds.cases import WorldsConfig, adapted
-from experiments.worlds.flights import WORLDS
+from experiments.worlds.flights import in_each_world
 
 NAME = "worlds"
+TAGS = "world", "change", "flight", "draw", "seed", "method"
 HEAD = """\
 A hybrid that was trained on usual flight of a vehicle adapts by `hj.adapt` to one flight after a change, or after none,
 and is tested over 1 s of usual flights after it. Ratio: its test error over the error of the source. Each source (seed)
@@ -54,15 +51,6 @@ PRESETS = {
 }
 
 
-def experiment(config: WorldsConfig, console: Console) -> None:
-    stages = stages_of(config, console)
-    rows = Results(
-        [row for name in config.worlds for row in adapted(WORLDS[name], config, stages)],
-        ("world", "change", "flight", "draw", "seed", "method"),
-    )
-    stages.publish(NAME, config, rows, report)
-
-
 def report(record: Mapping[str, Any]) -> Report:
     rows = rows_in(record)
     judged = evaluate(verdicts.CLAIMS, rows)
@@ -71,7 +59,7 @@ def report(record: Mapping[str, Any]) -> Report:
 
 
 ABOUT = "Does adaptation to one flight ever make a model worse, in our simulator or in RotorPy?"
-main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
+main = partial(command.run, NAME, ABOUT, partial(in_each_world, NAME, TAGS, adapted, report), presets=PRESETS)
 
 if __name__ == "__main__":
     main()

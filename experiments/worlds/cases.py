@@ -14,7 +14,7 @@ import hybrid_jax as hj
 from experiments.paper.config import OneFlight, WorldName
 from experiments.reporting.results import Row
 from experiments.runner.cache import identity_of
-from experiments.runner.options import Count, distinct
+from experiments.runner.options import Count, Several
 from experiments.runner.stages import Found, Stages, rows_of
 from experiments.worlds.flights import LEARNING, WORLDS, trained, usual_flights
 from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
@@ -58,11 +58,11 @@ FLIGHTS: dict[str, Manner] = {
 class WorldsConfig(OneFlight):
     """Adapt to a usual flight after each change, and to other flights, for example a hover, after none."""
 
-    changes: tuple[ChangeName, ...] = CHANGES
+    changes: Several[ChangeName] = CHANGES
     """Which changes of the vehicle."""
-    worlds: tuple[WorldName, ...] = ("iris", "hummingbird", "crazyflie")
+    worlds: Several[WorldName] = ("iris", "hummingbird", "crazyflie")
     """Simulated vehicles. iris: our own simulator. hummingbird, crazyflie: vehicles of RotorPy."""
-    learn_from: tuple[FlightName, ...] = get_args(FlightName)
+    learn_from: Several[FlightName] = get_args(FlightName)
     """Flights to adapt to. moving: ten seconds of usual flight. Of the others one draw for each source. near_ground:
     slow. short: three seconds. noisy: sensors three times as noisy. outliers: 0.3 s of outliers."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
@@ -75,10 +75,6 @@ class WorldsConfig(OneFlight):
     draw: Annotated[Literal["random", "contiguous"], tyro.conf.Suppress] = "contiguous"
     rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
     """Changes after which other methods are compared with `hj.adapt`, on the first flight of six sources."""
-
-    def __post_init__(self):
-        OneFlight.__post_init__(self)
-        distinct("--learn-from", self.learn_from)
 
     def cases(self) -> Iterator[tuple[ChangeName, FlightName]]:
         for change in self.changes:

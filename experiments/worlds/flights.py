@@ -1,19 +1,23 @@
 """Usual flights in each world, as the datasets of other experiments."""
 
 import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
+from rich.console import Console
 
 from experiments.paper import study
 from experiments.paper.conditions import fresh_fields
 from experiments.paper.config import Config, OneFlight
 from experiments.reporting.names import HYBRID
-from experiments.runner.stages import Stages
+from experiments.reporting.report import Report
+from experiments.reporting.results import Results, Row
+from experiments.runner.stages import Stages, stages_of
 from experiments.worlds.iris import Iris, domain_of
 from experiments.worlds.methods import PHYSICS
 from experiments.worlds.rotorpy import ROTORPY
@@ -31,6 +35,27 @@ from hybrid_jax.trajectories import Trajectories
 WORLDS: dict[str, World] = {world.name: world for world in (Iris(), *ROTORPY)}
 LEARNING = 20.0  # s, of a flight
 SPARE = 1.5  # times as many flights are flown as are needed
+
+
+class Sources(NamedTuple):
+    """A hybrid for each seed, stacked, and the usual flights that all were trained on."""
+
+    fields: AbstractVectorField
+    windows: Trajectories
+
+
+def in_each_world(
+    name: str,
+    tags: Sequence[str],
+    of_world: Callable[..., Sequence[Row]],
+    report: Callable[..., Report],
+    config: Any,
+    console: Console,
+) -> None:
+    """Run an experiment: `of_world(world, config, stages)` returns the rows of one of its worlds."""
+    stages = stages_of(config, console)
+    rows = [row for world in config.worlds for row in of_world(WORLDS[world], config, stages)]
+    stages.publish(name, config, Results(rows, tags), report)
 
 
 def usual_flights(world: World, change: str, flights: int, seconds: float, key: PRNGKeyArray) -> Flown:
@@ -61,10 +86,9 @@ def dataset(world: World, change: str, splits: dict[str, SplitSpec], config: Con
     return study.received(name, fly, change == NOTHING, config, stages)
 
 
-def sources(world: World, config: OneFlight, stages: Stages) -> tuple[AbstractVectorField, Trajectories]:
-    """Return a hybrid for each seed, stacked, and the usual flights that all were trained on."""
+def sources(world: World, config: OneFlight, stages: Stages) -> Sources:
     source = dataset(world, NOTHING, study.source_splits(config), config, stages)
-    return trained(world, config, stages, source), source.splits["train"]
+    return Sources(trained(world, config, stages, source), source.splits["train"])
 
 
 def trained(world: World, config: OneFlight, stages: Stages, source: Dataset) -> AbstractVectorField:
