@@ -33,12 +33,6 @@ from hybrid_jax.vehicle import IRIS
 NAME = "ablation"
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 TRUTH = {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
-HEAD = """\
-One choice of the hybrid method is changed at a time; everything else keeps its default. Each value is pre-trained on
-source flight and fine-tuned on N trajectories of each target: other moments of inertia, and a side wind.
-
-L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖²: on the source's validation windows of 0.1 s after pre-training, and on test flights of
-1 s in the target, before (source-only) and after fine-tuning. Test flights have no sensor noise."""
 NOTES = [
     "Seconds are those that the stages of a value took when they ran; a stage shared by several values counts in each.",
     "Off: mean of the recovered parameter over the true one, less 1.",
@@ -136,7 +130,7 @@ def run(config: AblationConfig, stages: Stages) -> Results:
 def report(record: Mapping[str, Any]) -> Report:
     rows = rows_in(record)
     tables = [*ratio_table(rows), *ablation_tables(rows, TRUTH)]
-    return Report(record, draw(rows), tables, conclusion(rows), head=HEAD, notes=NOTES)
+    return Report(record, draw(rows), tables, conclusion(rows), notes=NOTES)
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:

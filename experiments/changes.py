@@ -48,21 +48,6 @@ SCALES = np.where(np.arange(STATE_SIZE) < [[STATE_SIZE], [3]], 1.0, np.inf)  # o
 Compared = Literal["fine_tune", "fine_tune_offset", "l2_sp"]
 METHOD, OFFSET = Auto(), 0.3
 L2_SP = FineTune(l2_sp=1e-2)
-HEAD = """\
-A hybrid that was trained on source flight adapts to a changed vehicle with the first N windows of 0.1 s of **one**
-flight and nothing else: in our simulator, and in RotorPy, which others wrote. `hj.adapt` takes one of several
-candidates, or keeps the source model. Regret: the test error of the candidate that it took over the error of the best
-one in hindsight. ρ: the share of the source's test error that adaptation removes. Test error: L^T_MSE over 1 s of other
-flights.
-
-- **source**: not adapted. **theta**: Ix, Iy and k by least squares
-- **force**, **torque**, **drag**, **efficiency**, and several of these: fitted with Ix, Iy, k; efficiency is one for
-  each rotor, and k stays as it is
-- **network**: from the candidate that was taken, also the network's weights,
-  by a ridge Gauss–Newton step of low rank that keeps them near the source's
-- For comparison, no candidates: **fine_tune**, as in the paper; **fine_tune_offset**, its output bias at a rate of 0.3;
-  **l2_sp**, fine-tuning with a penalty on the distance from the source's parameters (L2-SP)
-"""
 
 
 @dataclass(frozen=True)
@@ -99,7 +84,7 @@ def report(record: Mapping[str, Any]) -> Report:
     rows = rows_in(record)
     verdicts = evaluate(CLAIMS, rows)
     tables = [verdict_table(verdicts, "Hypotheses"), regret_table(rows), *error_tables(rows)]
-    return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
+    return Report(record, draw(rows), tables, conclusion(rows), verdicts)
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:

@@ -38,13 +38,6 @@ TAGS = "world", "domain", "noise", "draw", "parameter"
 LEVEL, ASKED, MOST = 0.95, 0.9, 0.99  # of the intervals, and the least and largest share that may hold the truth
 WIDEST, FEW = 2.0, 20  # times what 95 % of the errors need, of which fewer flights say nothing
 RIGHT: tuple[Change, ...] = ("parameter_shift", "external_force", "doubled_drag", "weak_rotor", "gusty_wind")
-HEAD = """\
-Hybrids that were trained on source flight, with different seeds, adapt to the same N windows of one flight by
-`hj.adapt`, and `hj.pool` pools the interval of each of θ_p over the sources. Coverage: the share of flights whose
-pooled 95 % interval contains the truth. A parameter that was not fitted, or that most sources call effective, has no
-interval and does not count; where rotors lost thrust, their efficiencies take the place of k. One source: the share of
-intervals that are not pooled, of parameters that are not called effective.
-"""
 
 
 @dataclass(frozen=True)
@@ -94,7 +87,7 @@ def report(record: Mapping[str, Any]) -> Report:
     rows = rows_in(record)
     verdicts = evaluate(CLAIMS, rows)
     tables = [verdict_table(verdicts, "Hypotheses"), worst_table(rows), pooled_table(rows)]
-    return Report(record, draw(rows), tables, conclusion(rows), verdicts, HEAD)
+    return Report(record, draw(rows), tables, conclusion(rows), verdicts)
 
 
 def adapted(world: World, change: str, known: Sources, config: CoverageConfig, stages: Stages) -> list[Row]:

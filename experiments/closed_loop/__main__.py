@@ -18,6 +18,7 @@ from experiments.closed_loop.timing import call_times
 from experiments.flying.timing import on_one_core
 from experiments.paper.config import Config
 from experiments.reporting.claims import evaluate, verdict_table, with_recorded
+from experiments.reporting.questions import QUESTIONS
 from experiments.reporting.report import Report, rows_in, write_report
 from experiments.runner import command
 from experiments.runner.run_record import record_of
@@ -34,48 +35,18 @@ Training = dict[str, Stages]  # of each trained model, and of FLIGHTS
 Places = Sequence[tuple[str, float]]  # reference, distance from home [m]
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
 DISTURBANCES = {"needed": LeastSquares(), "always": LeastSquares(disturbance=True)}
-
-HEAD = """\
-A model predictive controller flies the simulated quadrotor after a change: other moments of inertia,
-or a side wind of 4 N with a sine of 1 N. Every 0.01 s the controller plans 1 s ahead with its
-prediction model; nothing else differs between the flights of a column. {knows}
-
-- **nominal physics**: the rigid body of the data sheet, not trained
-- **physics**: the same with Ix, Iy, k fitted to N target trajectories of 0.1 s
-- **hybrid**: physics plus the paper's network, trained on source flights (source), then on N target trajectories
-- **no-physics**: the paper's network without physics
-- **invariant hybrid**: a hybrid with a translation- and yaw-invariant residual. Its network reads neither p_x, p_y nor
-  yaw, but by default the distance of each rotor from the ground (--invariant-inputs). It adds a force and a torque,
-  with a linear skip connection (--invariant-linear); a smaller network, shared by all rotors, adds to the thrust of
-  each (--invariant-outputs). The output bias, which represents a constant force, has its own learning rate in
-  adaptation (--invariant-offset)
-- **invariant, least squares**: the invariant hybrid of the source with a frozen network. Least squares fits Ix, Iy, k
-  and a constant disturbance (three accelerations, three angular ones) to N target trajectories, without validation
-  flights. By default the disturbance stays zero where it does not lower the leave-one-out error
-  (--invariant-disturbance)
-- **true vehicle, mean wind**: the simulator's own equations and the mean of the wind. It is no lower bound, because an
-  observer follows the sine as well
-- **+ observer**: a disturbance observer adds the constant acceleration that explains the last prediction errors
-
-RMSE: over the flight after its initial state. A flight crashes if it goes below the ground or 10 m from the reference;
-its error then counts as infinite. Predicted cost: of the plan of a call, by the prediction model (`promised` in
-rows.csv). Actual cost: of the same inputs run open loop for 1 s in the true system (`realised`); the relative error is
-(actual − predicted) / predicted (`excess`). Calls every 0.5 s are compared. Models that were not adapted also fly the
-unchanged vehicle, on which the source networks were trained.
-"""
-
 EXACT = "It knows the true state without noise."
 
 
 def head(config: Mapping[str, Any]) -> str:
     noise, latency, lag = (config.get(name, 0.0) for name in ("noise", "latency", "rotor_lag"))
     if not (noise or latency or lag):
-        return HEAD.format(knows=EXACT)
+        return QUESTIONS[NAME].head.format(knows=EXACT)
     known = "controller and observer predict both"
     knows = (
         f"Noise of the sensors: {noise:g} times that of motion capture and a gyroscope. Latency {1e3 * latency:g} ms"
     )
-    return HEAD.format(knows=f"{knows}, lag of the rotors {1e3 * lag:g} ms; {known}.")
+    return QUESTIONS[NAME].head.format(knows=f"{knows}, lag of the rotors {1e3 * lag:g} ms; {known}.")
 
 
 def experiment(config: ClosedLoopConfig, console: Console) -> None:

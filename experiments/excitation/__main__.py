@@ -44,17 +44,6 @@ if TYPE_CHECKING:
     Change = str
 else:
     Change = Literal[tuple(CASES)]
-HEAD = """\
-Which ten seconds of flight determine the parameters best? `hj.excitation` designs a reference for the vehicle of the
-data sheet, inside a box, D-optimal for Ix, Iy and k while an unknown constant force and torque are fitted too. The
-changed vehicle then flies it, a hover and a figure-8 in the simulator with a model predictive controller that knows the
-data sheet only, and the random flights of the paper with their own pilot. Sensor noise is added to each log; least
-squares fits Ix, Iy, k and the force and torque to its windows of 0.1 s.
-
-Half-width: of the 95 % interval of the parameter's logarithm, in %, from leaving out a second at a time. Predicted:
-1.96 standard errors that the flown states and inputs should give, if the model were exact. Error: of the fitted value.
-A seed draws the noise, and the random flight.
-"""
 
 
 @dataclass(frozen=True)
@@ -109,7 +98,7 @@ def report(record: Mapping[str, Any]) -> Report:
     rows, planned, flown = rows_in(record), record["design"]["margins"], record["flown"]
     verdicts = evaluate(results.CLAIMS, DesignEvidence(rows, flown))
     made = [verdict_table(verdicts, "Hypotheses"), *results.tables(rows), results.margin_table(planned, flown)]
-    return Report(record, results.draw(rows), made, results.conclusion(rows), verdicts, HEAD)
+    return Report(record, results.draw(rows), made, results.conclusion(rows), verdicts)
 
 
 def designed(config: ExcitationConfig) -> Excitation:

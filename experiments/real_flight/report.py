@@ -14,6 +14,7 @@ from experiments.real_flight.study import ADAPTED, BASELINES, LEARNED, MODELS, F
 from experiments.reporting import names, plots
 from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evaluate, every, verdict_table
 from experiments.reporting.plots import METHODS, STYLE, Line, dots, subplots
+from experiments.reporting.questions import QUESTIONS
 from experiments.reporting.report import Report, rows_in
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval, spread
@@ -34,18 +35,6 @@ LABELS = names.LABELS | {
 }
 TINTS = {LEARNED: METHODS["fine-tuned"], ADAPTED: METHODS["adapted"]}
 Cell = tuple[str, int]  # model, n_train
-HEAD = """\
-Flights held out are predicted open loop with the recorded motors, by models that the calls of `hybrid-jax fit` and
-`hybrid-jax adapt` made of the other flights.
-
-- **hybrid-jax fit**: physics, or physics with a network, each with its past errors or without, whichever predicts
-  flights left out best
-- **its physics, no network**: the multirotor in it
-- **hybrid-jax adapt**: the same adapted to N windows of ten intervals after the change
-- **physics adapted from nominal**: the vehicle file's multirotor adapted to the same windows, without flights before
-- **rigid body + linear residual**: a linear map of state and input that is fitted to the residuals of a rigid body
-
-Errors are lengths of vectors, of rotation the angle; an RMSE over flights counts each flight once."""
 
 
 def write(
@@ -64,7 +53,7 @@ def report(record: Mapping[str, Any]) -> Report:
     claims = verdicts(found, best)
     tables = [expected_table(found), *score_tables(rows, found, config["dt"]), verdict_table(claims, "Hypotheses")]
     tables += [by_flight_table(found, best, max(config["horizon"])), parameter_table(found)]
-    head = f"{HEAD}\n\nFlights: {record['flown']}, in {len(record['folds'])} folds."
+    head = f"{QUESTIONS[NAME].head}\n\nFlights: {record['flown']}, in {len(record['folds'])} folds."
     tables = [table for table in tables if table.lines]
     return Report(record, draw(rows, config["dt"]), tables, conclusion(found, best, config["dt"]), claims, head)
 

@@ -36,7 +36,7 @@ class Report:
     tables: Sequence[Table] = ()
     conclusion: Sequence[str] = ()
     claims: Sequence[Verdict] = ()
-    head: str = ""
+    head: str = ""  # in place of the one in questions.toml
     notes: Sequence[str] = ()  # that follow from the rows, before those in the record
 
     @property
@@ -69,7 +69,8 @@ class Report:
     def page(self, folder: Path) -> Page:
         """Lay out question, answer, one figure, one small table and their meaning; the rest is folded."""
         asked, record = self.asked, self.record
-        said = [" ".join(re.sub(r"^- |[*`]", "", each).split()) for each in re.split(r"\n\s*\n|\n- ", self.head)]
+        parts = re.split(r"\n\s*\n|\n- ", self.head or asked.head)
+        said = [" ".join(re.sub(r"^- |[*`]", "", each).split()) for each in parts]
         found = self.main()
         main = narrowed(found) if found else None
         answer, *more = self.conclusions() or [""]
