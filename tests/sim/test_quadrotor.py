@@ -98,14 +98,11 @@ def hovering(altitude, tilt=0.0, axis=(1.0, 0.0, 0.0)):
 
 
 @pytest.mark.parametrize(("altitude", "percent"), [(0.1, 11.41), (0.2, 2.63), (0.5, 0.411)])
-def test_level_thrust_gains_what_cheeseman_and_bennett_say(altitude, percent):
+def test_level_thrust_gains_what_cheeseman_and_bennett_say_and_no_more_below_half_a_radius(altitude, percent):
     wrench = ground_effect(hovering(altitude), U, T0, parameters_of(IRIS))
     free = IRIS.thrust_coefficient * float((U**2).sum())
     assert 100 * float(wrench.force[2]) / free == pytest.approx(percent, abs=0.005)
     np.testing.assert_array_equal(wrench.force[:2], 0)
-
-
-def test_the_gain_stays_finite_below_half_a_radius():
     radius = jnp.asarray(IRIS.rotor_radius)
     gains = thrust_gain(jnp.array([0.5, 0.25, 0.1, 0.0, -3.0]) * radius, radius)
     np.testing.assert_allclose(gains, 4 / 3)

@@ -33,15 +33,11 @@ def level_flights(count, steps=40):
     return Flights(states, np.zeros((count, steps, 4)), np.ones((count, steps + 1)), np.zeros(count))
 
 
-def test_splits_have_exactly_the_windows_asked_for_in_single_precision(source):
+def test_splits_have_the_windows_asked_for_in_single_precision_and_depend_on_the_seed_alone(source):
     for name, split in source.splits.items():
         spec = SplitSpec(**source.config["splits"][name])
-        assert split.x.shape == (spec.windows, spec.steps, 13)
-        assert split.u.shape == (spec.windows, spec.steps, 4)
+        assert (split.x.shape, split.u.shape) == ((spec.windows, spec.steps, 13), (spec.windows, spec.steps, 4))
         assert split.x.dtype == split.u.dtype == split.x0.dtype == np.float32
-
-
-def test_a_split_depends_on_the_seed_and_not_on_the_others(source):
     again = make_dataset(SOURCE, specs(source), seed=3)
     other = make_dataset(SOURCE, specs(source), seed=4)
     assert content_hash(again) == content_hash(source)
@@ -99,22 +95,14 @@ def test_a_flight_does_not_depend_on_how_many_are_flown():
     np.testing.assert_array_equal(few.states, many.states[:2])
 
 
-def test_flights_that_go_wrong_are_dropped_and_counted():
-    flights = level_flights(6)
+@pytest.mark.parametrize(("sample", "rejected"), [(0, 1), (15, 1), (20, 2)])
+def test_flights_that_go_wrong_and_windows_with_a_rotor_below_ground_are_dropped_and_counted(sample, rejected):
+    flights, tally = level_flights(6), Counter()
     for place, value in {(1, 20, 11): np.nan, (2, 5, 0): 21.0, (3, 5, 8): 16.0, (4, 30, 2): -0.1}.items():
         flights.states[place] = value
-    tally = Counter()
-    assert sum(map(len, cut(flights, 10, tally))) == 8
-    assert tally == {"flights": 6, "dropped_flights": 4, "windows": 8, "rejected_windows": 0}
-
-
-@pytest.mark.parametrize(("sample", "rejected"), [(0, 1), (15, 1), (20, 2)])
-def test_windows_with_a_rotor_below_ground_are_rejected_and_counted(sample, rejected):
-    flights = level_flights(1)
     flights.lowest_rotor[0, sample] = -0.001  # sample 20 ends one window and starts the next
-    tally = Counter()
-    assert sum(map(len, cut(flights, 10, tally))) == 4 - rejected
-    assert tally["rejected_windows"] == rejected
+    assert sum(map(len, cut(flights, 10, tally))) == 8 - rejected
+    assert tally == {"flights": 6, "dropped_flights": 4, "windows": 8 - rejected, "rejected_windows": rejected}
 
 
 def test_splits_come_from_disjoint_flights_and_windows_do_not_overlap(monkeypatch):
@@ -142,27 +130,26 @@ def test_a_domain_in_which_every_flight_fails_says_so(monkeypatch):
     broken = level_flights(64)
     broken.states[:, 3, 2] = np.nan
     monkeypatch.setattr(recording, "random_flights", lambda *_: broken)
-    refusal(
-        lambda: make_dataset(SOURCE, {"train": SplitSpec(1, 10)}, seed=0),
-        "domain source: all 64 flights left the bounds",
-    )
-
-
-def call(monkeypatch, *arguments):
-    monkeypatch.setattr("sys.argv", ["make_flights", *map(str, arguments)])
-    make_flights.main()
+    splits = {"train": SplitSpec(1, 10)}
+    refusal(lambda: make_dataset(SOURCE, splits, seed=0), "domain source: all 64 flights left the bounds")
 
 
 def test_the_command_writes_a_dataset_prints_a_table_and_keeps_what_exists(tmp_path, monkeypatch, capsys):
     file = tmp_path / "source.npz"
-    call(monkeypatch, "--domain", "source", "--output", file, "--train", 20, "--validation", 10)
+
+    def call(train):
+        options = "--domain", "source", "--output", str(file), "--train", str(train), "--validation", "10"
+        monkeypatch.setattr("sys.argv", ["make_flights", *options])
+        make_flights.main()
+
+    call(20)
     assert "windows below 0.5 m" in capsys.readouterr().out
     before = file.read_bytes()
     assert len(load_dataset(file).splits["train"]) == 20
-    call(monkeypatch, "--domain", "source", "--output", file, "--train", 20, "--validation", 10)
+    call(20)
     for train, said in ((30, "splits.train.windows is 20, expected 30"), (-3, "--train must be")):
         with pytest.raises(SystemExit) as stop:
-            call(monkeypatch, "--domain", "source", "--output", file, "--train", train, "--validation", 10)
+            call(train)
         assert stop.value.code == 2
         (message,) = capsys.readouterr().err.strip().splitlines()
         assert said in message
