@@ -112,21 +112,16 @@ def module_with(monkeypatch, name, sign):
     return module
 
 
-def test_classes_of_one_name_are_told_apart_by_module(tmp_path, monkeypatch):
+def test_classes_of_one_name_are_told_apart_by_module_which_is_named_if_it_is_not_imported(tmp_path, monkeypatch):
     one, other = module_with(monkeypatch, "one", 1), module_with(monkeypatch, "other", -1)
     for module in (one, other):
         hj.save(tmp_path / f"{module.__name__}.npz", module.Linear(jnp.ones(())))
     assert type(hj.load(tmp_path / "one.npz").field) is one.Linear
     assert type(hj.load(tmp_path / "other.npz").field) is other.Linear
-
-
-def test_a_class_that_is_not_imported_is_named(tmp_path, monkeypatch):
-    module = module_with(monkeypatch, "one", 1)
-    hj.save(tmp_path / "model.npz", module.Linear(jnp.ones(())))
     monkeypatch.delitem(sys.modules, "one")
     with pytest.raises(ValueError, match=r"one:Linear .*import one first, or pass like="):
-        hj.load(tmp_path / "model.npz")
-    assert hj.load(tmp_path / "model.npz", like=module.Linear(jnp.zeros(()))).field.a == 1
+        hj.load(tmp_path / "one.npz")
+    assert hj.load(tmp_path / "one.npz", like=one.Linear(jnp.zeros(()))).field.a == 1
 
 
 def test_a_portable_name_outlives_its_module_and_is_unique(tmp_path, monkeypatch):
@@ -199,10 +194,9 @@ def test_another_program_cannot_import_a_class_of_the_script(tmp_path):
         "class Own(hj.AbstractVectorField):\n    a: object\n    def __call__(self, x, u): return self.a * x\n"
         "hj.save('own.npz', Own(jnp.ones(())))\n"
     )
-    said = subprocess.run(
-        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=True
-    ).stderr
-    assert "class Own is of the script that runs; define it in a module" in said
+    run = [sys.executable, "script.py"]
+    done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "class Own is of the script that runs; define it in a module" in done.stderr
 
 
 @pytest.mark.filterwarnings("ignore:.*like=")
@@ -232,17 +226,6 @@ def test_what_cannot_be_saved_is_refused_with_its_path(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-class Alarm(eqx.Module):
-    """An Equinox module that would tell if any code of it ran."""
-
-    command: str
-
-    def __init__(self, command):
-        raise AssertionError(command)
-
-    __check_init__ = __init__
-
-
 LINEAR = "equinox.nn._linear:Linear"
 HOSTILE = {
     "class that is a function": {"class": "os:system", "fields": {"command": "touch sprung"}},
@@ -269,6 +252,17 @@ def test_a_hostile_structure_is_refused(name, tmp_path, monkeypatch):
             hj.load("hostile.npz")
     assert [path.name for path in tmp_path.iterdir()] == ["hostile.npz"]
     assert "antigravity" not in sys.modules
+
+
+class Alarm(eqx.Module):
+    """It would tell if any code of it ran."""
+
+    command: str
+
+    def __init__(self, command):
+        raise AssertionError(command)
+
+    __check_init__ = __init__
 
 
 def test_no_code_of_a_users_class_runs(tmp_path):
