@@ -28,10 +28,7 @@ class Pushed(hj.AbstractVectorField):
         return self.b * u - self.a * x + 0 * self.c
 
 
-class Doubled(hj.AbstractVectorField):
-    a: jax.Array
-    b: jax.Array
-
+class Doubled(Pushed):
     def __call__(self, x, u):
         return (self.a + self.b) * u
 
