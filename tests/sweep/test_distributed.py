@@ -7,16 +7,15 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
+from smoke import ROOT
 
 from experiments.reporting.report import read_record
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("all_cores")]
 
-ROOT = Path(__file__).parents[2]
 EXPERIMENT = ["-m", "experiments.param_shift", "--preset", "smoke", "--seeds", "3", "--models", "hybrid"]
 COUNTED = ("model", "mode", "n_train", "seed", "epochs", "status")
 FAST = 20.0  # s, within which the others must end when one is gone; what they do between two exchanges is part of it

@@ -20,15 +20,14 @@ from hybrid_jax.sweep.training import evaluate, evaluate_windows, sweep
 from hybrid_jax.training import Settings, fitting
 from hybrid_jax.training.fitting import make_run_config, start
 
-BATCH = 10
-SETTINGS = Settings(batch_size=BATCH)
+SETTINGS = Settings(batch_size=10)
 TRAIN, VALIDATION = swings(40), swings(20, seed=1)
 LENGTHS = (0.8, 0.7, 0.6)
 
 
-def plan(rate=0.03, n_train=20, minimum=5, patience=3, cap=12, seed=0):
+def plan(rate=0.03, n_train=20, minimum=5, cap=12, seed=0):
     subset = np.random.default_rng(seed).permutation(40)
-    return make_run_config(rate, subset, n_train, minimum, patience, cap, 0.0)
+    return make_run_config(rate, subset, n_train, minimum, 3, cap, 0.0)
 
 
 def starts(lengths=LENGTHS):
@@ -73,7 +72,7 @@ def test_a_lane_is_a_run_by_the_plain_function(final):
 
 @pytest.mark.parametrize("solver", [diffrax.Heun(), *slow(diffrax.Tsit5())], ids=["heun", "tsit5"])
 def test_a_sweep_trains_through_the_solvers_of_diffrax(solver, final):
-    other = swept(starts(), PLANS, width=1, settings=Settings(batch_size=BATCH, solver=solver))
+    other = swept(starts(), PLANS, width=1, settings=replace(SETTINGS, solver=solver))
     assert not same(other.field, final.field)
     # The steps of 0.05 are short, so that the solver's error is all that is between them.
     np.testing.assert_allclose(other.field.log_length, final.field.log_length, rtol=0, atol=0.02)
@@ -106,8 +105,9 @@ def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
     own = replace(SETTINGS, batch_size=5)  # no other test's, or its compilation would serve here too
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         for _ in range(2):
-            sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1, block_seconds=1e-9,
-                  on_block=lambda states, progress: blocks.append(progress))  # fmt: skip
+            swept(
+                starts(), PLANS, settings=own, width=1, block_seconds=1e-9, on_block=lambda *each: blocks.append(each)
+            )
     assert len(blocks) > 3
     assert compilations(caplog) == 1
 
@@ -167,8 +167,8 @@ def test_stopped_lanes_are_run_no_more(monkeypatch):
         return run(self, lanes, shared, costs, active)
 
     monkeypatch.setattr(LaneMap, "__call__", counting)
-    swept(starts(), [plan(cap=1), plan(cap=9, minimum=9), plan(cap=20, minimum=20)], width=1, block_seconds=1e-9,
-          on_block=lambda states, progress: epochs.append(states.epoch.tolist()))  # fmt: skip
+    given = {"width": 1, "block_seconds": 1e-9, "on_block": lambda states, _: epochs.append(states.epoch.tolist())}
+    swept(starts(), [plan(cap=1), plan(cap=9, minimum=9), plan(cap=20, minimum=20)], **given)
     assert handed[1] == [0, 1, 2]  # the first call only compiles
     assert handed[2] == [1, 2]
     assert handed[-1] == [2]
@@ -179,8 +179,8 @@ def test_stopped_lanes_are_run_no_more(monkeypatch):
 
 def test_progress_says_what_is_left():
     reports = []
-    swept(starts(), [plan(cap=12, minimum=12)] * 3, width=1, block_seconds=1e-9,
-          on_block=lambda states, progress: reports.append((states, progress)))  # fmt: skip
+    given = {"width": 1, "block_seconds": 1e-9, "on_block": lambda *report: reports.append(report)}
+    swept(starts(), [plan(cap=12, minimum=12)] * 3, **given)
     for states, progress in reports:
         running = states.status == Status.RUNNING
         assert (progress.active, progress.lanes, progress.epochs) == (running.sum(), 3, states.epoch.max())
@@ -223,19 +223,14 @@ def test_runs_stop_by_their_own_validation_windows():
         swept(starts(), [own[0], wrong])
 
 
-def test_lanes_are_stacked_and_picked():
-    lanes = [{"x": np.full(2, i), "n": np.int32(i), "name": "all alike"} for i in range(3)]
+def test_lanes_are_stacked_and_picked_and_a_number_is_a_constant_of_all():
+    lanes = [{"x": np.full(2, i), "n": np.int32(i), "name": "all alike", "mass": 2.0} for i in range(3)]
     stacked = stack(lanes)
-    assert count(stacked) == 3
+    assert (count(stacked), stacked["mass"]) == (3, 2.0)
     assert eqx.tree_equal(lane(stacked, 1), lanes[1] | {"n": np.asarray(lanes[1]["n"])})
     assert lane(stacked, 1)["n"].shape == ()
-
-
-def test_a_number_is_a_constant_of_all_lanes():
-    fields = [{"k": np.float32(i), "mass": 2.0} for i in range(3)]
-    assert stack(fields)["mass"] == 2.0
     with pytest.raises(ValueError, match=r"lanes: 2.0 must be an array if it differs between lanes"):
-        stack([*fields, {"k": np.float32(3), "mass": 3.0}])
+        stack([*lanes, lanes[0] | {"mass": 3.0}])
 
 
 @pytest.mark.parametrize(("devices", "width"), [(1, 1), (2, 1), (3, 2), (4, 5), (4, 30)])
