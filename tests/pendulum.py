@@ -9,12 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics import AbstractVectorField, Hybrid
-from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.io.structure import portable
-from hybrid_jax.networks.mlp import residual_network
+from hybrid_jax import AbstractVectorField, Hybrid, Trajectories, portable, residual_network, rollout_batch
 from hybrid_jax.state_space import Angle, Quantity, StateSpace
-from hybrid_jax.trajectories import Trajectories
 
 GRAVITY = 9.81
 LENGTH, DAMPING = 0.5, 0.8  # of the true pendulum: [m], [1/s]

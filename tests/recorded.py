@@ -8,11 +8,9 @@ from writers import bag, blackbox, crazyflie, escs, foreign, px4_topics, table_o
 
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.simulated import csv_of
-from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.integrate import rollout_batch
+from hybrid_jax import IRIS, rigid_body, rollout_batch
+from hybrid_jax.flights import FlightLog
 from hybrid_jax.sim import random_flights
-from hybrid_jax.vehicle import IRIS
 
 DT, SAMPLES = 0.01, 90
 CONFIG = RealFlightConfig(horizon=(5, 10), n=(20,), seeds=1)

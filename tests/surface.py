@@ -37,13 +37,13 @@ def outcome(function, *arguments, naming="", **named):
 
 
 def refusal(call, *words):
-    """The one line in which a call is refused with a ValueError; it holds all these words."""
+    """The one line, from ^ to $, in which a call is refused with a ValueError; it holds all these words."""
     with pytest.raises(ValueError, match=r".") as error:
         call()
     message = str(error.value)
     assert "\n" not in message
     for word in words:
-        assert str(word) in message, message
+        assert str(word) in f"^{message}$", message
     return message
 
 

@@ -14,11 +14,14 @@ from pendulum import pendulum, whirling
 import hybrid_jax as hj
 from hybrid_jax.dynamics import AbstractVectorField, Terms, rigid_body
 from hybrid_jax.dynamics.base import as_field
+from hybrid_jax.networks import InputScaling
+from hybrid_jax.vehicle import QUATERNION
 
 ODD = replace(  # a vehicle without any symmetry
     hj.IRIS, mass=2.1, inertia=(0.05, 0.02, 0.06), thrust_coefficient=1.1e-5, torque_coefficient=2e-6, gravity=9.7,
     rotor_positions=((0.2, -0.1), (-0.15, 0.2), (0.1, 0.3), (-0.2, -0.25)), spin=(1.0, 1.0, -1.0, -1.0),
 )  # fmt: skip
+HOVER = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
 STEPS = 10
 GRID = 32
 
@@ -178,8 +181,9 @@ def _car() -> System:
     )  # fmt: skip
 
 
-def _flights(truth, changed, model) -> System:
-    speed = hj.IRIS.hover_speed
+def _multirotor() -> System:
+    def real(shift, learn=("Ix", "Iy", "k_rotors", "drag", "centre_of_mass"), drag=0.3):
+        return jax.tree.map(lambda leaf: leaf + shift, rigid_body(hj.IRIS, learn, Terms(drag=(drag, drag, 0.1))))
 
     def start(rng, n):
         q = np.array([1.0, 0, 0, 0]) + 0.2 * rng.normal(size=(n, 4))
@@ -188,20 +192,18 @@ def _flights(truth, changed, model) -> System:
         return np.concatenate([position, q, velocity, rates], axis=-1)
 
     def inputs(rng, shape):
-        return speed * (1 + 0.1 * rng.normal(size=(shape[0], 1, 4)) + 0.02 * rng.normal(size=(*shape, 4)))
+        shakes = 0.1 * rng.normal(size=(shape[0], 1, 4)) + 0.02 * rng.normal(size=(*shape, 4))
+        return hj.IRIS.hover_speed * (1 + shakes)
 
-    return _system(truth, changed, model, start, inputs, 0.01)
-
-
-def _multirotor() -> System:
-    def real(shift, learn=("Ix", "Iy", "k_rotors", "drag", "centre_of_mass"), drag=0.3):
-        return jax.tree.map(lambda leaf: leaf + shift, rigid_body(hj.IRIS, learn, Terms(drag=(drag, drag, 0.1))))
-
-    residual = hj.residual_network(13, 4, jax.random.key(1), hidden=16)
-    return _flights(real(0.05), real(0.15), hj.Hybrid(real(0.0, drag=0.0), residual))
+    model = hj.Hybrid(real(0.0, drag=0.0), hj.residual_network(13, 4, jax.random.key(1), hidden=16))
+    return _system(real(0.05), real(0.15), model, start, inputs, 0.01)
 
 
-def _ring(residual) -> System:
+def _convolution() -> System:
+    first, second = jax.random.split(jax.random.key(1))
+    options = {"kernel_size": 5, "padding": "SAME", "padding_mode": "CIRCULAR"}
+    residual = Convolution(eqx.nn.Conv1d(1, 3, **options, key=first), eqx.nn.Conv1d(3, 1, **options, key=second))
+
     def start(rng, n):
         wave = 2 * np.pi * (np.arange(1, 4)[:, None] * np.arange(GRID) / GRID)
         return (0.5 * rng.normal(size=(n, 1, 3)) @ np.sin(wave) + 0.5 * rng.normal(size=(n, 1, 3)) @ np.cos(wave))[:, 0]
@@ -212,15 +214,27 @@ def _ring(residual) -> System:
     )  # fmt: skip
 
 
-def _convolution() -> System:
-    first, second = jax.random.split(jax.random.key(1))
-    options = {"kernel_size": 5, "padding": "SAME", "padding_mode": "CIRCULAR"}
-    return _ring(Convolution(eqx.nn.Conv1d(1, 3, **options, key=first), eqx.nn.Conv1d(3, 1, **options, key=second)))
-
-
 MAKERS = {"pendulum": _pendulum, "circle": _circle, "car": _car, "multirotor": _multirotor}
 MAKERS |= {"wrapper": lambda: _pendulum(lambda network: Gain(jnp.zeros(()), network)), "ring_convolution": _convolution}
 SYSTEMS: dict[str, Callable[[], System]] = {name: cache(make) for name, make in MAKERS.items()}
+
+
+def flying(count=6, seed=0):
+    """States and inputs of a multirotor, one in a row: within some metres, at any attitude."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(count, 13))
+    x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
+    return x, rng.uniform(400, 900, (count, 4))
+
+
+def columns(count=6, seed=0):
+    """The same as a minibatch, one in a column."""
+    return [jnp.asarray(part.T) for part in flying(count, seed)]
+
+
+@eqx.filter_jit
+def one_by_one(field, x, u):
+    return jax.vmap(field, -1, -1)(x, u)
 
 
 @eqx.filter_jit

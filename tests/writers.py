@@ -234,6 +234,14 @@ def outputs(t, values):
     return [struct.pack("<QI16f", at, 16, *row) for at, row in zip(stamps(t), rows.tolist(), strict=True)]
 
 
+def column_map(**signals):
+    """A map of the names and the unit of each signal, in the frames of the library."""
+    text = 'frames = {world = "ENU", body = "FLU", velocity = "world"}\n'
+    for name, (columns, unit) in signals.items():
+        text += f'{name} = {{columns = {columns.split()}, unit = "{unit}"}}\n'
+    return text
+
+
 MAP = """
 frames = {world = "NED", body = "FRD", velocity = "body"}
 time = {columns = ["stamp"], unit = "us"}
