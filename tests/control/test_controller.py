@@ -1,16 +1,33 @@
-"""Laws of the controller on single calls, and of the reference states that it follows."""
+"""Laws of the controller on single calls, of the Jacobians that it needs, and of the references that it follows."""
 
 import dataclasses
+from dataclasses import replace
+from functools import cache, partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from choices import slow
 from surface import refusal
+from systems import HOVER, flying
 
 import hybrid_jax as hj
-from hybrid_jax.control import Controller, Weights, add_body_rates, figure_eight, hover, low_flyby, sample, step
+from hybrid_jax.control import (
+    Controller,
+    Weights,
+    add_body_rates,
+    advance,
+    figure_eight,
+    hover,
+    low_flyby,
+    sample,
+    step,
+)
+from hybrid_jax.control.sensitivities import advance_lagged, advance_with_jacobian, condensed, stage_shares, step_of
+from hybrid_jax.dynamics import ConstantDisturbance, Frozen
+from hybrid_jax.networks import LinearResidual, multirotor_network
 from hybrid_jax.rotation import body_z, from_axis_angle, heading, normalise
 
 # With equal arms hover needs equal speeds.
@@ -61,7 +78,7 @@ def test_half_a_turn_of_yaw_is_corrected(still, cosine):
     assert abs(torque) > 0.5 * 4 * VEHICLE.hover_speed**2
 
 
-def test_speeds_reach_the_limits_and_stay_within(still):
+def test_speeds_reach_the_limits_and_stay_within_and_more_iterations_never_raise_the_cost(still):
     x, reference = still
     plan, found = None, []
     for away in (30.0, 3000.0, -30.0, -3000.0):
@@ -70,9 +87,6 @@ def test_speeds_reach_the_limits_and_stay_within(still):
     lowest, highest = np.min(found), np.max(found)
     assert LOWEST <= lowest < LOWEST + 10.0
     assert VEHICLE.max_rotor_speed - 10.0 < highest <= VEHICLE.max_rotor_speed
-
-
-def test_more_iterations_never_raise_the_cost(still):
     x, reference = still
     turned = x.at[3:7].set(from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.array(2.5)))
     for start in (add_body_rates(x, (5.0, -6.0, 4.0)), turned, x.at[:3].add(3.0)):
@@ -81,7 +95,7 @@ def test_more_iterations_never_raise_the_cost(still):
         assert costs[-1] < 0.95 * costs[0]
 
 
-def test_quaternion_length_is_ignored_if_traced_and_refused_if_concrete(still):
+def test_quaternion_length_is_ignored_if_traced_and_refused_if_concrete_as_are_invalid_shapes(still):
     x, reference = still
     x = x.at[3:7].set(normalise(jnp.array([0.8, 0.3, -0.2, 0.5])))
     for factor in (0.5, 1.1):
@@ -92,24 +106,7 @@ def test_quaternion_length_is_ignored_if_traced_and_refused_if_concrete(still):
             CONTROLLER(BODY, reference, x.at[3:7].multiply(factor), CONTROLLER.begin())
     with pytest.raises(ValueError, match=r"reference\[2, 3:7\] must be a unit quaternion"):
         CONTROLLER(BODY, reference.at[2, 3:7].multiply(2.0), x, CONTROLLER.begin())
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"steps": 1}, "steps"), ({"interval": 0.055}, "interval must be a multiple"),
-        ({"interval": 0.005}, "interval must be a multiple"), ({"min_speed": 700.0}, "hover speed"),
-        ({"weights": {"position": 1.0}}, r"weights must be a Weights, got \{'position': 1.0\}"),
-    ],
-)  # fmt: skip
-def test_invalid_hyper_parameters_are_refused(wrong, said):
-    with pytest.raises(ValueError, match=said):
-        Controller(**{"vehicle": hj.IRIS, **wrong})
-
-
-def test_invalid_weights_and_shapes_are_refused(still):
     x, reference = still
-    refusal(lambda: Weights(yaw=0.0), "yaw")
     refusal(lambda: CONTROLLER(BODY, reference[:-1], x, CONTROLLER.begin()), "reference")
     refusal(lambda: CONTROLLER(BODY, reference, x.at[0].set(jnp.nan), CONTROLLER.begin()), "finite")
     refusal(lambda: CONTROLLER(None, reference, x, CONTROLLER.begin()), "model must be a vector field, got None")
@@ -121,34 +118,27 @@ REGULAR = Controller(hj.IRIS)
 DT = REGULAR.period
 
 
-def spiral(t):
-    return jnp.stack([jnp.sin(t), jnp.cos(2 * t), 0.3 * t**2]), jnp.sin(2 * t)
-
-
 @pytest.fixture(scope="module")
 def states():
+    def spiral(t):
+        return jnp.stack([jnp.sin(t), jnp.cos(2 * t), 0.3 * t**2]), jnp.sin(2 * t)
+
     with jax.enable_x64(True):
         return np.asarray(sample(spiral, REGULAR, 1.0))
 
 
-def test_samples_cover_the_last_horizon(states):
+def test_samples_cover_the_last_horizon_and_their_velocity_rates_and_attitude_are_those_of_the_path(states):
     assert len(states) == 100 + REGULAR.steps * REGULAR.stride + 1
     horizon = REGULAR.horizon(jnp.asarray(states), 100)
     np.testing.assert_allclose(horizon[-1], states[-1], rtol=1e-6)
     np.testing.assert_allclose(horizon[0], states[105], rtol=1e-6)
     refusal(lambda: REGULAR.horizon(jnp.asarray(states), 101), "i ≤ 100; got 101")
     refusal(lambda: REGULAR.horizon(jnp.asarray(states), -1), "i must be an integer of at least 0, got -1")
-
-
-def test_velocity_and_rates_are_derivatives(states):
     # Central differences of second order: 1e-4 of the third derivatives, which are below 20.
     np.testing.assert_allclose((states[2:, :3] - states[:-2, :3]) / (2 * DT), states[1:-1, 7:10], rtol=0, atol=1e-3)
     turning = (states[2:, 3:7] - states[:-2, 3:7]) / (2 * DT)
     found = np.array([hj.rigid_body(hj.IRIS)(x, np.zeros(4, np.float32))[3:7] for x in states[1:-1:10]])
     np.testing.assert_allclose(turning[::10], found, rtol=0, atol=2e-3)
-
-
-def test_attitude_follows_acceleration_and_yaw(states):
     acceleration = (states[2:, 7:10] - states[:-2, 7:10]) / (2 * DT) + [0, 0, hj.IRIS.gravity]
     asked = acceleration / np.linalg.norm(acceleration, axis=1, keepdims=True)
     np.testing.assert_allclose(np.asarray(body_z(states[1:-1, 3:7].T)).T, asked, rtol=0, atol=1e-3)
@@ -163,14 +153,11 @@ def test_figure_eight_reaches_its_top_speed(speed):
     assert flown.min() > 0.3 * speed
 
 
-def test_hover_and_step_have_zero_velocity():
+def test_hover_and_step_have_zero_velocity_and_a_low_flyby_is_low_for_two_fifths_of_the_time():
     samples = sample(step(to=(2.0, 0.0, 1.0), at=0.5, yaw=1.0, altitude=1.5), REGULAR, 1.0)
     np.testing.assert_array_equal(samples[:, 7:], 0)
     np.testing.assert_allclose(samples[0], sample(hover((0.0, 0.0, 1.5)), REGULAR, 1.0)[0])
     np.testing.assert_allclose(samples[-1], sample(hover((2.0, 0.0, 2.5), yaw=1.0), REGULAR, 1.0)[0], atol=1e-6)
-
-
-def test_low_flyby_is_low_for_two_fifths_of_the_time():
     altitude = np.asarray(sample(low_flyby(low=0.15, high=1.0, every=5.0), REGULAR, 9.0)[:, 2])
     assert altitude.min() == pytest.approx(0.15, abs=1e-4)
     assert altitude.max() == pytest.approx(1.0, abs=1e-4)
@@ -185,9 +172,100 @@ def test_low_flyby_is_low_for_two_fifths_of_the_time():
         (lambda: hover(yaw=np.inf), "yaw must be a finite number"), (lambda: low_flyby(low=1.0, high=0.5), "high"),
         (lambda: sample(hover(), REGULAR, -1.0), "duration"), (lambda: figure_eight(0.0), "top_speed"),
         (lambda: add_body_rates(jnp.zeros(4)), r"state \(13,\) expected"),
-        (lambda: sample(None, REGULAR, 1.0), "path must be a function of time"),
+        (lambda: sample(None, REGULAR, 1.0), "path must be a function of time"), (lambda: Weights(yaw=0.0), "yaw"),
+        (lambda: Controller(hj.IRIS, steps=1), "steps"), (lambda: Controller(hj.IRIS, min_speed=700.0), "hover speed"),
+        *((lambda dt=dt: Controller(hj.IRIS, interval=dt), "interval must be a multiple") for dt in (0.055, 0.005)),
+        (lambda: Controller(hj.IRIS, weights={"yaw": 1.0}), r"weights must be a Weights, got \{'yaw': 1.0\}"),
     ],
 )  # fmt: skip
 def test_invalid_arguments_are_refused(make, said):
     with pytest.raises(ValueError, match=said):
         make()
+
+
+INTERVAL = 0.05
+
+
+def network(inputs="all", outputs="all", norm="batch", linear=False):
+    known = {"hidden": 8, "scaling": HOVER, "vehicle": hj.IRIS}
+    made = multirotor_network(key=jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
+    return jax.tree.map(lambda leaf: leaf + 0.3 + 0.2 * jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape), made)
+
+
+class Spun(hj.AbstractVectorField):
+    def __call__(self, x, u):
+        return jnp.sin(x) + jnp.concatenate([x[5:9] * u / 600, x[:9]])
+
+
+@cache
+def body():
+    return hj.RigidBody({"Ix": jnp.asarray(0.1), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.05)}, hj.IRIS)
+
+
+def invariant():
+    forced = replace(body(), wrench=True)
+    return hj.Hybrid(forced, network("near_ground", "rotors", "none", linear=True))
+
+
+FIELDS = {
+    "physics": body, "paper": lambda: hj.Hybrid(body(), network()),
+    "layer norm": lambda: hj.Hybrid(body(), network(norm="layer")),
+    "no x, y": lambda: hj.Hybrid(body(), network("no_xy", norm="none")),
+    "body frame": lambda: hj.Hybrid(body(), network("body", "accelerations")),
+    "invariant, disturbed": lambda: hj.Hybrid(invariant(), ConstantDisturbance(jnp.ones(6))),
+    "frozen": lambda: hj.Hybrid(body(), Frozen(LinearResidual(jnp.ones((13, 17)) / 50, jnp.ones(13)))), "user": Spun,
+}  # fmt: skip
+
+
+LONG_TO_COMPILE = ("paper", "layer norm", "body frame", "invariant, disturbed")
+
+
+@pytest.mark.parametrize("name", [name for name in FIELDS if name not in LONG_TO_COMPILE] + slow(*LONG_TO_COMPILE))
+def test_jacobian_of_a_step_equals_autodiff(name):
+    def both(field, x, u):
+        expected = jnp.concatenate(jax.jacfwd(partial(advance, field), argnums=(0, 1))(x, u, INTERVAL), axis=1)
+        return advance_with_jacobian(field, x, u, u, 0.0, INTERVAL), (advance(field, x, u, INTERVAL), expected)
+
+    with jax.enable_x64(True):
+        field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), FIELDS[name]())
+        x, u = map(jnp.asarray, flying(3))
+        x = x.at[:, 2].set(jnp.array([0.2, 0.6, 1.0]))
+        found, expected = jax.jit(jax.vmap(both, in_axes=(None, 0, 0)))(field, x, u)
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * float(jnp.abs(other).max()))
+
+
+@pytest.mark.parametrize("lag", [0.005, 0.03, 0.2, 4.9, 5.1])
+def test_a_step_is_exact_for_a_chain_of_integrators_of_a_lagging_input(lag):
+    start, dt = jnp.array([0.3, -0.2, 0.1]), INTERVAL
+    with jax.enable_x64(True):
+        shares = stage_shares(lag, dt)
+        found = step_of(lambda x, f: jnp.stack([x[1], x[2], f]), jnp.asarray(start, float), shares, dt)
+    s = np.linspace(0, dt, 20_001)
+    moments = [np.trapezoid((dt - s) ** k / (1, 1, 2)[k] * np.exp(-s / lag), s) for k in (2, 1, 0)]
+    a, b, c = np.asarray(start, float)
+    expected = np.array([a + b * dt + c * dt**2 / 2, b + c * dt, c]) + moments
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [0.04, 0.0])
+def test_derivatives_by_commands_of_lagging_rotors_equal_autodiff(lag):
+    dt, body = 0.05, FIELDS["physics"]()
+
+    def states(commands, x, speeds):
+        def interval(start, command):
+            start = advance_lagged(body, *start, command, lag, dt)
+            return start, start[0]
+
+        return jax.lax.scan(interval, (x, speeds), commands)[1]
+
+    @jax.jit
+    def both(commands, x, speeds):
+        path = jnp.concatenate([x[None], states(commands, x, speeds)])
+        found = condensed(body, path[:-1], speeds, commands, lag, dt)
+        return found, jax.jacfwd(states)(commands, x, speeds)
+
+    with jax.enable_x64(True):
+        x, u = map(jnp.asarray, flying(3))
+        found, expected = both(u, x[0], u[1])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(np.asarray(expected)).max())

@@ -8,19 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import HOVER
 
 import hybrid_jax as hj
 from hybrid_jax import control
 from hybrid_jax.control.cost import deviations
 from hybrid_jax.dynamics import ConstantDisturbance, DisturbanceModel, RandomWalk
-from hybrid_jax.networks.mlp import InputScaling
 
 CONTROLLER = control.Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)
 WIND = np.array([0.0, -4 / 1.5, 0.0, 0.0, 0.0, 0.0], np.float32)  # m/s²: the mean of experiment 2's
 DT = 0.01
 TRUE = jnp.array([0.0, -4 / 1.5, 0.5, 0.3, -0.2, 0.1])
-START = jnp.zeros(13).at[2].set(2.0).at[3].set(1.0)
 
 
 def plant(field):
@@ -57,23 +56,19 @@ def test_true_model_tracks_the_reference(name, allowed):
     assert not found.crashed
 
 
-def test_recovery_from_a_rate_of_6_rad_per_s():
+def test_recovery_from_a_rate_of_6_rad_per_s_and_damping_does_not_grow_at_the_optimum():
     reference = control.sample(control.hover((0.0, 0.0, 3.0)), CONTROLLER, 2.0)
     flight, found = alone(np.zeros(6), reference, control.add_body_rates(reference[0]), 0.0, NEVER)
     assert found.largest_error < 0.3
-    assert not found.crashed
     away = np.abs(flight.x[-1] - reference[0])
     assert away[:3].max() < 0.02
     assert away[7:].max() < 0.1
-
-
-def test_damping_does_not_grow_at_the_optimum():
     reference = reference_of("hover")
     early, late = (alone(np.zeros(6), reference, reference[0], 0.0, at)[1].largest_error for at in (0.0, 1.0))
     assert late < 1.03 * early
 
 
-def test_observer_finds_the_wind_and_removes_its_error():
+def test_observer_finds_the_wind_and_removes_its_error_as_does_a_model_with_a_past():
     reference = reference_of("hover")
     _, without = alone(WIND, reference, reference[0], 0.0, NEVER)
     flight, found = alone(WIND, reference, reference[0], 10.0, NEVER)
@@ -81,10 +76,7 @@ def test_observer_finds_the_wind_and_removes_its_error():
     assert without.position_rmse > 0.1
     assert found.position_rmse < 0.3 * without.position_rmse
     assert np.linalg.norm(flight.x[-1, :3] - reference[0, :3]) < 0.01
-
-
-def test_a_model_with_a_past_carries_its_state_and_removes_the_wind():
-    """This one takes the last error, filtered over 0.1 s, for the next."""
+    # This one takes the last error, filtered over 0.1 s, for the next.
     model = DisturbanceModel(BODY, jnp.eye(12, 13), jnp.ones(13), (0.1,), ())
     reference = reference_of("hover")
     pushed = plant(hj.Hybrid(BODY, ConstantDisturbance(WIND)))
@@ -104,31 +96,18 @@ def test_a_filter_of_a_hidden_force_removes_the_wind():
     kalman = hj.ExtendedKalmanFilter(replace(system.only(noise), noise=noise), CONTROLLER.period)
     pushed = plant(hj.Hybrid(BODY, ConstantDisturbance(WIND)))
     given = {"hardware": control.Hardware(noise=(0.002, 0.002, 0.02, 0.02)), "key": jax.random.key(0)}
-    flight = jax.jit(
-        lambda: control.fly(pushed, field, reference, reference[0], CONTROLLER, estimator=kalman, **given)
-    )()
+    flown = partial(control.fly, pushed, field, reference, reference[0], CONTROLLER, estimator=kalman, **given)
+    flight = jax.jit(flown)()
     np.testing.assert_allclose(flight.estimates.x[-1, 13:], WIND[:3], atol=0.3)
     assert np.linalg.norm(flight.x[-1, :3] - reference[0, :3]) < 0.02
 
 
-def test_hidden_states_that_nothing_estimates_are_refused():
-    lagging = hj.with_hidden(BODY, hj.dynamics.Lag(jnp.log(jnp.full(4, 0.05)), (0, 1, 2, 3)))
-    model, reference = DisturbanceModel(BODY, jnp.eye(12, 13), jnp.ones(13), (0.1,), ()), reference_of("hover")
-    for bandwidth, field, message in ((0.0, lagging, "hidden states"), (1.0, model, "bandwidth must be 0")):
-        with pytest.raises(ValueError, match=message):
-            control.fly(plant(BODY), field, reference, reference[0], CONTROLLER, bandwidth)
-    with pytest.raises(ValueError, match=r"x \(25,\) and reference"):
-        CONTROLLER(model, CONTROLLER.horizon(reference, 0), reference[0], CONTROLLER.begin())
-
-
-def still(periods=4):
-    x = jnp.tile(control.sample(control.hover(), CONTROLLER, 0.1)[0], (periods + 1, 1))
-    u = jnp.full((periods, 4), hj.IRIS.hover_speed)
-    return control.Flight(x, u, CONTROLLER.begin(), None, u)
-
-
-def test_performance_of_a_known_flight():
-    flight, reference = still(), control.sample(control.hover(), CONTROLLER, 0.1)
+@pytest.mark.parametrize("end", [(0.0, 0.0, -0.1), (11.0, 0.0, 1.0), (np.nan, 0.0, 1.0)])
+def test_performance_of_known_flights_and_crashes_below_ground_too_far_or_not_finite(end):
+    reference, u = control.sample(control.hover(), CONTROLLER, 0.1), jnp.full((4, 4), hj.IRIS.hover_speed)
+    flight = control.Flight(jnp.tile(reference[0], (5, 1)), u, CONTROLLER.begin(), None, u)
+    ended = eqx.tree_at(lambda f: f.x, flight, flight.x.at[3, :3].set(jnp.array(end)))
+    assert control.performance(ended, reference, CONTROLLER).crashed
     flight = eqx.tree_at(lambda f: f.x, flight, flight.x.at[2:, 1].add(jnp.array([0.3, 0.0, 0.4])))
     flight = eqx.tree_at(lambda f: f.u, flight, flight.u.at[0, 0].set(1099.0).at[1, 1].set(1.0))
     found = control.performance(flight, reference, CONTROLLER)
@@ -143,14 +122,7 @@ def test_performance_of_a_known_flight():
     assert control.performance(flight, behind, CONTROLLER).yaw_rmse == pytest.approx(0.2, rel=1e-4)
 
 
-@pytest.mark.parametrize("end", [(0.0, 0.0, -0.1), (11.0, 0.0, 1.0), (np.nan, 0.0, 1.0)])
-def test_crashes_are_below_ground_too_far_or_not_finite(end):
-    flight = still()
-    flight = eqx.tree_at(lambda f: f.x, flight, flight.x.at[3, :3].set(jnp.array(end)))
-    assert control.performance(flight, control.sample(control.hover(), CONTROLLER, 0.1), CONTROLLER).crashed
-
-
-def test_invalid_arguments_are_refused():
+def test_invalid_arguments_hardware_and_hidden_states_that_nothing_estimates_are_refused():
     reference = reference_of("hover")
     for x0, samples in ((reference[0, :4], reference), (reference[0], reference[0]), (reference[0], reference[:101])):
         with pytest.raises(ValueError, match="reference"):
@@ -159,6 +131,21 @@ def test_invalid_arguments_are_refused():
         control.fly(plant(BODY), BODY, reference, reference[0].at[3:7].set(0.0), CONTROLLER)
     with pytest.raises(ValueError, match="bandwidth must be a finite number of at least 0"):
         control.fly(plant(BODY), BODY, reference, reference[0], CONTROLLER, jnp.asarray(-1.0))
+    lagging = hj.with_hidden(BODY, hj.dynamics.Lag(jnp.log(jnp.full(4, 0.05)), (0, 1, 2, 3)))
+    model, reference = DisturbanceModel(BODY, jnp.eye(12, 13), jnp.ones(13), (0.1,), ()), reference_of("hover")
+    for bandwidth, field, message in ((0.0, lagging, "hidden states"), (1.0, model, "bandwidth must be 0")):
+        with pytest.raises(ValueError, match=message):
+            control.fly(plant(BODY), field, reference, reference[0], CONTROLLER, bandwidth)
+    with pytest.raises(ValueError, match=r"x \(25,\) and reference"):
+        CONTROLLER(model, CONTROLLER.horizon(reference, 0), reference[0], CONTROLLER.begin())
+    for options in ({"latency": -1.0}, {"rotor_lag": np.nan}, {"noise": (0.1,)}, {"noise": (-1.0, 0.0, 0.0, 0.0)}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            control.Hardware(**options)
+    with pytest.raises(ValueError, match="latency must be a multiple"):
+        control.Hardware(latency=0.015).delay(0.01)
+    noisy = control.Hardware(noise=(0.1, 0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="key must be"):
+        control.fly(plant(BODY), BODY, reference_of("hover"), reference_of("hover")[0], CONTROLLER, hardware=noisy)
 
 
 @pytest.mark.parametrize(("start", "wanted"), [(np.float32, np.float64), (np.float64, np.float32)])
@@ -167,11 +154,8 @@ def test_mixed_precision_is_promoted(start, wanted):
         controller, body = control.Controller(hj.IRIS, steps=2), hj.rigid_body(hj.IRIS)
         reference = np.asarray(control.sample(control.hover(), controller, 0.02), wanted)
 
-        def single(x, u, t):
-            return control.advance(body, x, u, controller.period).astype(np.float32)
-
         def fly(reference, x0):
-            return control.fly(single, body, reference, x0, controller).x
+            return control.fly(lambda *given: plant(body)(*given).astype("f4"), body, reference, x0, controller).x
 
         assert jax.eval_shape(fly, reference, reference[0].astype(start)).dtype == np.float64
 
@@ -216,17 +200,6 @@ def test_a_command_arrives_late_and_the_rotors_follow():
     np.testing.assert_allclose(seen[2] - start, share * (commands[0] - start), rtol=1e-3, atol=1e-3)
 
 
-def test_hardware_that_cannot_be_is_refused():
-    for options in ({"latency": -1.0}, {"rotor_lag": np.nan}, {"noise": (0.1,)}, {"noise": (-1.0, 0.0, 0.0, 0.0)}):
-        with pytest.raises(ValueError, match=next(iter(options))):
-            control.Hardware(**options)
-    with pytest.raises(ValueError, match="latency must be a multiple"):
-        control.Hardware(latency=0.015).delay(0.01)
-    noisy = control.Hardware(noise=(0.1, 0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="key must be"):
-        control.fly(plant(BODY), BODY, reference_of("hover"), reference_of("hover")[0], CONTROLLER, hardware=noisy)
-
-
 @eqx.filter_jit
 def watch(field, plant, bandwidth, sign, periods=100):
     """Estimates over a flight of the plant at random speeds; the observer sees quaternions of this sign."""
@@ -237,23 +210,19 @@ def watch(field, plant, bandwidth, sign, periods=100):
         x = control.advance(plant, x, u, DT)
         return (x, observer.update(state, x.at[3:7].multiply(sign), u)), state.disturbance
 
-    observer = control.Observer(field, bandwidth, DT)
-    start = START, observer.begin(START.at[3:7].multiply(sign))
-    return jax.lax.scan(tick, start, speeds)[1]
+    observer, x0 = control.Observer(field, bandwidth, DT), jnp.eye(13)[2] * 2 + jnp.eye(13)[3]
+    return jax.lax.scan(tick, (x0, observer.begin(x0.at[3:7].multiply(sign))), speeds)[1]
 
 
-@pytest.fixture(scope="module")
-def fields():
-    speeds = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
-    network = hj.residual_network(13, 4, jax.random.key(0), hidden=8, scaling=speeds)
-    return {"physics": BODY, "hybrid": hj.Hybrid(BODY, network), "network": network}
+NETWORK = hj.residual_network(13, 4, jax.random.key(0), hidden=8, scaling=HOVER)
+FIELDS = {"physics": BODY, "hybrid": hj.Hybrid(BODY, NETWORK), "network": NETWORK}
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("name", "bandwidth"), [("physics", 5.0), ("hybrid", 5.0), ("network", 5.0), ("physics", 0.0)])
-def test_estimate_converges_at_the_bandwidth_whatever_the_quaternion_s_sign(fields, name, bandwidth, sign):
-    given = hj.Hybrid(fields[name], ConstantDisturbance(TRUE)), jnp.asarray(bandwidth), jnp.asarray(sign)
-    found = watch(fields[name], *given)
+def test_estimate_converges_at_the_bandwidth_whatever_the_quaternion_s_sign(name, bandwidth, sign):
+    given = hj.Hybrid(FIELDS[name], ConstantDisturbance(TRUE)), jnp.asarray(bandwidth), jnp.asarray(sign)
+    found = watch(FIELDS[name], *given)
     share = -np.expm1(-bandwidth * DT * np.arange(100))[:, None]
     # Rounding of v and ω over DT: 1e-6 / 0.01, more where a network's speeds are large.
     np.testing.assert_allclose(found, share * TRUE, rtol=0, atol=2e-2 if bandwidth else 0)
