@@ -75,11 +75,8 @@ def test_a_wrapped_network_is_trained_as_the_bare_one(how):
     assert_trained_alike(Gain(network(), how=how), network())
 
 
-def test_nested_wrappers_and_several_networks_are_trained_as_their_hybrid():
+def test_nested_wrappers_are_trained_as_their_hybrid_and_a_frozen_network_stays_in_inference_mode():
     assert_trained_alike(Sum([Gain(Gain(network(1))), network(2)]), Hybrid(network(1), network(2)))
-
-
-def test_a_frozen_network_in_a_wrapper_stays_in_inference_mode():
     (x, u), field = batch(), Gain(Frozen(network()))
     expected = base.as_field(network()).infer_batch(x, u[0])
     np.testing.assert_allclose(base.as_field(field).train_batch(x, u[0]), expected, rtol=1e-12)

@@ -1,4 +1,4 @@
-"""Laws of a rigid body with weakened rotors and added drag."""
+"""Laws of a rigid body with weakened rotors and added drag; and of its actuators: lag, curve, voltage and delay."""
 
 from dataclasses import replace
 
@@ -7,14 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from surface import refusal
 
 import hybrid_jax as hj
 from experiments.flying.changes import DOUBLED_DRAG, LOADED, WEAK_ROTOR, loaded
-from hybrid_jax.dynamics.disturbance import with_disturbance, without_zeros
+from hybrid_jax.dynamics.actuators import Actuator, actuated, held_means, rotor_speeds
+from hybrid_jax.dynamics.disturbance import disturbance_of, with_disturbance, without_zeros
 from hybrid_jax.dynamics.rigid_body import corrected, hold_corrections, uncorrected
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.export.program import sizes_of
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.sim.domain import SOURCE
 
@@ -34,16 +37,13 @@ def moving():
     return jnp.zeros(13).at[2].set(50.0).at[3:7].set(tilted).at[7:].set(jnp.array([1, -2, 0.5, 0.3, -0.2, 0.1]))
 
 
-def test_without_a_change_it_is_the_body_and_is_simplified_to_it():
+def test_without_a_change_it_is_the_body_and_is_simplified_to_it_and_held_corrections_are_no_parameters():
     larger = corrected(hj.Hybrid(BODY, hj.residual_network(13, 4, jax.random.key(0), hidden=4)))
     assert eqx.tree_equal(larger.physics, changed())
     np.testing.assert_array_equal(larger.physics(moving(), U), BODY(moving(), U))
     assert eqx.tree_equal(uncorrected(without_zeros(with_disturbance(larger))).physics, BODY)
     weak = changed((0.9, 1, 1, 1))
     assert eqx.tree_equal(uncorrected(weak), weak)
-
-
-def test_held_corrections_act_and_are_no_parameters():
     weak = changed((0.85, 1, 1, 1), 0.3)
     held = hold_corrections(weak)
     np.testing.assert_allclose(held(moving(), U), weak(moving(), U), rtol=1e-6)
@@ -51,26 +51,18 @@ def test_held_corrections_act_and_are_no_parameters():
     assert len(ravel_parameters(held)[0]) == len(ravel_parameters(BODY)[0])
 
 
-def test_an_efficiency_is_a_factor_on_thrust_and_reaction_torque():
+def test_an_efficiency_is_a_factor_on_thrust_and_reaction_torque_which_has_one_of_its_own():
     weak = changed((0.85, 1, 1, 1))
     slower = U.at[0].multiply(np.sqrt(0.85))  # both go with the square of the speed
     np.testing.assert_allclose(weak(moving(), U), BODY(moving(), slower), rtol=1e-6, atol=1e-6)
-
-
-def test_a_factor_of_the_reaction_torque_is_one_of_its_coefficient():
     other = hj.rigid_body(replace(hj.IRIS, torque_coefficient=1.6 * hj.IRIS.torque_coefficient))
     np.testing.assert_allclose(changed(reaction=1.6)(moving(), U), other(moving(), U), rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("domain", "efficiency", "drag"),
-    [(WEAK_ROTOR, 0.85, SOURCE.drag_coefficient / hj.IRIS.mass), (DOUBLED_DRAG, 1.0, None)],
-    ids=["weak rotor", "doubled drag"],
-)
+@pytest.mark.parametrize(("domain", "efficiency", "drag"), [(WEAK_ROTOR, 0.85, 1), (DOUBLED_DRAG, 1.0, 2)])
 def test_it_can_be_what_the_simulator_flies(domain, efficiency, drag):
     """Far above the ground, where ground effect is none."""
-    c = 2 * SOURCE.drag_coefficient / hj.IRIS.mass if drag is None else drag
-    field = changed((efficiency, 1, 1, 1), c)
+    field = changed((efficiency, 1, 1, 1), drag * SOURCE.drag_coefficient / hj.IRIS.mass)
     with jax.enable_x64(True):
         x, u = moving().astype(float), U.astype(float)
         after = domain.quadrotor().step(x, u, jnp.zeros(()), 1e-4)
@@ -107,3 +99,75 @@ def test_a_hybrid_model_is_the_same_for_both_quaternions_of_an_attitude():
     np.testing.assert_array_equal(hybrid(other * x, U), other * hybrid(x, U))
     columns = [hybrid.parameter_columns(at, U) for at in (x, other * x)]
     np.testing.assert_array_equal(columns[1], other[:, None] * columns[0])
+
+
+LAGGING = Actuator((100.0, 900.0), time_constants=(0.04, 0.08))
+DRIVEN = hj.rigid_body(hj.IRIS, ("Ix", "k_rotors"))
+LEVEL = np.eye(13)[3]
+
+
+@pytest.mark.parametrize(("step", "tau"), [(0.2, 0.04), (-0.2, 0.08)])
+def test_a_step_is_followed_by_a_share_of_1_minus_1_over_e_after_the_time_constant_of_its_direction(step, tau):
+    field = actuated(DRIVEN, LAGGING)
+    u = np.full((100, 4), 0.5 + step)
+    x0 = np.concatenate([LEVEL, np.full(4, 550.0)])
+    w = np.asarray(hj.rollout(field, x0, u, 0.002))[round(tau / 0.002) - 1, 13:]
+    np.testing.assert_allclose(w, 550 + 900 * step * (1 - np.exp(-1)), rtol=1e-4)
+
+
+def test_in_the_steady_state_a_commanded_vehicle_has_the_speeds_or_thrusts_of_its_curve():
+    field = actuated(DRIVEN, LAGGING)
+    u = jnp.array([0.4, 0.5, 0.6, 0.7])
+    w = field.steady_speeds(u)
+    np.testing.assert_allclose(w, 100 + 900 * u, rtol=1e-6)
+    slope = field(jnp.concatenate([jnp.asarray(LEVEL), w]), u)
+    np.testing.assert_array_equal(slope[:13], DRIVEN(jnp.asarray(LEVEL), w))
+    np.testing.assert_allclose(slope[13:], 0, atol=1e-2)
+    instant = actuated(DRIVEN, replace(LAGGING, time_constants=0.0))
+    np.testing.assert_array_equal(instant(jnp.asarray(LEVEL), u), slope[:13])
+    assert (field.state_size, instant.state_size) == (17, 13)
+    thrust = Actuator((0.5, 0.0, 8.0), "thrust", nominal_voltage=12.0, voltage_exponent=0.5)
+    field = actuated(hj.rigid_body(hj.IRIS, ()), thrust)
+    w = field.steady_speeds(jnp.array([0.3, 0.4, 0.5, 0.6, 10.0]))
+    share = jnp.array([0.3, 0.4, 0.5, 0.6]) * (10 / 12) ** 0.5
+    np.testing.assert_allclose(hj.IRIS.thrust_coefficient * w**2, 0.5 + 8 * share**2, rtol=1e-5)
+    assert field.input_size == 5
+
+
+def test_the_filter_before_a_window_agrees_with_the_solver():
+    field, rng = actuated(DRIVEN, LAGGING), np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0.3, 0.8, (10, 4)), 10, axis=0)
+    with jax.enable_x64(True):
+        x0 = np.concatenate([LEVEL, field.steady_speeds(jnp.asarray(u[0]))])
+        last = hj.rollout(field, x0, u, 0.002)[-1, 13:]
+        np.testing.assert_allclose(field.settled(jnp.asarray(u), 0.002), last, rtol=1e-6)
+
+
+def test_a_delay_shifts_commands_and_a_log_of_them_becomes_one_of_mean_speeds():
+    t, values = np.arange(20) * 0.1, np.random.default_rng(0).random((20, 2))
+    edges = 0.1 * np.arange(5, 15)
+    np.testing.assert_allclose(held_means(t, values, edges, 0.2), values[3:12], atol=1e-5)
+    half = held_means(t, values, edges, 0.05)
+    np.testing.assert_allclose(half, (values[4:13] + values[5:14]) / 2, atol=1e-5)
+    field = actuated(DRIVEN, replace(LAGGING, time_constants=0.05))
+    u = np.concatenate([np.full((30, 4), 0.4), np.full((30, 4), 0.6)])
+    t = 0.01 * np.arange(60)
+    speeds = rotor_speeds(field, t, u, 0.01 * np.arange(61))
+    after = 0.01 * np.arange(31)
+    ends = 640 - 180 * np.exp(-after / 0.05)
+    means = 640 - (ends[1:] - ends[:-1]) * 0.05 / 0.01
+    np.testing.assert_allclose(speeds[30:], means[:, None] * np.ones(4), rtol=1e-4)
+
+
+def test_a_commanded_field_is_saved_exported_and_disturbed_and_malformed_actuators_are_refused(tmp_path):
+    field = actuated(hj.rigid_body(hj.IRIS, ("Ix",)), LAGGING, ("curve", "time_constants", "delay"))
+    hj.save(tmp_path / "model.npz", field)
+    loaded = hj.load(tmp_path / "model.npz").field
+    assert named_parameters(loaded).keys() >= {"curve[1]", "time_constants[0]", "delay", "Ix"}
+    assert sizes_of(loaded, None, None) == (17, 4)
+    assert disturbance_of(hj.with_disturbance(field)).indices == tuple(range(7, 13))
+    refusal(lambda: replace(LAGGING, curve=(1.0,)), "two to six")
+    refusal(lambda: replace(LAGGING, gives="torque"), "speed, thrust")
+    refusal(lambda: replace(LAGGING, voltage_exponent=1.0), "nominal_voltage")
+    refusal(lambda: actuated(DRIVEN, LAGGING, ("gain",)), "'gain'")
+    refusal(lambda: actuated(DRIVEN, LAGGING, ("curve",)), "k_rotors")

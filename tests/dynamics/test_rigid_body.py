@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import ODD, infer_batch, train_batch
+from systems import ODD, columns, infer_batch, one_by_one, train_batch
 
 from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid, rotation
 from hybrid_jax.dynamics import ConstantDisturbance, HoldState
@@ -25,22 +25,10 @@ KNOWN = Terms(
 )  # fmt: skip
 
 
-def samples(count=6, seed=1):
-    rng = np.random.default_rng(seed)
-    x = rng.normal(size=(13, count)) * 2
-    x[QUATERNION] /= np.linalg.norm(x[QUATERNION], axis=0)
-    return jnp.asarray(x), jnp.asarray(rng.uniform(400, 900, (4, count)))
-
-
 def moved(field, size=0.1, seed=2):
     rng = np.random.default_rng(seed)
     leaves, structure = jax.tree.flatten(field)
     return jax.tree.unflatten(structure, [leaf + size * rng.normal(size=leaf.shape) for leaf in leaves])
-
-
-@eqx.filter_jit
-def one_by_one(field, x, u):
-    return jax.vmap(field, -1, -1)(x, u)
 
 
 def newton_euler(x, u, vehicle, terms, k):
@@ -78,25 +66,17 @@ def test_it_is_newton_euler_at_any_parameters(terms, vehicle):
     field = eqx.tree_at(lambda field: field.deviations, field, logs)
     inertia = tuple((np.array(vehicle.inertia) * np.exp([0.3, -0.4, 0.0])).tolist())
     true, k = replace(vehicle, inertia=inertia), vehicle.thrust_coefficient * np.exp(logs["k_rotors"])
-    x, u = samples()
+    x, u = columns()
     expected = [newton_euler(*map(np.asarray, pair), true, terms, k) for pair in zip(x.T, u.T, strict=True)]
     np.testing.assert_allclose(one_by_one(field, x, u).T, expected, rtol=1e-11, atol=1e-11)
 
 
-def level(v=(0.0, 0.0, 0.0), w=(0.0, 0.0, 0.0)):
-    x = jnp.zeros(13).at[3].set(1.0)
-    return x.at[VELOCITY].set(jnp.array(v)).at[BODY_RATES].set(jnp.array(w))
-
-
-def test_theta_is_nominal_at_zero_and_positive_everywhere():
+def test_theta_is_nominal_at_zero_and_positive_everywhere_and_a_guess_lies_in_its_box():
     found = rigid_body(IRIS).theta()
     assert {name: float(value) for name, value in found.items()} == {"Ix": 0.02912, "Iy": 0.02912, "k": 8.54858e-6}
     for log in (-50.0, -1.0, 3.0):
         extreme = RigidBody({name: jnp.asarray(log) for name in LEARNED}, IRIS).theta()
         assert all(value > 0 for value in extreme.values())
-
-
-def test_a_guess_lies_in_its_box_and_follows_its_key():
     guesses = jax.vmap(lambda key: perturbed(IRIS, key, low=0.5, high=2.0))(jax.random.split(jax.random.key(0), 500))
     for name in LEARNED:
         factors = np.exp(guesses.deviations[name])
@@ -108,7 +88,7 @@ def test_a_guess_lies_in_its_box_and_follows_its_key():
 
 @pytest.mark.parametrize("name", SIGNED)
 def test_a_known_term_is_a_learned_one_at_its_value(name):
-    x, u = samples()
+    x, u = columns()
     value = getattr(KNOWN, name)
     terms = Terms(**{"drag": KNOWN.drag, name: value})  # a lag without a force is none
     known, learned = rigid_body(IRIS, (), terms), rigid_body(IRIS, (name,), terms)
@@ -124,7 +104,7 @@ MINIBATCHES = {"rigid body": rigid_body(IRIS)} | {
 
 @pytest.mark.parametrize("field", MINIBATCHES.values(), ids=MINIBATCHES)
 def test_a_minibatch_and_its_gradient_are_those_of_its_samples(field):
-    field, (x, u) = moved(field), samples()
+    field, (x, u) = moved(field), columns()
     weights = jnp.asarray(np.random.default_rng(2).normal(size=(13, 6)))
 
     def slope(evaluate):
@@ -143,7 +123,7 @@ AROUND |= {"hybrid": lambda body: Hybrid(body, HoldState())}
 @pytest.mark.parametrize("around", AROUND.values(), ids=AROUND)
 def test_position_moves_with_the_true_velocity_where_the_log_s_lags(around):
     """An estimator that knows thrust alone has v̂˙ = R T e_z / m − g e_z + (v − v̂) / λ, the last across the thrust."""
-    lag, (x, u) = 0.25, samples()
+    lag, (x, u) = 0.25, columns()
     field = around(rigid_body(IRIS, (), Terms(drag=(0.3, 0.4, 0.0), velocity_lag=lag)))
     thrust = one_by_one(rigid_body(IRIS, ()), x, u)[VELOCITY]
     behind = jnp.asarray([0.3, -0.2, 0.0])  # v − v̂ in the body
@@ -166,7 +146,7 @@ def test_a_body_that_does_not_turn_tells_where_its_cable_pulls():
     held = [*-np.cross([0.0, 0.0, -below], pull)[:2], IRIS.mass * IRIS.gravity]
     lifts = np.linalg.lstsq(np.stack([arms[:, 1], -arms[:, 0], np.ones(4)]), np.array(held))[0]
     field = rigid_body(IRIS, (), Terms(cable_pull=(1 / below, 1 / below)))
-    derivative = field(level(), jnp.sqrt(lifts / IRIS.thrust_coefficient))
+    derivative = field(jnp.eye(13)[3], jnp.sqrt(lifts / IRIS.thrust_coefficient))
     np.testing.assert_allclose(IRIS.mass * derivative[VELOCITY], pull, atol=1e-12)
 
 
@@ -174,7 +154,7 @@ def test_a_learned_mass_is_that_of_a_heavier_vehicle():
     heavier = replace(IRIS, mass=1.3 * IRIS.mass)
     learned = RigidBody({"mass": jnp.log(1.3)}, IRIS, KNOWN)
     np.testing.assert_allclose(learned.theta()["mass"], heavier.mass)
-    x, u = samples()
+    x, u = columns()
     expected = one_by_one(rigid_body(heavier, (), KNOWN), x, u)
     np.testing.assert_allclose(one_by_one(learned, x, u), expected, rtol=1e-13, atol=1e-13)
 
@@ -191,7 +171,7 @@ def test_a_torque_beside_a_forced_body_turns_it_by_its_own_inertia():
     logs = dict(zip(LEARNED, jnp.array([0.3, -0.4, 0.1]), strict=True))
     inertia = np.array(ODD.inertia) * np.exp([0.3, -0.4, 0.0])
     added = np.concatenate([np.zeros(7), force / ODD.mass, torque / inertia])
-    x, u = samples(3)
+    x, u = columns(3)
     expected = one_by_one(RigidBody(logs, ODD), x, u) + added[:, None]
     body = RigidBody(logs, ODD, wrench=True)
     for field in (Hybrid(body, Push()), Hybrid(Hybrid(body, HoldState()), Push())):
