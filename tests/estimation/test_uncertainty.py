@@ -11,8 +11,6 @@ from pendulum import Push, pendulum, pushes, swings
 import hybrid_jax as hj
 from experiments.paper.conditions import measure, sensor_noise
 from hybrid_jax import IRIS, AbstractVectorField, Hybrid, fit_least_squares, rigid_body, with_disturbance
-from hybrid_jax.dynamics.rigid_body import RigidBody
-from hybrid_jax.estimation.uncertainty import covariance_of, intervals
 from hybrid_jax.rotation import normalise
 from hybrid_jax.status import Status
 from hybrid_jax.vehicle import QUATERNION
@@ -27,15 +25,21 @@ def closed_form(windows, design, gains):
     return n / (n - p) * bread @ (scores.T @ scores) @ bread
 
 
-def test_a_linear_problem_meets_its_closed_form():
+def test_a_linear_problem_meets_its_closed_form_also_with_parameters_told_apart_by_little():
     windows, design = pushes(30, 0.1)
     offset = 0.2 * np.random.default_rng(1).normal(size=(30, 1, 2))  # an error that a whole window shares
     windows = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(offset, np.float32))
     field = fit_least_squares(Push(jnp.ones(2)), windows).field
     expected = closed_form(windows, design, field.gains)
-    np.testing.assert_allclose(covariance_of(field, windows), expected, rtol=1e-4)  # float32 sums
+    np.testing.assert_allclose(hj.covariance_of(field, windows), expected, rtol=1e-4)  # float32 sums
     # In pieces that do not divide the windows the sums are the same.
-    np.testing.assert_allclose(covariance_of(field, windows, chunk=7), expected, rtol=1e-4)
+    np.testing.assert_allclose(hj.covariance_of(field, windows, chunk=7), expected, rtol=1e-4)
+    windows, design = pushes(30, 1e-3)
+    field = fit_least_squares(Pair(jnp.ones(2)), windows).field
+    expected = closed_form(windows, design @ np.array([[1.0, 1.0], [6e-4, -6e-4]]), field.parts)
+    np.testing.assert_allclose(hj.covariance_of(field, windows), expected, rtol=0.3)  # float32 sums
+    with pytest.raises(ValueError, match=r"windows: 1 are too few for the 1 parameters of Pendulum, at least 2"):
+        hj.covariance_of(pendulum(), swings(1))
 
 
 class Pair(AbstractVectorField):
@@ -47,22 +51,15 @@ class Pair(AbstractVectorField):
         return Push(jnp.array([[1.0, 1.0], [6e-4, -6e-4]]) @ self.parts)(x, u)
 
 
-def test_parameters_that_are_told_apart_by_little_have_their_intervals():
-    windows, design = pushes(30, 1e-3)
-    field = fit_least_squares(Pair(jnp.ones(2)), windows).field
-    expected = closed_form(windows, design @ np.array([[1.0, 1.0], [6e-4, -6e-4]]), field.parts)
-    np.testing.assert_allclose(covariance_of(field, windows), expected, rtol=0.3)  # float32 sums
-
-
 def test_a_parameter_that_the_windows_do_not_depend_on_stays_and_may_be_anything():
     windows, _ = pushes(30, 0.1)
     still = eqx.tree_at(lambda w: w.u, windows, windows.u * np.float32([1, 0]))
     first = np.float32([1, np.inf])  # the second state, which the second gain moves as well, does not count
     found = fit_least_squares(Push(jnp.array([1.0, 7.0])), still, scale=first)
-    covariance = covariance_of(found.field, still, scale=first)
-    assert tuple(intervals(found.field, covariance)["gains[1]"]) == (7, -np.inf, np.inf)
+    covariance = hj.covariance_of(found.field, still, scale=first)
+    assert tuple(hj.intervals(found.field, covariance)["gains[1]"]) == (7, -np.inf, np.inf)
     # The other one is found as it is where the second is known.
-    known = covariance_of(found.field, still, scale=first, free=np.array([True, False]))
+    known = hj.covariance_of(found.field, still, scale=first, free=np.array([True, False]))
     assert found.converged
     assert 0 < known[0, 0] < np.inf
     dark = eqx.tree_at(lambda w: w.u, windows, 0 * windows.u)
@@ -86,17 +83,12 @@ class Sum(AbstractVectorField):
 def test_parameters_that_no_window_tells_apart_have_no_interval_and_others_have_theirs(unit, cluster):
     windows, _ = pushes(30, 0.1, unit)
     found = fit_least_squares(Sum(*map(jnp.array, (1.0, 0.5, 0.0))), windows)
-    variances = np.diagonal(covariance_of(found.field, windows, cluster=cluster))
+    variances = np.diagonal(hj.covariance_of(found.field, windows, cluster=cluster))
     assert np.isinf(variances[:2]).all()
     alone = Sum(found.field.a + found.field.b, jnp.zeros(()), found.field.c)
-    known = covariance_of(alone, windows, cluster=cluster, free=np.array([True, False, True]))
+    known = hj.covariance_of(alone, windows, cluster=cluster, free=np.array([True, False, True]))
     factor = 1.0 if cluster > 1 else 28 / 27  # n - p
     np.testing.assert_allclose(variances[2], known[2, 2] * factor, rtol=1e-3)
-
-
-def test_too_few_windows_are_refused():
-    with pytest.raises(ValueError, match=r"windows: 1 are too few for the 1 parameters of Pendulum, at least 2"):
-        covariance_of(pendulum(), swings(1))
 
 
 LEARN = ("Ix", "k_rotors", "drag")
@@ -107,7 +99,7 @@ Z = 1.959964  # of 95 %, from the normal distribution's table
 @pytest.mark.parametrize(("level", "z"), [(0.6826895, 1.0), (0.95, Z)])
 @pytest.mark.parametrize("wrap", [lambda field: field, lambda field: Hybrid(field, Push(jnp.ones(2)))])
 def test_every_entry_has_its_interval_in_si_units(wrap, level, z):
-    found = intervals(wrap(rigid_body(IRIS, LEARN)), np.diag(ERRORS**2), level)
+    found = hj.intervals(wrap(rigid_body(IRIS, LEARN)), np.diag(ERRORS**2), level)
     drag, rotors = ([f"{name}[{i}]" for i in range(count)] for name, count in (("drag", 3), ("k_rotors", 4)))
     assert set(found) == {"Ix", *drag, *rotors}
     for name, error in zip(("Ix", *rotors), ERRORS[[0, 4, 5, 6, 7]], strict=True):
@@ -119,10 +111,10 @@ def test_every_entry_has_its_interval_in_si_units(wrap, level, z):
 
 
 def test_matrices_and_a_disturbance_have_intervals_entry_by_entry():
-    found = intervals(rigid_body(IRIS, ("aerodynamic_moment",)), np.eye(9) * 1e-4)
+    found = hj.intervals(rigid_body(IRIS, ("aerodynamic_moment",)), np.eye(9) * 1e-4)
     assert list(found) == [f"aerodynamic_moment[{i},{j}]" for i in range(3) for j in range(3)]
     field = Hybrid(with_disturbance(rigid_body(IRIS)), Push(jnp.ones(2)))
-    found = intervals(field, np.eye(9) * 1e-4)
+    found = hj.intervals(field, np.eye(9) * 1e-4)
     assert list(found) == ["Ix", "Iy", "k", *(f"disturbance[{name}]" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))]
     np.testing.assert_allclose(found["disturbance[wz]"], Z * 0.01 * np.array([0, -1, 1]), rtol=1e-5)  # float32
 
@@ -134,7 +126,7 @@ SPREAD = np.repeat([0.0, 0.05, 2.0, 1.0], [3, 4, 3, 3])  # m, of a quaternion, m
 @eqx.filter_jit
 def fitted(measured, key):
     """θ_p of a rigid body from a hundred noisy windows of 0.1 s, and its intervals, over the truth."""
-    truth = RigidBody({"Ix": jnp.array(0.3), "Iy": jnp.array(-0.3), "k": jnp.zeros(())}, IRIS)
+    truth = hj.RigidBody({"Ix": jnp.array(0.3), "Iy": jnp.array(-0.3), "k": jnp.zeros(())}, IRIS)
     keys = jax.random.split(key, 4)
     x0 = jnp.zeros((100, 13)).at[:, 3].set(1.0) + SPREAD * jax.random.normal(keys[0], (100, 13))
     x0 = x0.at[:, QUATERNION].set(normalise(x0[:, QUATERNION]))
@@ -142,7 +134,7 @@ def fitted(measured, key):
     x = measure(hj.rollout_batch(truth, x0, u, 0.01), sensor_noise(1.0), keys[2])
     windows = hj.Trajectories(jnp.where(measured, measure(x0, sensor_noise(1.0), keys[3]), x0), u, x, 0.01)
     found = fit_least_squares(rigid_body(IRIS), windows)
-    around, true = intervals(found.field, covariance_of(found.field, windows), 0.95), truth.theta()
+    around, true = hj.intervals(found.field, hj.covariance_of(found.field, windows), 0.95), truth.theta()
     return found.converged, jnp.stack([jnp.stack(around[name]) / true[name] for name in true])
 
 
