@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from pendulum import pendulum
 
-from hybrid_jax import AbstractVectorField, Hybrid, Trajectories
-from hybrid_jax.integrate import RK4, rollout_batch
-from hybrid_jax.networks.mlp import residual_network, zero_output
+from hybrid_jax import RK4, AbstractVectorField, Hybrid, Settings, Trajectories, residual_network, rollout_batch
+from hybrid_jax.networks import zero_output
+from hybrid_jax.training import TrajectoryLoss
 from hybrid_jax.training.loss import REGULARISERS, along, cosine, rollout_minibatch
-from hybrid_jax.training.objective import Settings, TrajectoryLoss
 
 pytestmark = pytest.mark.usefixtures("double_precision")
 DT, WINDOWS, STEPS = 0.05, 6, 4
@@ -52,7 +51,7 @@ def network(seed=0):
     return residual_network(2, 1, jax.random.key(seed), hidden=5)
 
 
-def test_trajectory_correlation_is_the_paper_s_formula(batch):
+def test_trajectory_correlation_is_the_paper_s_formula_and_shows_small_differences_in_single_precision(batch):
     field = Hybrid(pendulum(0.7), network())
     cut = windows()
     physics = np.asarray(rollout_batch(field.physics, cut.x0, cut.u, DT)).reshape(WINDOWS, -1)
@@ -62,10 +61,7 @@ def test_trajectory_correlation_is_the_paper_s_formula(batch):
     found = regulariser("trajectory_correlation", field, batch)
     # The 1e-12 under the square root, against squared norms of about 1.
     np.testing.assert_allclose(found, np.mean(1 - product), rtol=0, atol=1e-11)
-
-
-def test_trajectory_correlation_shows_small_differences_in_single_precision(batch):
-    """1 − ⟨a, b⟩ would round to 0 or to 6e-8 here."""
+    # 1 − ⟨a, b⟩ would round to 0 or to 6e-8 here.
     with jax.enable_x64(False):
         single = jax.tree.map(lambda leaf: jnp.asarray(leaf, np.float32), batch)
         push = affine(np.zeros((2, 2)), (0.0, 1e-3))
@@ -75,16 +71,18 @@ def test_trajectory_correlation_shows_small_differences_in_single_precision(batc
     np.testing.assert_allclose(value, exact, rtol=0.05)  # the differences of 1e-4 carry an error of 1e-7
 
 
-def test_cosine_is_one_for_parallel_and_zero_for_orthogonal_parts(batch):
+def test_cosine_is_one_for_parallel_parts_and_zero_for_orthogonal_ones_and_the_residual_norm_a_mean_square(batch):
     def value(other):
         return regulariser("cosine", Hybrid(affine(TURN), affine(other)), batch)
 
     # The 1e-12 of the unit vectors, against squared norms of at least 1e-4.
     np.testing.assert_allclose([value(2.0 * TURN), value(-0.5 * TURN)], 1, rtol=0, atol=1e-7)
     assert abs(value(np.array([[0.0, -1.0], [1.0, 0.0]]) @ TURN)) < 1e-20  # a quarter turn
+    field = Hybrid(pendulum(), affine(np.zeros((2, 2)), (3.0, 4.0)))
+    np.testing.assert_allclose(regulariser("residual_norm", field, batch), 25, rtol=1e-12)
 
 
-def test_inner_product_is_the_squared_product_of_the_parts(batch):
+def test_inner_product_is_the_squared_product_of_the_parts_and_pearson_their_correlation(batch):
     field = Hybrid(affine(TURN), affine(OTHER, (0.3, -0.2)))
     predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
     x = np.concatenate([batch.x0[None], np.asarray(predicted)[:-1]])
@@ -93,9 +91,6 @@ def test_inner_product_is_the_squared_product_of_the_parts(batch):
     found = regulariser("inner_product", field, batch)
     np.testing.assert_allclose(found, np.mean(products**2), rtol=1e-12)
     assert abs(regulariser("inner_product", Hybrid(affine(TURN), affine([[0.7, -0.4], [0.3, 1.2]])), batch)) < 1e-25
-
-
-def test_pearson_is_the_correlation_and_blind_to_offset_and_scale(batch):
     other = affine(OTHER)
     predicted = rollout_minibatch(Hybrid(affine(TURN), other), batch.x0, batch.u, DT, RK4())
 
@@ -107,11 +102,6 @@ def test_pearson_is_the_correlation_and_blind_to_offset_and_scale(batch):
     np.testing.assert_allclose(value(other), np.mean(expected), rtol=1e-9)  # the 1e-12 under the roots
     np.testing.assert_allclose(value(affine(-7 * other.matrix, (5.0, -3.0))), value(other), rtol=1e-9)
     np.testing.assert_allclose(value(affine(3 * TURN, (1.0, 1.0))), 1, rtol=1e-9)
-
-
-def test_residual_norm_is_the_mean_square_of_the_residual(batch):
-    field = Hybrid(pendulum(), affine(np.zeros((2, 2)), (3.0, 4.0)))
-    np.testing.assert_allclose(regulariser("residual_norm", field, batch), 25, rtol=1e-12)
 
 
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
@@ -129,11 +119,10 @@ def test_gradients_are_finite_where_the_residual_is_zero(precision, batch):
         assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope)), name
 
 
-def loss(field, batch, rule, weight):
-    return TrajectoryLoss().loss(field, batch, Settings(regulariser=rule), weight)[0]
+def test_the_loss_is_the_error_plus_the_weighted_regulariser_and_settings_that_are_none_are_refused(batch):
+    def loss(field, batch, rule, weight):
+        return TrajectoryLoss().loss(field, batch, Settings(regulariser=rule), weight)[0]
 
-
-def test_the_loss_is_the_error_plus_the_weighted_regulariser(batch):
     field = Hybrid(pendulum(0.7), network())
     predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
     error = np.square(np.asarray(predicted - batch.x)).sum(1).mean()
@@ -141,14 +130,8 @@ def test_the_loss_is_the_error_plus_the_weighted_regulariser(batch):
     for rule in REGULARISERS.values():
         expected = error + 0.3 * rule(field, batch, predicted)
         np.testing.assert_allclose(loss(field, batch, rule, 0.3), expected, rtol=1e-13)
-
-
-def test_a_field_without_two_parts_has_no_regulariser(batch):
-    for field in (pendulum(0.7), network()):
+    for field in (pendulum(0.7), network()):  # without two parts there is none
         assert loss(field, batch, cosine, 1e3) == loss(field, batch, None, 0.0)
-
-
-def test_settings_that_are_none_are_refused_where_they_are_set():
     wrong = {"regulariser": "cosine", "solver": "rk4", "objective": TrajectoryLoss, "batch_size": 10.0}
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"^{name} must be"):
