@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from surface import refusal
 from systems import infer_batch, train_batch
 
 from hybrid_jax import Hybrid, load, save
@@ -32,7 +33,7 @@ def batch(seed=0, columns=COLUMNS):
     return jnp.asarray(3 + 2 * rng.normal(size=(STATES, columns))), jnp.asarray(rng.normal(size=(INPUTS, columns)))
 
 
-def plain(field, x, u, activation=lambda h: jnp.maximum(h, 0)):
+def plain(field, x, u, activation):
     """The training formula as the papers write it, for autodiff: γ (h − mean) / √(variance + ε) + β."""
     hidden = field.weight_in @ jnp.concatenate([x, (u - field.scaling.offset) / field.scaling.scale])
     mean, variance = hidden.mean(1, keepdims=True), hidden.var(1, keepdims=True)
@@ -92,16 +93,11 @@ def test_a_smoothed_network_is_as_near_as_beta_says_and_only_relu_is_smoothed(be
     assert smoothed(eqx.nn.MLP(2, 2, 3, 1, key=jax.random.key(0)), beta).activation == SmoothRelu(beta)
     save(tmp_path / "smooth.npz", smooth)
     assert eqx.tree_equal(load(tmp_path / "smooth.npz").field, smooth)
+    refusal(lambda: smoothed(field, float("nan")), "^beta must be")
+    refusal(lambda: network(activation="step"), "^activation must be one of relu, softplus, tanh, silu, got 'step'$")
 
 
-def test_what_is_no_activation_is_refused():
-    with pytest.raises(ValueError, match=r"^activation must be one of relu, softplus, tanh, silu, got 'step'$"):
-        residual_network(STATES, INPUTS, jax.random.key(0), activation="step")
-    with pytest.raises(ValueError, match=r"^beta must be"):
-        smoothed(network(), float("nan"))
-
-
-def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
+def test_running_statistics_approach_the_batch_by_a_tenth_each_time_and_a_still_unit_stays_finite():
     with jax.enable_x64(True):
         field, (x, u) = network(), batch()
         hidden = field.weight_in @ field.inputs(x, u)
@@ -114,9 +110,6 @@ def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
             np.testing.assert_allclose(end - goal, 0.9**20 * (start - goal), rtol=0, atol=1e-12)
         untouched = eqx.tree_at(lambda field: field.norm.running, observed, before)
         assert eqx.tree_equal(untouched, field)
-
-
-def test_a_hidden_unit_that_never_varies_stays_finite_in_value_and_gradient():
     field = network()
     x, u = jnp.ones((STATES, COLUMNS)), jnp.ones((INPUTS, COLUMNS))
     value, slope = jax.jit(jax.value_and_grad(lambda x: jnp.sum(field.train_batch(x, u))))(x)
@@ -136,27 +129,17 @@ def test_a_linear_path_adds_its_map_in_training_and_in_deployment():
         assert sum(jax.tree.leaves(base.trainable(path))) == 1 + sum(jax.tree.leaves(base.trainable(field)))
 
 
-def test_running_statistics_are_not_trainable_and_all_else_is():
+def test_the_paper_s_network_has_the_paper_s_size_and_all_but_running_statistics_is_trainable():
     marks = base.trainable(Hybrid(network(), network()))
     for part in (marks.physics, marks.residual):
         assert jax.tree.leaves(part.norm.running) == [False]
         assert jax.tree.leaves(eqx.tree_at(lambda part: part.norm.running, part, None)) == [True] * 5
-
-
-def test_the_paper_s_network_has_the_paper_s_size():
     field = residual_network(13, 4, jax.random.key(0))
     learned = eqx.filter(field, base.trainable(field))
     # 17 × 64 (its bias would be removed by batch norm), γ and β of 64, 64 × 13 + 13.
     assert sum(leaf.size for leaf in jax.tree.leaves(learned)) == 17 * 64 + 2 * 64 + 64 * 13 + 13
     for weight, fan_in in ((field.weight_in, 17), (field.weight_out, 64), (field.bias_out, 64)):
         assert 0.85 / fan_in**0.5 < jnp.abs(weight).max() <= 1 / fan_in**0.5  # 13 draws or more, of a fixed seed
-
-
-def unbatched(norm, seed=0):
-    """A network with layer normalisation, or none, whose gain and shift are not those of a fresh one."""
-    field = network(seed)
-    kind = {"layer": LayerNorm(field.norm.gain, field.norm.shift), "none": Bias(field.norm.shift)}[norm]
-    return eqx.tree_at(lambda field: field.norm, field, kind)
 
 
 def plain_one(field, x, u):
@@ -172,7 +155,9 @@ def plain_one(field, x, u):
 @pytest.mark.parametrize("norm", ["layer", "none"])
 def test_without_a_batch_s_statistics_training_is_deployment_and_both_the_plain_formula(norm):
     with jax.enable_x64(True):
-        field, (x, u) = unbatched(norm), batch()
+        field, (x, u) = network(), batch()
+        kind = {"layer": LayerNorm(field.norm.gain, field.norm.shift), "none": Bias(field.norm.shift)}[norm]
+        field = eqx.tree_at(lambda field: field.norm, field, kind)
         expected = jnp.stack([plain_one(field, x[:, i], u[:, i]) for i in range(COLUMNS)], axis=1)
         np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
         np.testing.assert_allclose(field.train_batch(x, u), expected, rtol=0, atol=1e-12)
