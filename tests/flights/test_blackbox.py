@@ -43,7 +43,7 @@ def test_a_blackbox_log_is_the_flight_it_holds(flight, written, monkeypatch):
     assert len(read_recording(packed).signals["rates"]) == last
 
 
-def test_events_and_armings_without_frames_are_no_damage(flight, written):
+def test_events_and_armings_without_frames_are_no_damage_and_pwm_and_other_headers_are_read(flight, written):
     """Of Betaflight 4: an adjustment in flight, logging that resumes, disarming; and an end with its reason."""
     events = b"E\x0d\x05\x02" + b"E\x0d\x85abcd" + b"E\x0e\x05\x06" + b"E\x0f\x04"
     whole = blackbox(flight[:200], events=events)
@@ -57,9 +57,6 @@ def test_events_and_armings_without_frames_are_no_damage(flight, written):
     assert len(two.signals["rates"]) >= 199
     reasoned = blackbox(flight[:200], events=b"E\xffEnd of log (disarm reason:4)\0", ended=False)
     assert "damage" not in read_recording(written(reasoned, "reasoned.bbl")).facts
-
-
-def test_commands_of_pwm_and_headers_of_other_types_are_read(flight, written):
     headers = ["vbatcellvoltage:unknown", "motor_poles:12", "blackbox_high_resolution:1"]
     signals = read_recording(written(blackbox(flight[:200], headers=headers, digital=False), "flight.bbl")).signals
     last = len(signals["command"])

@@ -14,8 +14,8 @@ from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
 from hybrid_jax.trajectories import check
 
 
-def with_gap(log, start=400, stop=420):
-    return log[np.delete(np.arange(len(log)), slice(start, stop))]
+def with_gap(log, lost=slice(400, 420)):
+    return log[np.delete(np.arange(len(log)), lost)]
 
 
 def with_repeat(log, at=700):
@@ -44,7 +44,7 @@ def test_windows_never_cross_a_gap(flight, stride):
     assert len(cut) == expected
 
 
-def test_resampling_preserves_the_flight(flight):
+def test_resampling_preserves_the_flight_and_bridges_gaps_on_request_only(flight):
     rng = np.random.default_rng(0)
     t = flight.t + rng.uniform(-0.002, 0.002, len(flight))
     x = np.stack([np.interp(t, flight.t, column) for column in flight.x.T], axis=1)
@@ -54,9 +54,6 @@ def test_resampling_preserves_the_flight(flight):
     np.testing.assert_allclose(log.x, flight.x[at], atol=0.02)  # linear between samples: ẍ dt² / 8
     assert "resampled 1200 samples" in done
     assert len(cut_windows([log], 50, 50)) >= 23
-
-
-def test_resampling_bridges_gaps_on_request_only(flight):
     log = with_gap(flight)
     kept, _ = resample(log, 0.01)
     bridged, done = resample(log, 0.01, longest_gap=0.25)
@@ -69,18 +66,15 @@ def test_resampling_bridges_gaps_on_request_only(flight):
 
 
 @pytest.mark.parametrize("lost", [slice(401, 402), slice(401, 410)])
-def test_coarser_resampling_hides_no_gap(flight, lost):
-    log, _ = resample(with_gap(flight, lost.start, lost.stop), 0.02)
-    assert gaps(log).sum() == 1
-    before = log.t[: np.flatnonzero(gaps(log))[0] + 1]
-    assert before[-1] <= flight.t[lost.start - 1]
-
-
-def test_coarser_resampling_loses_no_thrust(flight):
+def test_coarser_resampling_loses_no_thrust_and_hides_no_gap(flight, lost):
     log, _ = resample(flight, 0.04)
     first = int(np.argmin(np.abs(flight.t - log.t[0])))
     means = flight.u[first : first + 4 * (len(log) - 1)].reshape(-1, 4, 4).mean(axis=1)
     np.testing.assert_allclose(log.u[:-1], means, rtol=1e-6)
+    log, _ = resample(with_gap(flight, lost), 0.02)
+    assert gaps(log).sum() == 1
+    before = log.t[: np.flatnonzero(gaps(log))[0] + 1]
+    assert before[-1] <= flight.t[lost.start - 1]
 
 
 def test_time_on_the_ground_is_cut_but_not_a_short_fall(flight):
@@ -90,9 +84,7 @@ def test_time_on_the_ground_is_cut_but_not_a_short_fall(flight):
     log, done = in_flight(FlightLog(flight.t, x, u))
     np.testing.assert_array_equal(log.t, flight.t[80:])
     assert done == "80 samples on the ground cut out"
-
-
-def test_motors_that_turn_before_take_off_carry_nothing(flight):
+    # Motors that turn before take-off carry nothing.
     u, x = flight.u.copy(), flight.x.copy()
     u[:80], x[:200, 2] = 3.0, flight.x[:, 2].min() - 0.3  # full power from 0.8 s on, off the ground after 2 s
     log, _ = in_flight(FlightLog(flight.t, x, u))
@@ -120,17 +112,13 @@ def test_step_response_of_the_lag_is_exponential(flight):
     np.testing.assert_allclose(log.u[:100], 400)
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "said"),
-    [
-        ("resample", 5.0, f"{LOGS[0].name}: resample: no segment without gaps is as long as dt = 5.0 s"),
-        ("delay", 5.0, f"{LOGS[0].name}: delay: no segment without gaps is longer than the lag of 5.0 s"),
-        ("longest_gap", -0.1, "longest_gap must be a finite number of at least 0"),
-    ],
-)
-def test_impossible_cleaning_is_refused_with_log_and_option(option, value, said):
-    options = {"resample": 0.01} if option == "longest_gap" else {}
-    refusal(lambda: clean(LOGS[0], Cleaning(**options | {option: value})), said)
+def test_impossible_cleaning_is_refused_with_log_and_option():
+    for options, said in (
+        ({"resample": 5.0}, f"{LOGS[0].name}: resample: no segment without gaps is as long as dt = 5.0 s"),
+        ({"delay": 5.0}, f"{LOGS[0].name}: delay: no segment without gaps is longer than the lag of 5.0 s"),
+        ({"resample": 0.01, "longest_gap": -0.1}, "longest_gap must be a finite number of at least 0"),
+    ):
+        refusal(lambda options=options: clean(LOGS[0], Cleaning(**options)), said)
 
 
 T = np.arange(0, 12, 0.01)
@@ -148,14 +136,11 @@ def hop() -> Recording:
     return Recording("hop", {"command": command, "position": position})
 
 
-def test_a_vehicle_flies_while_it_is_clear_of_where_it_stood(hop):
+def test_a_vehicle_flies_while_it_is_clear_of_where_it_stood_also_at_both_ends_and_in_a_dip_of_power(hop):
     """Without height it flies from the power that carries it to shortly before its motors stop."""
     np.testing.assert_allclose(airborne(hop), [(CLIMBS, LANDS)], atol=0.02)
     blind = replace(hop, signals={"command": hop.signals["command"]})
     np.testing.assert_allclose(airborne(blind), [(CARRIES, STOPS - MARGIN)], atol=0.02)
-
-
-def test_a_log_that_begins_and_ends_in_flight_is_all_flight_and_a_short_dip_of_power_ends_none(hop):
     inside = (T > 4) & (T < 8)
     part = {name: replace(each, t=each.t[inside], values=each.values[inside]) for name, each in hop.signals.items()}
     np.testing.assert_allclose(airborne(Recording("part", part)), [(4, 8)], atol=0.02)

@@ -8,7 +8,7 @@ from surface import outcome, refusal
 from writers import MAP, foreign, table_of
 
 from hybrid_jax.flights import attitude, load_log
-from hybrid_jax.flights.attitude import Frames, from_euler, rotation_of
+from hybrid_jax.flights.attitude import from_euler, rotation_of
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.flights.formats.raw import Samples, own_samples, record
@@ -96,12 +96,19 @@ def test_lines_become_the_samples_at_their_bends(beside):
     np.testing.assert_allclose(found, own, atol=1e-6)
 
 
-def test_noise_steps_and_rest_stay_as_they_are():
+def test_noise_steps_and_rest_stay_as_they_are_and_a_recording_says_which_signals_were_lines():
     rng, t = np.random.default_rng(1), 0.01 * np.arange(500)
     noise = rng.normal(size=(500, 3))
     smooth = np.sin(3 * t)[:, None]
     for values in (noise, smooth, np.round(smooth, 2), 0 * noise, np.where(t[:, None] > 2, noise, 0.0), noise * np.nan):
         assert own_samples(t, values)[1] is values
+    rng, t = np.random.default_rng(2), 0.01 * np.arange(501)
+    slow = drawn(t, 0.1 * np.arange(51), rng.normal(size=(51, 4)))
+    parts = {"command": Samples(t, slow, "motors"), "rates": Samples(t, rng.normal(size=(501, 3)), "gyro")}
+    found = record("log", parts)
+    assert (len(found.signals["command"]), len(found.signals["rates"])) == (51, 501)
+    (note,) = found.notes
+    assert note.startswith("motors: values repeated, or lines between samples 0.1 s apart")
 
 
 @pytest.mark.parametrize("rows", [[2], [3], [3, 3, 4], [10]], ids=str)
@@ -118,49 +125,22 @@ def test_values_that_were_repeated_are_samples_once(rows):
     assert own_samples(t, values, repeated=False)[1] is values
 
 
-def test_a_recording_says_which_signals_were_lines():
-    rng, t = np.random.default_rng(2), 0.01 * np.arange(501)
-    slow = drawn(t, 0.1 * np.arange(51), rng.normal(size=(51, 4)))
-    parts = {"command": Samples(t, slow, "motors"), "rates": Samples(t, rng.normal(size=(501, 3)), "gyro")}
-    found = record("log", parts)
-    assert (len(found.signals["command"]), len(found.signals["rates"])) == (51, 501)
-    (note,) = found.notes
-    assert note.startswith("motors: values repeated, or lines between samples 0.1 s apart")
+def to_library(p=(0, 0, 0), q=(1, 0, 0, 0), v=(0, 0, 0), omega=(0, 0, 0)):
+    """One sample in NED and FRD, by the conversion of readers, whose recordings become flights."""
+    parts = {"position": p, "attitude": q, "velocity": v, "rates": omega}
+    samples = {name: raw.Samples(np.zeros(1), np.array([each], float), name) for name, each in parts.items()}
+    return [part.values[0] for part in raw.turned(samples, "NED", "FRD").values()]
 
 
-NED, LEVEL = Frames("NED", "FRD", "world"), np.array([[1.0, 0, 0, 0]])
-NONE, DEG = np.zeros((1, 3)), np.pi / 180
-
-
-def to_library(p, q, v, omega, frames):
-    """By the conversion of readers, whose recordings become flights."""
-    velocity = "body_velocity" if frames.velocity == "body" else "velocity"
-    parts = {"position": p, "attitude": q, velocity: v, "rates": omega}
-    parts = {name: raw.Samples(np.zeros(len(q)), values, name) for name, values in parts.items()}
-    p, q, v, omega = (part.values for part in raw.turned(parts, frames.world, frames.body).values())
-    return np.concatenate([p, q, rotation_of(q).apply(v) if frames.velocity == "body" else v, omega], axis=1)
-
-
-def row(*numbers):
-    return np.array([numbers], float)
-
-
-def axes(x):
-    """Where the body's forward, left and up point in the world."""
-    return rotation_of(x[:, 3:7]).as_matrix()[0].T
-
-
-def test_level_and_north_in_ned_is_level_and_north_in_enu():
-    x = to_library(row(1, 2, -3), LEVEL, row(4, 5, -6), row(0.1, 0.2, 0.3), NED)
-    np.testing.assert_allclose(x[0, :3], [2, 1, 3])  # east, north, up
-    np.testing.assert_allclose(x[0, 7:10], [5, 4, 6])
-    np.testing.assert_allclose(x[0, 10:], [0.1, -0.2, -0.3])
-    np.testing.assert_allclose(axes(x), [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-12)  # nose north, left west
-    x = to_library(NONE, from_euler(row(0, 0, 90 * DEG)), NONE, NONE, NED)  # yaw to the east is the identity
-    np.testing.assert_allclose(np.abs(x[0, 3:7]), [1, 0, 0, 0], atol=1e-12)
-
-
-def test_rates_between_are_the_rates_of_the_flight(flight):
+def test_level_and_north_in_ned_is_so_in_enu_and_rates_between_are_the_rates_of_the_flight(flight):
+    p, q, v, omega = to_library(p=(1, 2, -3), v=(4, 5, -6), omega=(0.1, 0.2, 0.3))
+    np.testing.assert_allclose(p, [2, 1, 3])  # east, north, up
+    np.testing.assert_allclose(v, [5, 4, 6])
+    np.testing.assert_allclose(omega, [0.1, -0.2, -0.3])
+    axes = rotation_of(q[None]).as_matrix()[0].T  # where the body's forward, left and up point in the world
+    np.testing.assert_allclose(axes, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-12)  # nose north, left west
+    _, q, *_ = to_library(q=from_euler(np.array([[0, 0, np.pi / 2]]))[0])  # yaw to the east is the identity
+    np.testing.assert_allclose(np.abs(q), [1, 0, 0, 0], atol=1e-12)
     middle = 0.5 * (flight.x[1:, 10:] + flight.x[:-1, 10:])
     # Second order in the interval: ω̈ dt² / 12 with ω̈ up to some hundred rad/s³.
     np.testing.assert_allclose(attitude.rates_between(flight.t, flight.x[:, 3:7]), middle, atol=5e-3)

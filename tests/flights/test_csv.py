@@ -6,6 +6,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from surface import refusal
+from writers import column_map
 
 from hybrid_jax.flights import check_recording, load_log, read_recording
 from hybrid_jax.flights.conversion import flight_at
@@ -128,7 +129,7 @@ def test_joined_tables_of_several_rates_have_the_times_of_each(flight, written):
     np.testing.assert_allclose(log.x[:, 7:10], flight.x[1 : 2 * len(log) : 2, 7:10], atol=1e-9)
 
 
-def test_damaged_files_are_refused(flight, written, tmp_path):
+def test_damaged_files_are_refused_and_memory_is_bounded_by_the_numbers_kept(flight, written, tmp_path):
     packed = gzip.compress("\n".join([HEADER, *rows_of(flight)]).encode())
     refusal(lambda: load_log(written(packed[: len(packed) // 2], "a.csv.gz")), "a.csv.gz", "truncated")
     refusal(lambda: load_log(written(packed[:500] + b"\0" * 400 + packed[900:], "b.csv.gz")), "b.csv.gz")
@@ -137,10 +138,7 @@ def test_damaged_files_are_refused(flight, written, tmp_path):
     refusal(lambda: load_log(tmp_path), "a folder")
     path = written("\n".join([HEADER, *rows_of(flight)]))
     refusal(lambda: read_table(path, COLUMNS, max_rows=1199), "row 1201", "split the file")
-
-
-def test_memory_is_bounded_by_the_numbers_kept(flight, written):
-    """Text is held a block at a time; at the worst, more rows take twice their numbers, while parts are joined."""
+    # Text is held a block at a time; at the worst, more rows take twice their numbers, while parts are joined.
     rows = [row.split(",", 1)[1] for row in rows_of(flight)] * 42
 
     def peak(count):
@@ -159,9 +157,7 @@ def test_semicolons_and_decimal_commas_are_said_and_read(flight, tmp_path):
     path = tmp_path / "flight.csv"
     path.write_text("\n".join([HEADER, *rows_of(flight)]).replace(",", ";").replace(".", ","))
     refusal(lambda: read_recording(path), path, "row 1", "separated by ';'", "columns=")
-    tables = 'frames = {world = "ENU", body = "FLU", velocity = "world"}\ntime = {columns = ["t"], unit = "s"}\n'
-    tables += 'velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}\n'
-    tables += 'motors = {columns = ["u0", "u1", "u2", "u3"], unit = "pwm"}\n'
+    tables = column_map(time=("t", "s"), velocity=("vx vy vz", "m/s"), motors=("u0 u1 u2 u3", "pwm"))
     (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";"}')
     refusal(lambda: read_recording(path, tmp_path / "map.toml"), "row 2, field t", "decimal comma", 'decimal = ","')
     (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";", decimal = ","}')

@@ -22,7 +22,6 @@ from hybrid_jax.flights.log import COLUMNS
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.files import json_text, named_leaves, save_archive, write_atomic
 from hybrid_jax.io.models import FORMAT as MODEL
-from hybrid_jax.vehicle import IRIS
 
 LOGS = ("flight.csv", "flight.ulg", "flight.bbl", "log00", "log00.gz", "flight.bag", "flight.db3", "flight.mcap")
 LOADERS = {"model.npz": hj.load, "set.npz": load_dataset, "program.npz": load_program}
@@ -44,19 +43,15 @@ def wholes(flight, topics, tmp_path_factory):
     for plugin, suffix in (("ROS1", "bag"), ("SQLITE3", "db3"), ("MCAP", "mcap")):
         path = bag(folder / suffix, few, plugin)
         made[f"flight.{suffix}"] = next(iter(path.glob(f"*.{suffix}") if path.is_dir() else [path])).read_bytes()
-    model = hj.Hybrid(hj.rigid_body(IRIS), hj.residual_network(13, 4, jax.random.key(0), hidden=4))
+    model = hj.Hybrid(hj.rigid_body(hj.IRIS), hj.residual_network(13, 4, jax.random.key(0), hidden=4))
     hj.save(folder / "model.npz", model)
     export_program(folder / "program.npz", model, state_size=13, input_size=4)
     windows = hj.Trajectories(few.x[:1], few.u[None, :5], few.x[None, 1:6], 0.01)
     save_dataset(folder / "set.npz", Dataset({"train": windows}, {"config": {"vehicle": "iris"}}))
     parts = {"config": {"seeds": 3}, "versions": {}, "flights": {}, "machine": {"cores": 2}}
     write_atomic(folder / "run.json", json_text(parts | {"state": "unfinished", "started": "2026-11-28"}))
-    write_atomic(folder / "vehicle.toml", vehicle_toml(IRIS))
+    write_atomic(folder / "vehicle.toml", vehicle_toml(hj.IRIS))
     return made | {name: (folder / name).read_bytes() for name in LOADERS}
-
-
-def random_numbers():
-    return np.random.default_rng(int(os.environ.get("SEED", "0")))
 
 
 def mutated(content, rng):
@@ -94,10 +89,10 @@ def went_through(path, whole):
     recording = outcome(read_recording, path, topics=topics)
     if recording is not None:
         assert all(np.isfinite(signal.values).all() for signal in recording.signals.values())
-        assert all("\n" not in line for line in failures(check_recording(recording, IRIS, 0.01), "log"))
+        assert all("\n" not in line for line in failures(check_recording(recording, hj.IRIS, 0.01), "log"))
         log = outcome(to_flight, recording, naming=str(path))
         if log is not None and log.u.shape[1] == 4:
-            check_log(log, IRIS)
+            check_log(log, hj.IRIS)
 
 
 @COUNTS
@@ -105,7 +100,7 @@ def went_through(path, whole):
 def test_a_mutated_file_is_read_or_ends_in_a_line(tmp_path, wholes, capfd, name, count):
     """Without another exception, a hang, much memory, or a word on standard output."""
     pytest.importorskip(LIBRARY.get(name, "numpy"))
-    slowest, path, rng = 0.0, tmp_path / name, random_numbers()
+    slowest, path, rng = 0.0, tmp_path / name, np.random.default_rng(int(os.environ.get("SEED", "0")))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for _ in range(count):
         path.write_bytes(mutated(wholes[name], rng))

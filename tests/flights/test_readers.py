@@ -26,7 +26,7 @@ def test_a_crazyflie_log_is_the_flight_it_holds(flight, written, packed):
     np.testing.assert_allclose(log.u[:-1], flight.u[:-1], atol=0.02)
 
 
-def test_crazyflie_angles_commands_and_accelerations_have_the_signs_of_the_library(written):
+def test_crazyflie_angles_commands_and_accelerations_have_our_signs_and_events_their_own_times(written, flight):
     ones, t = np.ones(5), np.arange(5) * 1000
     columns = {"stateEstimate.roll": 10 * ones, "stateEstimate.pitch": 20 * ones, "stateEstimate.yaw": 0 * ones}
     columns |= {"controller.r_roll": ones, "controller.r_pitch": ones, "controller.r_yaw": ones}
@@ -40,6 +40,13 @@ def test_crazyflie_angles_commands_and_accelerations_have_the_signs_of_the_libra
     np.testing.assert_allclose(65536 * signals["command"].values[0], [31000, 29000, 29000, 31000])  # M1, M4 in front
     assert signals["specific_force"].axes == ("z",)
     np.testing.assert_allclose(signals["specific_force"].values[0], 9.81 * 5)
+    ticks = np.round(flight.t * 1e6).astype(int)
+    pwm = {f"pwm.m{i + 1}_pwm": 60 * u[::2] for i, u in enumerate(flight.u.T)}
+    gyro = dict(zip(STATES[-3:], np.rad2deg(flight.x[:, 10:]).T, strict=True))
+    signals = read_recording(written(usd(gyro, ticks, event=(pwm, ticks[::2])))).signals
+    np.testing.assert_allclose(signals["rates"].values, flight.x[:, 10:], atol=1e-5)
+    np.testing.assert_allclose(signals["command"].t, flight.t[::2], atol=1e-9)
+    np.testing.assert_allclose(signals["command"].values, 60 * flight.u[::2] / 65536, atol=1e-6)
 
 
 def test_a_crazyflie_log_that_is_cut_off_or_changed_fails(flight, written):
@@ -52,7 +59,7 @@ def test_a_crazyflie_log_that_is_cut_off_or_changed_fails(flight, written):
         refusal(lambda content=content: read_recording(written(content, "flight.bin")), "flight.bin")
 
 
-def test_numbers_that_wrapped_are_found(flight, written):
+def test_numbers_that_wrapped_are_found_and_motors_at_rest_and_beyond_their_limits_fail(flight, written):
     height = np.int16(np.round(1000 * np.linspace(30, 40, len(flight.t))).astype(int) & 0xFFFF)
     columns = {f"stateEstimateZ.{axis}": height for axis in "xyz"}
     ticks = np.round(flight.t * 1e6).astype(int)
@@ -62,20 +69,17 @@ def test_numbers_that_wrapped_are_found(flight, written):
     path = written(usd(signed, ticks, dict.fromkeys(MOTORS, "h")))
     assert "16-bit number wrapped" in "".join(failures(check_recording(read_recording(path)), "log"))
     refusal(lambda: read_recording(written(usd(signed, ticks % 2**16))), "goes back from", "16 bits of µs began anew")
-
-
-def test_motors_at_rest_and_beyond_their_limits_fail(flight, written):
-    resting = crazyflie(flight, **{name: np.zeros(len(flight.t), int) for name in MOTORS})
-    assert "another topic, instance" in failures(check_recording(read_recording(written(resting))), "log")[0]
-    still = {name: np.zeros(len(flight.t), int) for name in MOTORS} | {"stateEstimate.z": 0 * flight.t}
-    still = read_recording(written(crazyflie(flight, **still)))
-    assert "nothing flew" in failures(check_recording(still), "log")[0]
-    slow = read_recording(written(crazyflie(flight, **{f"rpm.m{i + 1}": u for i, u in enumerate(flight.u.T)})))
-    assert "read as rpm" in failures(check_recording(slow), "log")[0]
-    speeds = {f"rpm.m{i + 1}": u * 30 / np.pi for i, u in enumerate(flight.u.T)}
-    speeds["rpm.m2"] = np.where(np.arange(len(flight.t)) == 300, 1e6, speeds["rpm.m2"])
-    (line,) = failures(check_recording(read_recording(written(crazyflie(flight, **speeds))), IRIS), "log")
-    assert "rotor_speed of motor 1 is 1.047e+05 at 3 s, must be from 0 to 1100" in line
+    rest = {name: np.zeros(len(flight.t), int) for name in MOTORS}
+    rpm = {f"rpm.m{i + 1}": u * 30 / np.pi for i, u in enumerate(flight.u.T)}
+    jump = {"rpm.m2": np.where(np.arange(len(flight.t)) == 300, 1e6, rpm["rpm.m2"])}
+    for changes, words in (
+        (rest, "another topic, instance"),
+        (rest | {"stateEstimate.z": 0 * flight.t}, "nothing flew"),
+        ({name: np.pi / 30 * speeds for name, speeds in rpm.items()}, "read as rpm"),
+        (rpm | jump, "rotor_speed of motor 1 is 1.047e+05 at 3 s, must be from 0 to 1100"),
+    ):
+        recording = read_recording(written(crazyflie(flight, **changes)))
+        assert words in failures(check_recording(recording, IRIS), "log")[0]
 
 
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
@@ -167,36 +171,22 @@ def test_the_compressed_state_and_the_filter_of_a_crazyflie_are_read(flight, wri
             np.testing.assert_allclose(signals["rates"].values, flight.x[:, 10:], atol=1e-3)
 
 
-def test_events_of_a_crazyflie_have_their_own_times(flight, written):
-    ticks = np.round(flight.t * 1e6).astype(int)
-    pwm = {f"pwm.m{i + 1}_pwm": 60 * u[::2] for i, u in enumerate(flight.u.T)}
-    gyro = dict(zip(STATES[-3:], np.rad2deg(flight.x[:, 10:]).T, strict=True))
-    signals = read_recording(written(usd(gyro, ticks, event=(pwm, ticks[::2])))).signals
-    np.testing.assert_allclose(signals["rates"].values, flight.x[:, 10:], atol=1e-5)
-    np.testing.assert_allclose(signals["command"].t, flight.t[::2], atol=1e-9)
-    np.testing.assert_allclose(signals["command"].values, 60 * flight.u[::2] / 65536, atol=1e-6)
-
-
-def test_two_clocks_are_named(flight):
-    """Stamps since boot beside those since 1970, as of mavros without a time sync."""
+def test_numbers_beyond_any_flight_and_two_clocks_are_named(flight, tmp_path):
+    """A bag holds doubles: 1e10 m is no position, of one sample or of most."""
+    x = flight.x[:60].copy()
+    x[20, 1] = 1e10
+    spoiled = SimpleNamespace(t=flight.t[:60], x=x, u=flight.u[:60])
+    recording = read_recording(bag(tmp_path / "one", spoiled, "MCAP"))
+    assert len(recording.signals["position"]) == 59
+    assert any("position is not a number in 1 samples, the first at 0.2 s" in note for note in recording.notes)
+    x[20:55, 1] = 1e10
+    path = bag(tmp_path / "most", spoiled, "MCAP")
+    refusal(lambda: read_recording(path), path, "/odom", "y is 1e+10 at 0.2 s")
+    # Stamps since boot beside those since 1970, as of mavros without a time sync.
     parts = {"rates": (flight.t, flight.x[:, 10:], "/imu"), "position": (flight.t + 1.7e9, flight.x[:, :3], "/odom")}
     samples = {name: Samples(t, values, source) for name, (t, values, source) in parts.items()}
     (line,) = [line for line in failures(check_recording(record("bag", samples)), "log") if "no time in common" in line]
     assert "/odom from 1700000000 to 1700000012 s" in line
-
-
-@pytest.mark.parametrize("many", [False, True])
-def test_numbers_beyond_any_flight_are_named(flight, tmp_path, many):
-    """A bag holds doubles: 1e10 m is no position, of one sample or of most."""
-    x = flight.x[:60].copy()
-    x[20 : 55 if many else 21, 1] = 1e10
-    path = bag(tmp_path / "run", SimpleNamespace(t=flight.t[:60], x=x, u=flight.u[:60]), "MCAP")
-    if many:
-        refusal(lambda: read_recording(path), path, "/odom", "y is 1e+10 at 0.2 s")
-    else:
-        recording = read_recording(path)
-        assert len(recording.signals["position"]) == 59
-        assert any("position is not a number in 1 samples, the first at 0.2 s" in note for note in recording.notes)
 
 
 @pytest.mark.parametrize("stray", [0, 600, -1])
@@ -221,11 +211,12 @@ def test_a_sample_that_tells_nothing_is_left_out_and_said(flight, written, stray
 @pytest.mark.parametrize("name", ["00000012.BIN", "00000012.log", "sess001.px4log", "flight.tlog", "logs.zip"])
 def test_formats_that_are_not_read_are_named_with_a_way_out(written, tmp_path, name):
     starts = {"BIN": b"\xa3\x95\x80\x80", "log": b"FMT, 128, 89, FMT, BBnNZ, Type", "zip": b"PK\x03\x04"}
-    path = written(starts.get(name.split(".")[1], b"abcd") + bytes(100), name)
-    words = dict.fromkeys(("BIN", "log"), "mavlogdump.py --format csv") | {"px4log": "log .ulg"}
-    words |= {"tlog": "own card", "zip": "unpack it"}
-    refusal(lambda: read_recording(path), path, words[name.split(".")[1]])
-    assert words[name.split(".")[1]] in find_logs(tmp_path)[1][path]
+    ending = name.split(".")[1]
+    path = written(starts.get(ending, b"abcd") + bytes(100), name)
+    words = dict.fromkeys(("BIN", "log"), "mavlogdump.py --format csv")
+    words |= {"px4log": "log .ulg", "tlog": "own card", "zip": "unpack it"}
+    refusal(lambda: read_recording(path), path, words[ending])
+    assert words[ending] in find_logs(tmp_path)[1][path]
 
 
 def test_pipes_links_and_bombs_neither_hang_nor_fill_the_memory(tmp_path):

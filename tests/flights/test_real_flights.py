@@ -17,10 +17,8 @@ FOLDER = Path(os.environ.get("HYBRID_JAX_FLIGHTS", Path(__file__).parents[3] / "
 SETS = {"crazyflie_payload": ("bare", "payload"), "nanodrone": ("train", "valid")}
 FILES = [f for name, parts in SETS.items() for part in parts for f in sorted((FOLDER / name / part).glob("*.csv.gz"))]
 
-needs_flights = pytest.mark.skipif(not FILES, reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder")
 
-
-@needs_flights
+@pytest.mark.skipif(not FILES, reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder")
 @pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}/{file.name.split('.')[0]}")
 def test_real_flights_pass_all_checks(file):
     log, vehicle = load_log(file), load_vehicle(file.parents[1] / "vehicle.toml")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from surface import refusal
-from writers import OUTPUTS, PX4_STATES, START, commands, escs, failures, message, outputs, stamped, ulog
+from writers import OUTPUTS, PX4_STATES, START, commands, escs, failures, message, outputs, stamped, stamps, ulog
 
 from hybrid_jax.flights import Recording, check_recording
 from hybrid_jax.flights.attitude import BODIES, WORLDS
@@ -37,8 +37,12 @@ def test_a_flight_with_esc_rpm_is_read(flight, topics, written, packed):
     np.testing.assert_allclose(log.u[:-1], mean[: len(log) - 1], atol=0.1)
 
 
-def test_commands_are_shares_that_the_polynomial_converts(flight, topics, written):
-    path = written(topics | {"actuator_motors": commands(flight.t - flight.t[0] + 0.003, flight.u)})
+@pytest.mark.parametrize("escs_too", [False, True])
+def test_commands_are_shares_that_the_polynomial_converts(flight, topics, written, escs_too):
+    """Also if ESCs report zero."""
+    t = flight.t - flight.t[0] + 0.003
+    zeros = {"esc_status": escs(t, 0 * flight.u)} if escs_too else {}
+    path = written(topics | zeros | {"actuator_motors": commands(t, flight.u)})
     log = to_flight(reordered(read_recording(path), (2, 0, 3, 1)), polynomial=(100.0, 1000.0))
     np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1][:, [2, 0, 3, 1]], rtol=1e-5)
     refusal(lambda: to_flight(read_recording(path)), path, "actuator_motors", "polynomial=")
@@ -46,25 +50,14 @@ def test_commands_are_shares_that_the_polynomial_converts(flight, topics, writte
     refusal(lambda: to_flight(read_recording(path), dt=0.0), "dt must be")
 
 
-def test_commands_are_used_if_escs_report_zero(flight, topics, written):
-    t = flight.t - flight.t[0] + 0.003
-    both = topics | {"esc_status": escs(t, 0 * flight.u), "actuator_motors": commands(t, flight.u)}
-    log = to_flight(read_recording(written(both)), polynomial=(100.0, 1000.0))
-    np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1], rtol=1e-5)
-
-
 def test_old_logs_hold_pwm_and_the_rates_beside_the_attitude(flight, topics, written):
     """PX4 1.6: no timestamp_sample, rates in vehicle_attitude, commands in µs, 1000 … 2000 by default."""
     t = flight.t - flight.t[0]
-    formats = {
-        "vehicle_attitude": "uint64_t timestamp;float rollspeed;float pitchspeed;float yawspeed;float[4] q;",
-        "actuator_outputs": "uint64_t timestamp;uint32_t noutputs;float[16] output;",
-    }
-    old = {name: [] for name in formats}
-    times = START + np.round(t * 1e6).astype(int)
-    for at, q, omega, u in zip(times, flight.x[:, 3:7], flight.x[:, 10:], flight.u, strict=True):
-        old["vehicle_attitude"].append(struct.pack("<Q7f", at, *(omega @ BODIES["FRD"]), *q))
-        old["actuator_outputs"].append(struct.pack("<QI16f", at, 6, *(1000 + u), *[900.0] * 2, *[0.0] * 10))
+    form = "uint64_t timestamp;float rollspeed;float pitchspeed;float yawspeed;float[4] q;"
+    rows = zip(stamps(t), flight.x[:, 10:] @ BODIES["FRD"], flight.x[:, 3:7], strict=True)
+    old = {"vehicle_attitude": [struct.pack("<Q7f", at, *omega, *q) for at, omega, q in rows]}
+    six = np.concatenate([1000 + flight.u, np.full((len(t), 2), 900.0)], axis=1)
+    old["actuator_outputs"], formats = outputs(t, six), OUTPUTS | {"vehicle_attitude": form}
     recording = read_recording(written(ulog(old, formats)))
     np.testing.assert_allclose(recording.signals["rates"].values, flight.x[:, 10:], atol=1e-5)
     np.testing.assert_allclose(recording.signals["command"].values, flight.u / 1000, atol=1e-6)
@@ -136,7 +129,7 @@ def test_every_topic_of_a_quantity_is_read_in_its_frame(written, quantity, topic
     np.testing.assert_allclose(found, own @ frame.T if len(fields) == 3 else own, atol=1e-6)
 
 
-def test_what_the_estimator_calls_invalid_resets_and_dropouts_are_said(written):
+def test_what_the_estimator_calls_invalid_and_resets_are_said_and_a_dropout_becomes_a_gap(written, flight, topics):
     form = "uint64_t timestamp;float x;float y;float z;uint8_t xy_valid;uint8_t z_valid;uint8_t z_reset_counter;"
     rows = [struct.pack("<Q3f3B", START + 10_000 * i, i, 0, 0, i >= 10, 1, i >= 30) for i in range(50)]
     content = ulog({"vehicle_local_position": rows}, {"vehicle_local_position": form})
@@ -144,17 +137,6 @@ def test_what_the_estimator_calls_invalid_resets_and_dropouts_are_said(written):
     assert len(recording.signals["position"]) == 40
     for words in ("not valid in 10 of 50", "reset the position (z_reset_counter) at 0.3 s", "longest of 120 ms"):
         assert any(words in note for note in recording.notes)
-
-
-@pytest.mark.parametrize("missing", [*PX4_STATES, "esc_status"])
-def test_a_missing_topic_is_named(flight, topics, written, missing):
-    motors = {"esc_status": escs(flight.t - flight.t[0], flight.u)}
-    path = written({name: samples for name, samples in (topics | motors).items() if name != missing})
-    quantity = dict(zip((*PX4_STATES, "esc_status"), ("position", "attitude", "rates", "motors"), strict=True))[missing]
-    refusal(lambda: to_flight(read_recording(path)), path, f"no {quantity}", "logger_topics.txt", f"{missing} ")
-
-
-def test_a_dropout_becomes_a_gap(flight, topics, written):
     t = flight.t - flight.t[0]
     holed = topics["vehicle_attitude"][:500] + topics["vehicle_attitude"][550:]  # 0.4 s from 4.003 s on
     log = to_flight(read_recording(written(topics | {"vehicle_attitude": holed, "esc_status": escs(t, flight.u)})))
@@ -165,21 +147,23 @@ def test_a_dropout_becomes_a_gap(flight, topics, written):
     np.testing.assert_allclose(log.x[:, 3:7], truth[:, 3:7], atol=2e-4)
 
 
-def test_samples_without_content_are_refused(topics, written):
+@pytest.mark.parametrize("missing", [*PX4_STATES, "esc_status"])
+def test_a_missing_topic_is_named_and_samples_without_content_are_refused(flight, topics, written, missing):
+    motors = {"esc_status": escs(flight.t - flight.t[0], flight.u)}
+    path = written({name: samples for name, samples in (topics | motors).items() if name != missing})
+    quantity = dict(zip((*PX4_STATES, "esc_status"), ("position", "attitude", "rates", "motors"), strict=True))[missing]
+    refusal(lambda: to_flight(read_recording(path)), path, f"no {quantity}", "logger_topics.txt", f"{missing} ")
     zero = stamped(np.arange(0.0, 5, 0.01), np.zeros((500, 4)))
     refusal(lambda: read_recording(written(topics | {"vehicle_attitude": zero})), "vehicle_attitude", "norm")
     bad = stamped(np.arange(0.0, 5, 0.01), np.full((500, 3), np.nan))
     refusal(lambda: read_recording(written(topics | {"vehicle_angular_velocity": bad})), "xyz[0]", "x is nan at 0 s")
 
 
-def test_a_log_that_was_cut_off_is_read_and_fails(flight, topics, written):
+def test_a_log_that_was_cut_off_is_read_and_fails_and_a_clock_that_jumps_is_refused_or_a_gap(flight, topics, written):
     whole = ulog(topics | {"esc_status": escs(flight.t - flight.t[0], flight.u)})
     (line,) = failures(check_recording(read_recording(written(whole[:-500])), IRIS), "log")
     assert "ends in the middle of a message, after 11" in line
     assert 'failed="warn"' in line
-
-
-def test_a_clock_that_jumps_is_refused_or_a_gap(flight, topics, written):
     rates, late = topics["vehicle_angular_velocity"], stamped(np.arange(0.0, 1, 0.005) + 3600, np.ones((200, 3)))
     recording = read_recording(written(topics | {"vehicle_angular_velocity": rates + late}))
     (line,) = [line for line in failures(check_recording(recording), "log") if "longest gap" in line]

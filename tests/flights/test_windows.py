@@ -2,21 +2,19 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from recorded import DT, LOGS, SAMPLES, write
 from surface import refusal
-from systems import infer_batch, train_batch
+from systems import columns, flying, infer_batch, one_by_one, train_batch
 
 import hybrid_jax as hj
 from hybrid_jax import Trajectories, rigid_body, rotation
 from hybrid_jax.dynamics import FrozenRates, HoldState
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.windows import errors_between, flight_errors, flight_of, folds, hold_out, manoeuvre_of
-from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.vehicle import BODY_RATES, IRIS, POSITION, QUATERNION, VELOCITY
 
 
@@ -38,39 +36,30 @@ def test_logs_are_resampled_to_dt_and_rotors_may_lag(tmp_path):
     assert windows.u.std() < hj.load_windows(tmp_path, IRIS, dt=0.02, failed="warn").u.std()
 
 
-def test_failed_checks_are_reported(tmp_path):
+def test_failed_checks_are_reported_and_invalid_arguments_refused(tmp_path):
     still = FlightLog(LOGS[0].t, LOGS[0].x, LOGS[0].u * [1, 1, 1, 0], "still.csv")
     write(tmp_path, [still])
     with pytest.warns(UserWarning, match=r"still.csv.gz: columns: u3 never changes"):
         hj.load_windows(tmp_path, IRIS, failed="warn")
     refusal(lambda: hj.load_windows(tmp_path, IRIS), "still.csv.gz: ", 'to continue anyway, use failed="warn"')
     refusal(lambda: hj.load_windows(tmp_path, IRIS, failed="no"), "failed must be")
-
-
-def test_invalid_arguments_are_refused(tmp_path):
-    write(tmp_path, LOGS[:1])
-    refusal(lambda: hj.load_windows(tmp_path, IRIS, steps=0), "steps")
-    refusal(lambda: hj.load_windows(tmp_path, IRIS, dt=-1.0), "dt must be")
-    refusal(lambda: hj.load_windows(tmp_path, IRIS, steps=500), "no window of 500")
+    sound = write(tmp_path / "sound", LOGS[:1])
+    refusal(lambda: hj.load_windows(sound, IRIS, steps=0), "steps")
+    refusal(lambda: hj.load_windows(sound, IRIS, dt=-1.0), "dt must be")
+    refusal(lambda: hj.load_windows(sound, IRIS, steps=500), "no window of 500")
     refusal(lambda: hj.load_windows(tmp_path / "none", IRIS), "no such folder")
 
 
-def test_quaternions_become_unit_and_continuous(flight):
+def test_quaternions_become_unit_and_continuous_and_the_arrays_given_are_not_changed(flight):
     signs = np.where(np.arange(len(flight)) % 3 == 1, -1.01, 0.99)[:, None]
     x = np.concatenate([flight.x[:, :3], flight.x[:, 3:7] * signs, flight.x[:, 7:]], axis=1)
+    before = x.copy()
     again = FlightLog(flight.t, x, flight.u)
     np.testing.assert_allclose(again.x, flight.x, atol=1e-12)
     assert again.x[0, 3] >= 0
-
-
-def test_the_arrays_given_must_agree_and_are_not_changed(flight):
+    np.testing.assert_array_equal(x, before)
     refusal(lambda: FlightLog(flight.t[1:], flight.x, flight.u), "(n, 13)")
     refusal(lambda: FlightLog(flight.t[:0], flight.x[:0], flight.u[:0]), "no samples")
-    x = -flight.x
-    x[:, 3:7] *= 1.01
-    before = x.copy()
-    FlightLog(flight.t, x, flight.u)
-    np.testing.assert_array_equal(x, before)
 
 
 @pytest.mark.parametrize(
@@ -124,22 +113,15 @@ def test_a_manoeuvre_is_held_out_whole_if_it_is_one():
     refusal(lambda: folds(LOGS, 4, manoeuvre_of), "3 different names")
 
 
-def states(count, seed=0):
-    rng = np.random.default_rng(seed)
-    x = rng.normal(size=(count, 13)).astype(np.float32)
-    x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
-    return x
-
-
 def flights(count=7, steps=4):
     u = np.random.default_rng(1).uniform(600, 700, (count, steps, 4)).astype(np.float32)
-    x0 = states(count)
-    return Trajectories(x0, u, np.asarray(jax.jit(rollout_batch)(rigid_body(IRIS), x0, u, 0.01)), 0.01)
+    x0 = flying(count)[0].astype(np.float32)
+    return Trajectories(x0, u, np.asarray(jax.jit(hj.rollout_batch)(rigid_body(IRIS), x0, u, 0.01)), 0.01)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 0.3, 3.0])
 def test_errors_are_lengths_and_an_angle(angle):
-    x = states(5)
+    x = flying(5)[0].astype(np.float32)
     turn = rotation.from_axis_angle(jnp.array([0.6, 0.0, 0.8]), jnp.asarray(angle))
     q = jax.vmap(lambda q: -rotation.multiply(q, turn))(x[:, QUATERNION])  # −q is the same rotation
     other = jnp.asarray(x).at[:, QUATERNION].set(q)
@@ -150,7 +132,7 @@ def test_errors_are_lengths_and_an_angle(angle):
         np.testing.assert_allclose(found, value, rtol=1e-3, atol=1e-6)  # float32; an arc cosine would err by 3e-4
 
 
-def test_exact_physics_has_no_error_and_chunks_do_not_matter(monkeypatch):
+def test_exact_physics_has_no_error_baselines_hold_the_state_or_freeze_rates_and_chunks_do_not_matter(monkeypatch):
     windows = flights()
     for error in flight_errors(rigid_body(IRIS), windows):
         assert error.shape == (7, 4)
@@ -160,15 +142,12 @@ def test_exact_physics_has_no_error_and_chunks_do_not_matter(monkeypatch):
     np.testing.assert_allclose(np.stack(whole), np.stack(flight_errors(HoldState(), windows)), rtol=1e-6)
     other = Trajectories(np.zeros((2, 2)), np.zeros((2, 3, 1)), np.zeros((2, 3, 2)), 0.1)
     refusal(lambda: flight_errors(HoldState(), other), "states of 13")
-
-
-def test_baselines_hold_the_state_or_freeze_rates():
-    x, u = jnp.asarray(states(5).T), jnp.full((4, 5), 650.0)
+    x, u = columns(5)
     plain = rigid_body(IRIS)
-    for evaluate in map(eqx.filter_jit, (train_batch, infer_batch, lambda field, x, u: jax.vmap(field, -1, -1)(x, u))):
+    for evaluate in (train_batch, infer_batch, one_by_one):
         assert (evaluate(HoldState(), x, u) == 0).all()
         frozen, whole = evaluate(FrozenRates(plain), x, u), evaluate(plain, x, u)
         assert (frozen[BODY_RATES] == 0).all()
         np.testing.assert_allclose(frozen[:10], whole[:10], rtol=1e-6, atol=1e-6)
     windows = flights()
-    np.testing.assert_array_equal(rollout_batch(HoldState(), windows.x0, windows.u, 0.01)[:, -1], windows.x0)
+    np.testing.assert_array_equal(hj.rollout_batch(HoldState(), windows.x0, windows.u, 0.01)[:, -1], windows.x0)
