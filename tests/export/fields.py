@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from choices import PAIRS
 from jaxtyping import Array, Float
+from systems import HOVER, flying
 
 from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid
 from hybrid_jax.dynamics.base import HoldState
 from hybrid_jax.dynamics.rigid_body import FrozenRates, RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, Terms
-from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
+from hybrid_jax.networks.mlp import NORMS, LinearResidual, residual_network
 from hybrid_jax.networks.views import multirotor_network
-from hybrid_jax.vehicle import QUATERNION, VELOCITY
+from hybrid_jax.vehicle import VELOCITY
 
 KEY = np.zeros(2, np.uint32)  # jax.random.key(0)
-SCALING = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
 TERMS = Terms(torque_gain=(0.9, 1.1, 0.8), drag=(0.3, 0.4, 0.1))
 
 
@@ -43,7 +43,7 @@ def moved(field, size=0.1):
 
 
 def network(**options):
-    return moved(multirotor_network(IRIS, KEY, hidden=5, scaling=SCALING, **options))
+    return moved(multirotor_network(IRIS, KEY, hidden=5, scaling=HOVER, **options))
 
 
 def solved(x, u):
@@ -65,7 +65,7 @@ def per_rotor():
 
 
 def with_norm(norm):
-    return Hybrid(body(), moved(residual_network(13, 4, KEY, hidden=5, scaling=SCALING, norm=norm)))
+    return Hybrid(body(), moved(residual_network(13, 4, KEY, hidden=5, scaling=HOVER, norm=norm)))
 
 
 def with_residual(inputs, outputs):
@@ -103,11 +103,14 @@ def field_of(name):
 SIZES = {"state_size": 13, "input_size": 4}
 
 
+def close(found, expected, tolerance):
+    """To a share of the largest entry."""
+    found, expected = np.asarray(found), np.asarray(expected)
+    np.testing.assert_allclose(found.reshape(expected.shape), expected, rtol=0, atol=tolerance * abs(expected).max())
+
+
 def samples(count=3, seed=1):
-    rng = np.random.default_rng(seed)
-    x = rng.normal(size=(count, 13))
-    x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
-    return x, rng.uniform(400, 900, (count, 4))
+    return flying(count, seed)
 
 
 def double(field):

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from choices import slow
 from compiled import Library, needs_compiler
-from fields import KEY, SOME_SLOW, body, double, field_of, samples
+from fields import KEY, SOME_SLOW, body, close, double, field_of, samples
 from surface import refusal
 
 import hybrid_jax as hj
-from hybrid_jax import IRIS, Hybrid
 from hybrid_jax.export import export_c
 from hybrid_jax.integrate import rk4_step
 from hybrid_jax.networks import multirotor_network, smoothed
@@ -20,11 +19,6 @@ from hybrid_jax.networks import multirotor_network, smoothed
 pytestmark = needs_compiler
 DT = 0.02
 TOLERANCE = {True: 1e-12, False: 1e-5}  # of the largest entry
-
-
-def close(found, expected, precise):
-    expected = np.asarray(expected)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE[precise] * abs(expected).max())
 
 
 def check(field, folder, precisions=(True, False), steps=True, sizes=(13, 4), points=None):
@@ -46,10 +40,10 @@ def check(field, folder, precisions=(True, False), steps=True, sizes=(13, 4), po
         library = Library(export_c(folder, field, DT, name=name, **options)[1], sizes, precise)
         for function, results in expected.items():
             for (value, slope), x, u in zip(results, *points, strict=True):
-                close(library(function, x, u), value, precise)
+                close(library(function, x, u), value, TOLERANCE[precise])
                 again, by_x, by_u = library(f"{function}_jacobian", x, u)
-                close(again, value, precise)
-                close(by_x.astype(float) @ dx + by_u.astype(float) @ du, slope, precise)
+                close(again, value, TOLERANCE[precise])
+                close(by_x.astype(float) @ dx + by_u.astype(float) @ du, slope, TOLERANCE[precise])
 
 
 @pytest.mark.parametrize("name", SOME_SLOW)
@@ -59,7 +53,7 @@ def test_it_is_the_field(name, tmp_path):
 
 
 def wide(norm="batch", **options):
-    return Hybrid(body(), multirotor_network(IRIS, KEY, hidden=64, norm=norm, **options))
+    return hj.Hybrid(body(), multirotor_network(hj.IRIS, KEY, hidden=64, norm=norm, **options))
 
 
 WIDE = {
@@ -83,39 +77,32 @@ def turned(x, u):
     return jnp.stack([x[1], u[0] * jnp.where(x[0] > 0, 2.0, jnp.exp(x[0])) - x[1] ** 3 + jnp.maximum(x[0], -0.5)])
 
 
-def test_a_function_of_one_s_own_of_any_size_may_be_one(tmp_path):
+def rows(x, u):
+    """Beside each other constants, what all rows have in common, a logical and a number of each row."""
+
+    def one(row):
+        place, entry, above = row
+        return place * jnp.where((x[0] > 0) & above, jnp.sin(entry), entry * u[0])
+
+    return jax.lax.map(one, (jnp.arange(3.0), x, x > u[0]))
+
+
+def steps(x, u):
+    """Half of it is carried on; each turn gives a number of its own, and reads one."""
+    halved = jax.lax.fori_loop(0, 3, lambda i, y: y / 2 + i * u[0], x)
+
+    def one(carried, row):
+        y, z = carried
+        return (jnp.sin(y) * row, z + y[0]), y[0] * z
+
+    (y, z), numbers = jax.lax.scan(one, (halved, u[0]), jnp.arange(3.0))
+    return y + z * numbers
+
+
+@pytest.mark.parametrize(("function", "size"), [(turned, 2), (rows, 3), (steps, 3)])
+def test_a_function_of_one_s_own_of_any_size_a_map_over_rows_and_a_loop_may_be_one(function, size, tmp_path):
     rng = np.random.default_rng(0)
-    check(turned, tmp_path, sizes=(2, 1), points=(rng.normal(size=(4, 2)), rng.normal(size=(4, 1))))
-
-
-def test_a_map_over_rows_is_a_loop(tmp_path):
-    def rows(x, u):
-        """Beside each other constants, what all rows have in common, a logical and a number of each row."""
-
-        def one(row):
-            place, entry, above = row
-            return place * jnp.where((x[0] > 0) & above, jnp.sin(entry), entry * u[0])
-
-        return jax.lax.map(one, (jnp.arange(3.0), x, x > u[0]))
-
-    rng = np.random.default_rng(0)
-    check(rows, tmp_path, sizes=(3, 1), points=(rng.normal(size=(4, 3)), rng.normal(size=(4, 1))))
-
-
-def test_a_loop_that_carries_numbers_on_is_one(tmp_path):
-    def steps(x, u):
-        """Half of it is carried on; each turn gives a number of its own, and reads one."""
-        halved = jax.lax.fori_loop(0, 3, lambda i, y: y / 2 + i * u[0], x)
-
-        def one(carried, row):
-            y, z = carried
-            return (jnp.sin(y) * row, z + y[0]), y[0] * z
-
-        (y, z), rows = jax.lax.scan(one, (halved, u[0]), jnp.arange(3.0))
-        return y + z * rows
-
-    rng = np.random.default_rng(0)
-    check(steps, tmp_path, sizes=(3, 1), points=(rng.normal(size=(4, 3)), rng.normal(size=(4, 1))))
+    check(function, tmp_path, sizes=(size, 1), points=(rng.normal(size=(4, size)), rng.normal(size=(4, 1))))
 
 
 def backward(function, x):

@@ -17,7 +17,6 @@ import hybrid_jax as hj
 from hybrid_jax.export import export_adaptation_c, export_filter_c
 from hybrid_jax.export.c.filters import _about
 from hybrid_jax.integrate import rk4_step
-from hybrid_jax.online.estimator import OnlineAdaptation
 
 pytestmark = needs_compiler
 DT = 0.01
@@ -73,7 +72,7 @@ def in_double(hypotheses):
 
 def filter_with(hypotheses):
     own = {"hypotheses": HYPOTHESES, "prior": 0.5, "indices": (1,)} if hypotheses else {}
-    return OnlineAdaptation(NOMINAL[hypotheses], DT, 1e-3, disturbance=2.0, process=1e-2, **own)
+    return hj.OnlineAdaptation(NOMINAL[hypotheses], DT, 1e-3, disturbance=2.0, process=1e-2, **own)
 
 
 def compiled(source, precise, size):
@@ -94,22 +93,18 @@ def compiled(source, precise, size):
     return lambda *given: filled(library[f"{source.stem}_begin"], *given), update
 
 
-def with_covariances(state):
-    """In place of square roots, of which some columns are rounding only."""
-
-    def squared(path, leaf):
-        return leaf @ np.swapaxes(leaf, -1, -2) if path[-1].name == "root" else leaf
-
-    return jax.tree_util.tree_map_with_path(squared, state)
-
-
 def error(found, expected):
-    """The largest difference, relative to the largest number of its part of the state or to the unit of that."""
+    """The largest difference, relative to the largest number of its part of the state or to the unit of that.
+
+    Covariances take the place of their square roots, of which some columns are rounding only.
+    """
 
     def off(path, value, other):
-        return np.abs(other - value).max() / max(np.abs(value).max(), UNITS.get(path[-1].name, 1e-9))
+        if (name := path[-1].name) == "root":
+            value, other = (root @ np.swapaxes(root, -1, -2) for root in (value, other))
+        return np.abs(other - value).max() / max(np.abs(value).max(), UNITS.get(name, 1e-9))
 
-    states = map(with_covariances, jax.device_get((expected, found)))  # NumPy compiles nothing
+    states = jax.device_get((expected, found))  # NumPy compiles nothing
     return max(jax.tree.leaves(jax.tree_util.tree_map_with_path(off, *states)))
 
 
@@ -162,8 +157,7 @@ def test_c_is_the_filter_of_hidden_states(tmp_path):
 
 
 def test_names_of_a_model_cannot_leave_their_comment():
-    said = _about(
-        "adapts", {"trusted": (0, 1), "*/\\\n": (1, 2)}, ["k*/ int main(void) {} /*", "disturbance[vx]", "β\n#error"]
-    )
+    names = ["k*/ int main(void) {} /*", "disturbance[vx]", "β\n#error"]
+    said = _about("adapts", {"trusted": (0, 1), "*/\\\n": (1, 2)}, names)
     assert "changes of k___int_main_void_______, disturbance[vx], ___error,\n" in said
     assert "state: trusted at 0 (1),\n   ____ at 1 (2).\n" in said

@@ -1,5 +1,8 @@
 """CasADi's function of a field is the field: its values, its derivatives, its steps."""
 
+from functools import partial
+
+import fields
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +15,9 @@ from hybrid_jax.export import casadi_function
 from hybrid_jax.networks import smoothed
 
 ca = pytest.importorskip("casadi")
-ROUND_OFF = 1e-12  # of the largest entry: a few hundred operations of 1e-16 each
 
 
-def close(found, expected):
-    found, expected = np.asarray(found), np.asarray(expected)
-    np.testing.assert_allclose(found.reshape(expected.shape), expected, rtol=0, atol=ROUND_OFF * abs(expected).max())
+close = partial(fields.close, tolerance=1e-12)  # a few hundred operations of 1e-16 each
 
 
 def jacobian(function):
@@ -91,11 +91,8 @@ def looped(x, u):
 
 
 @pytest.mark.parametrize(("field", "said"), [(solved, "'lu'"), (looked_up, "to int64"), (looped, "'scan'")])
-def test_an_operation_that_casadi_has_not_is_named(field, said):
+def test_an_operation_that_casadi_has_not_is_named_and_what_makes_no_sense_refused(field, said):
     with pytest.raises(ValueError, match=rf"^field: its .*{said}.* has no counterpart in CasADi$"):
         casadi_function(field, **SIZES)
-
-
-def test_what_makes_no_sense_is_refused():
     refusal(lambda: casadi_function(body(), name="1 f"), "name must be a valid")
     refusal(lambda: casadi_function(solved), "state_size must be given: function does not know its size")
