@@ -16,14 +16,12 @@ from matplotlib.figure import Figure
 from smoke import ROOT
 
 from experiments.real_flight.simulated import csv_of, vehicle_toml
-from hybrid_jax.adaptation import Adaptation
+from hybrid_jax import Adaptation, load, rigid_body, save
 from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED, VERBS, in_flags
 from hybrid_jax.cli.export import PARTS
 from hybrid_jax.cli.logs import Flights
 from hybrid_jax.cli.page import Page, Table, document, write
-from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.io.models import load, save
+from hybrid_jax.flights import FlightLog
 from hybrid_jax.status import Status
 from hybrid_jax.vehicle import IRIS, SENSOR_NOISE, load_vehicle
 
@@ -139,16 +137,12 @@ def test_set_points_of_a_plan_begin_and_end_in_the_middle(tmp_path, called):
 
 
 @pytest.mark.slow
-def test_a_flight_that_the_model_learned_from_is_refused(fitted, called):
+def test_a_flight_that_the_model_learned_from_is_refused_and_a_model_of_another_vehicle_told(fitted, called, tmp_path):
     shutil.copy(fitted / "before" / "px4.ulg", fitted / "copy.ulg")
     code, _, said = called("check", fitted / "source.npz", fitted / "copy.ulg", "--out", fitted / "check")
     assert code == BAD_INPUT
     assert "copy.ulg: the same flight as px4.ulg, which the model was trained on" in said
-
-
-@pytest.mark.slow
-def test_a_model_of_another_vehicle_is_told(fitted, tmp_path, called):
-    """Of a vehicle with five times the thrust no change of this one is learned."""
+    # Of a vehicle with five times the thrust no change of this one is learned.
     about, other = load(fitted / "source.npz").about, replace(IRIS, thrust_coefficient=5 * IRIS.thrust_coefficient)
     save(tmp_path / "other.npz", rigid_body(other), about)
     files = ["-o", tmp_path / "adapted.npz", "--out", tmp_path]
@@ -201,20 +195,16 @@ def test_arguments_become_options(said, printed):
     assert in_flags(said, "external_force") == said  # which reads no logs
 
 
-def drawn():
-    figure = Figure()
-    figure.subplots().plot([1, 2], [3, 4])
-    return figure
-
-
 @pytest.fixture
 def page():
     wide = Table("Many < columns", [f"column {i}" for i in range(30)], [[f"{i}.123 m/s" for i in range(30)]])
-    figures = [("The one & only <figure>", drawn()), ("Another", drawn())]
+    figures = [("The one & only <figure>", Figure()), ("Another", Figure())]
+    for _, figure in figures:
+        figure.subplots().plot([1, 2], [3, 4])
     return Page("What?", "This.", wide, figures, ["a < b"], ["Go on: " + "x" * 200], [wide], ["y" * 300])
 
 
-def test_it_needs_nothing_but_itself(page, tmp_path, capsys):
+def test_a_page_needs_nothing_but_itself(page, tmp_path, capsys):
     write(tmp_path, "check", page, {"one": 1})
     shown = (tmp_path / "report.html").read_text()
     assert re.findall(r"(?:src|href)=\"(?!data:)[^\"]*|url\(|@import|fetch\(", shown) == []

@@ -29,9 +29,8 @@ def field():
 def filters(monkeypatch):
     """The filters that the command would write as C, with their options; to translate one takes seconds."""
     given = []
-    monkeypatch.setattr(
-        "hybrid_jax.cli.export.export_adaptation_c", lambda *each, **own: given.append((*each, own)) or []
-    )
+    name = "hybrid_jax.cli.export.export_adaptation_c"
+    monkeypatch.setattr(name, lambda *each, **own: given.append((*each, own)) or [])
     return given
 
 
@@ -50,7 +49,7 @@ def test_all_that_is_written_is_the_model(field, tmp_path, called):
     np.testing.assert_allclose(field(X, U), derivative, rtol=1e-5, atol=1e-4)
 
 
-def test_of_a_model_with_a_past_the_update_is_written_and_said(tmp_path, called, filters):
+def test_of_a_model_with_a_past_the_update_is_written_and_a_filter_keeps_its_disturbance(tmp_path, called, filters):
     model = DisturbanceModel(hj.rigid_body(hj.IRIS), jnp.eye(12, 13), jnp.ones(13), (0.1,), ())
     hj.save(tmp_path / "model.npz", model, {"dt": 0.02})
     _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--to", "c,stablehlo", "--out", tmp_path)
@@ -61,10 +60,7 @@ def test_of_a_model_with_a_past_the_update_is_written_and_said(tmp_path, called,
     np.testing.assert_allclose(seen, model.after(x0, hj.rollout(model.field, X, U[None], 0.02)[0], X, 0.02), atol=1e-3)
     assert "void model_observe(" in (tmp_path / "model.h").read_text()
     assert len(filters) == 1
-
-
-def test_the_filter_keeps_which_states_an_adapted_model_disturbs(tmp_path):
-    """Of a model with a torque alone the exported filter had six disturbances for three."""
+    # Of a model with a torque alone the exported filter had six disturbances for three.
     body = hj.with_disturbance(hj.rigid_body(hj.IRIS), (10, 11, 12))
     made = _filter(Options(tmp_path, tmp_path), body, 0.01, 13)
     assert isinstance(made, hj.OnlineAdaptation)
@@ -86,7 +82,7 @@ def test_c_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, ca
     assert 0 < found <= np.abs(field.residual.weight_out).sum(axis=1).max() / 60
 
 
-def test_the_filter_that_is_written_is_that_of_the_options(tmp_path, called, filters):
+def test_the_filter_that_is_written_is_that_of_the_options_and_none_without_a_parameter(tmp_path, called, filters):
     hj.save(tmp_path / "model.npz", hj.rigid_body(hj.IRIS), {"dt": 0.02})
     options = "--noise-std 0.1,0.2,0.3,0.4"
     _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--out", tmp_path, *options.split())
@@ -96,9 +92,6 @@ def test_the_filter_that_is_written_is_that_of_the_options(tmp_path, called, fil
     wanted = hj.OnlineAdaptation(hj.rigid_body(hj.IRIS), 0.02, noise, disturbance=pushed, process=process)
     assert eqx.tree_equal(filters[0][1], wanted)
     assert filters[0][-1] == {"name": "model_adaptation", "double": False, "state_size": 13, "input_size": 4}
-
-
-def test_a_model_without_parameters_has_no_filter(tmp_path, called):
     hj.save(tmp_path / "model.npz", Kinematics(), {"dt": 0.02})
     sizes = ["--state-size", "13", "--input-size", "4"]
     _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--out", tmp_path, *sizes)

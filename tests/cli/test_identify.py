@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from recorded import LOGS, write
+from writers import column_map
 
 import hybrid_jax as hj
 from benchmarks.log_mistakes import parts_of, recording_of
@@ -19,12 +20,7 @@ from hybrid_jax.flights.checks.consistency import FAILS
 from hybrid_jax.identification.log_checks import compared
 from hybrid_jax.vehicle import IRIS
 
-COLUMNS = """
-frames = { world = "ENU", body = "FLU", velocity = "world" }
-time = { columns = ["t"], unit = "s" }
-specific_force = { columns = ["ax", "ay", "az"], unit = "m/s²" }
-motors = { columns = ["c0", "c1", "c2", "c3"], unit = "share" }
-"""
+COLUMNS = column_map(time=("t", "s"), specific_force=("ax ay az", "m/s²"), motors=("c0 c1 c2 c3", "share"))
 
 
 @pytest.fixture
@@ -114,27 +110,23 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_check_that_fails_ends_in_what_to_type(folder):
+def read_logs(folder, **options):
+    options = Options(folder / "logs", folder / "m.npz", **options)
+    return checked(options, folder / "v.toml", VehicleModel(IRIS))[0]
+
+
+def test_a_check_that_fails_ends_in_what_to_type_and_goes_on_when_asked_or_mended(folder):
     write(folder / "logs", [SWAPPED])
     (folder / "logs" / "notes.txt").write_text("windy")
     with pytest.raises(ChecksFailed, match="motor order against roll and pitch") as failed:
-        checked(Options(folder / "logs", folder / "m.npz"), folder / "v.toml", VehicleModel(IRIS))
+        read_logs(folder)
     assert failed.value.args[0].endswith("motor_order=(3, 0, 1, 2)")
     assert "nothing was identified" in failed.value.args[-1]
-
-
-@pytest.mark.parametrize(
-    ("more", "failed"), [({"ignore_checks": True}, 1), ({"motor_order": (3, 0, 1, 2)}, 0)], ids=str
-)
-def test_it_goes_on_when_asked_or_mended(folder, more, failed):
-    write(folder / "logs", [SWAPPED])
-    read, _ = checked(Options(folder / "logs", folder / "m.npz", **more), folder / "v.toml", VehicleModel(IRIS))
-    assert [f"{failed} checks" in line for line in read.warnings if "--ignore-checks" in line] == [True] * failed
-
-
-def test_a_log_that_fails_is_left_out_where_another_passes(folder):
-    write(folder / "logs", [SWAPPED, LOGS[1]])
-    read, _ = checked(Options(folder / "logs", folder / "m.npz"), folder / "v.toml", VehicleModel(IRIS))
+    for more, failed in (({"ignore_checks": True}, 1), ({"motor_order": (3, 0, 1, 2)}, 0)):  # asked, and mended
+        read = read_logs(folder, **more)
+        assert [f"{failed} checks" in line for line in read.warnings if "--ignore-checks" in line] == [True] * failed
+    write(folder / "logs", [LOGS[1]])
+    read = read_logs(folder)  # what fails is left out where another log passes
     assert [*read.contents] == ["chirp_run2.csv.gz"]
     assert "motor order against roll and pitch" in read.notes[-1]
 
@@ -165,14 +157,11 @@ def commanded(log, *left_out):
     return replace(recording, signals=signals | {"command": replace(speeds, values=(log.u - 100) / 900)})
 
 
-def test_commands_and_a_gyro_alone_tell_the_order_of_the_motors():
+def test_a_gyro_alone_tells_the_order_of_the_motors_and_states_are_compared_with_what_there_is():
     without = ("position", "velocity", "attitude")
     assert failed(commanded(LOGS[0], *without)) == []
     assert failed(commanded(SWAPPED, *without)) == ["motor order against roll and pitch"]
     assert failed(commanded(SWAPPED, *without, "rates")) == []
-
-
-def test_states_are_compared_with_what_there_is_of_them():
     x = LOGS[0].x.copy()
     x[:, 7:10] = -x[:, 7:10]
     backwards = replace(LOGS[0], x=x)
@@ -180,16 +169,13 @@ def test_states_are_compared_with_what_there_is_of_them():
     assert failed(commanded(backwards, "position", "attitude")) == []
 
 
-def test_a_thrust_that_is_learned_may_be_off_but_not_in_another_unit():
+def test_a_thrust_that_is_learned_may_be_off_but_not_in_another_unit_and_slow_signals_are_no_fast_ones():
     weak, ratio = replace(IRIS, thrust_coefficient=IRIS.thrust_coefficient / 3), "specific force over thrust per mass"
     assert ratio not in failed(recording_of(parts_of(LOGS[0])), vehicle=weak)
     assert ratio in failed(recording_of(parts_of(LOGS[0])), learn=("Ix",), vehicle=weak)
     rpm = replace(LOGS[0], u=LOGS[0].u * 30 / np.pi)
     assert ratio in failed(recording_of(parts_of(rpm)))
-
-
-def test_slow_signals_are_not_compared_as_if_they_were_fast():
-    """What a motor did between commands 40 ms apart is not known."""
+    # What a motor did between commands 40 ms apart is not known.
     recording = commanded(SWAPPED)
     slow = dict(recording.signals)
     for name, k in (("position", 20), ("command", 4)):

@@ -16,13 +16,10 @@ from writers import MAP
 
 from experiments.real_flight.simulated import vehicle_toml
 from experiments.worlds.cases import WORLDS
+from hybrid_jax import IRIS, load, load_vehicle, rigid_body, rollout, save
 from hybrid_jax.cli.command import VERBS
-from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.integrate import rollout
-from hybrid_jax.io.models import load, save
+from hybrid_jax.flights import FlightLog
 from hybrid_jax.sim import PARAMETER_SHIFT
-from hybrid_jax.vehicle import IRIS, load_vehicle
 
 X, U = [0, 0, 1, 1, 0, 0, 0, 0.3, 0, 0, 0, 0, 0.1], [650, 640, 650, 660]
 MAIN = """
@@ -36,7 +33,6 @@ int main(void) {
 }
 """
 FILES = ("own.csv", "px4.ulg", "ros.bag", "usd00", "z.bbl")
-ACTUATOR = "[actuator]\ncurve = [48.0, 1999.0]\n"
 
 
 def are_fine(folder, seen):
@@ -91,7 +87,7 @@ def test_from_logs_of_every_format_to_pages_and_a_program(fitted, ran, seen):
     assert set(report("check")["rmse"]) >= {"model", "no forces"}
     ran(fitted, "plan adapted.npz -o plan.csv --seconds 2 --starts 1 --iterations 5")
     ran(fitted, "replay adapted.npz other/flight0.csv.gz --other source.npz --seconds 1")
-    (fitted / "commands.toml").write_text((fitted / "v.toml").read_text() + ACTUATOR)
+    (fitted / "commands.toml").write_text((fitted / "v.toml").read_text() + "[actuator]\ncurve = [48.0, 1999.0]\n")
     options = "--learn Ix,Iy --windows 20 --ignore-checks --out runs/identified"
     ran(fitted, f"fit before/z.bbl -o body.npz --vehicle commands.toml {options}")
     ran(fitted, "export adapted.npz -o board --name iris")
