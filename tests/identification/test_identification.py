@@ -175,7 +175,7 @@ STEP = 0.1
 MIX = np.array([[1.0, 0.0], [0.8, 0.3]])
 
 
-def test_a_random_walk_is_a_line_and_a_bridge_between_its_samples():
+def test_a_random_walk_is_a_line_and_a_bridge_between_its_samples_and_noise_is_told_from_it():
     """It has a covariance of M Mᵀ in a second, and samples a tenth of a second apart."""
     steps = np.random.default_rng(0).normal(size=(20_000, 2)) @ MIX.T * np.sqrt(0.01)
     t, values = 0.01 * np.arange(20_000), np.cumsum(steps, axis=0)
@@ -195,9 +195,6 @@ def test_a_random_walk_is_a_line_and_a_bridge_between_its_samples():
     fast = Signal(0.01 * np.arange(50), np.random.default_rng(0).normal(size=(50, 4)), tuple("0123"), "fast")
     assert slow_commands.count(fast, 0.5) == 0  # fast commands are held, and know no bridge
     assert not slow_commands.root([fast]).any()
-
-
-def test_noise_is_told_from_what_bridges_do():
     rng, n, t = np.random.default_rng(1), 300, 20
     slopes = rng.normal(size=(n, t, 2, 3)) * np.array([[0.5], [2.0]])
     noise = np.array([0.1, 0.4])

@@ -112,20 +112,16 @@ def test_values_and_derivatives_are_those_of_jax_in_double_precision(name):
 
 
 @needs_kernels
-def test_inputs_have_the_derivative_of_jax():
-    x0, u, d_states = windows(paper(), 16)
-    slopes = [jax.vjp(partial(of, paper(), x0), u)[1](d_states)[0] for of in (trained, trained_by_jax)]
-    np.testing.assert_allclose(*slopes, rtol=0, atol=1e-5 * np.abs(slopes[1]).max())
-
-
-@needs_kernels
-def test_a_lane_is_the_same_alone_to_the_bit():
+def test_a_lane_is_the_same_alone_to_the_bit_and_inputs_have_the_derivative_of_jax():
     lanes = windows(paper(), 20, lanes=(2, 3))
     function = partial(both_ways, trained, paper())
     together = jax.jit(jax.vmap(jax.vmap(function)))(*lanes)
     single = jax.jit(function)(*(part[1, 2] for part in lanes))
     for one, other in zip(jax.tree.leaves(together), jax.tree.leaves(single), strict=True):
         np.testing.assert_array_equal(one[1, 2], other)
+    x0, u, d_states = windows(paper(), 16)
+    slopes = [jax.vjp(partial(of, paper(), x0), u)[1](d_states)[0] for of in (trained, trained_by_jax)]
+    np.testing.assert_allclose(*slopes, rtol=0, atol=1e-5 * np.abs(slopes[1]).max())
 
 
 class Own(RigidBody):

@@ -62,7 +62,7 @@ def gains(adaptation, states):
 
 
 @pytest.mark.parametrize("noise", [NOISE, NOISE / 10], ids=["noisy", "quiet"])
-def test_what_hover_does_not_tell_stays_with_its_variance_and_is_flagged(noise):
+def test_what_hover_does_not_tell_stays_with_its_variance_and_gusts_are_not_taken_for_another_gain(noise):
     """A filter that learns all is off by three standard deviations of the prior after this minute."""
     adaptation = filter_of(noise)
     states, _ = hovering(adaptation, noise, jax.random.key(0), 60 * SECOND)
@@ -71,10 +71,6 @@ def test_what_hover_does_not_tell_stays_with_its_variance_and_is_flagged(noise):
     assert deviation.min() > 0.8
     assert adaptation.flags(states).unexcited[SECOND:, adaptation.names.index("gain")].all()
     assert np.linalg.eigvalsh(np.asarray(states.covariance[::SECOND], float)).min() > 0
-
-
-@pytest.mark.parametrize("noise", [NOISE, NOISE / 10], ids=["noisy", "quiet"])
-def test_gusts_are_followed_and_not_taken_for_another_gain(noise):
     adaptation = filter_of(noise)
     states, errors = hovering(adaptation, noise, jax.random.key(0), 60 * SECOND, gusts=1.0)
     theta, deviation = gains(adaptation, states)

@@ -113,14 +113,11 @@ def test_alarms_that_follow_each_other_do_not_make_it_forget_a_cause():
     assert not adaptation().flags(state).inconsistent
 
 
-def test_what_is_outside_all_causes_is_found_no_worse_than_by_the_filter_of_all():
+def test_what_is_outside_all_causes_is_found_no_worse_and_a_push_that_grows_is_delivered_ahead():
     """Two things at once, which only the filter of all parameters explains."""
     both = cart(stiffness=1.8, gain=0.5, push=0.6)
     found, alone = (errors(watched(hypotheses, both, seeds=24)[1], both) for hypotheses in (True, False))
     assert found < 1.2 * alone
-
-
-def test_a_push_that_grows_is_delivered_ahead():
     ahead, rate = HYPOTHESES[-1].lead, 0.15
     _, theta = watched(True, cart(push=0.5), rate=rate)
     push = adaptation().names.index("push")
@@ -139,15 +136,12 @@ def test_intervals_hold_the_truth_with_and_without_a_number_of_their_own():
     assert np.mean(inside) >= 0.85
 
 
-def test_bad_samples_keep_the_model_and_its_weights():
+def test_bad_samples_keep_the_model_and_its_weights_and_hypotheses_that_cannot_be_are_refused():
     samples, inputs = flown(cart(stiffness=1.6), jax.random.key(3))
     states = watch(adaptation(), samples.at[-6:].set(jnp.nan), inputs)
     assert np.ptp(states.trusted[-7:], axis=0).max() < 1e-3
     assert np.ptp(states.mixture.log_weights[-7:], axis=0).max() < 1e-6
     assert adaptation().flags(states).gap[-1]
     assert states.restarts[-1] == 0
-
-
-def test_hypotheses_that_cannot_be_are_refused():
     refusal(lambda: hj.Hypothesis("a"), "hypothesis a: parameters must contain")
     refusal(lambda: hj.Hypothesis("a", {"push": 1.0}, rates={"gain": 1.0}), "hypothesis a: rates must be of its")

@@ -73,14 +73,11 @@ def test_a_quadrotor_s_rates_and_the_wind_are_estimated_from_position_and_attitu
     assert off[12:].max() < 0.15
 
 
-def test_an_outlier_moves_a_robust_filter_less():
+def test_an_outlier_moves_a_robust_filter_less_and_bad_input_is_refused():
     samples, inputs = np.full((40, 1), 0.5, np.float32), np.full((40, 1), 2.0, np.float32)
     samples[-1] = 5.0
     usual, robust = (run(hj.ExtendedKalmanFilter(pushed(), DT, robust=r), samples, inputs).x[0] for r in (np.inf, 3.0))
     assert abs(robust - 0.5) < 0.1 * abs(usual - 0.5)
-
-
-def test_bad_input_is_refused():
     for change, options, message in (
         ({"noise": {}}, {}, "the noise of position must be known: give it to the model, or take the model of a fit"),
         ({"spread": (1.0, np.inf, 1.0)}, {}, "spread must be finite for a filter"),

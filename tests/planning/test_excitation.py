@@ -42,7 +42,7 @@ FREE = hj.InputBounds(low=(-2.0,), high=(1.0,), start=(0.0,))
 GAIN = Pushed(b=jnp.array(0.7))
 
 
-def test_the_best_input_of_an_integrator_is_at_its_larger_limit_throughout():
+def test_the_best_input_of_an_integrator_is_at_its_larger_limit_throughout_and_switches_in_a_box():
     """J of a sample is t u, so each window tells u² ∫t², and the larger limit is the best for all of them."""
     found = search(GAIN, FREE)
     u = jnp.full((100, 1), -2.0)
@@ -55,10 +55,7 @@ def test_the_best_input_of_an_integrator_is_at_its_larger_limit_throughout():
     t = DT * np.arange(1, 6)
     alone = NOISE**2 * (np.sum(t**2) + np.sum(t) ** 2) / (4 * np.sum(t**2) ** 2)
     assert found.standard_errors["b"] < np.sqrt(alone / 20)
-
-
-def test_a_box_makes_the_input_switch_and_is_kept():
-    """The state may move by 0.5 only, a quarter of a second at full push, so the input must turn round."""
+    # The state may move by 0.5 only, a quarter of a second at full push, so the input must turn round.
     bounds = hj.InputBounds((-2.0,), (2.0,), (0.0,), state_low=(-0.5,), state_high=(0.5,))
     found = search(GAIN, bounds, steps=100)
     assert found.margins["x0"] >= 0
@@ -82,7 +79,7 @@ def test_predicted_errors_are_those_of_least_squares():
     assert spread == pytest.approx([found.standard_errors[name] for name in "ab"], rel=0.12)
 
 
-def test_hidden_states_are_unknown_at_the_start_of_each_window():
+def test_hidden_states_are_unknown_at_the_start_of_each_window_and_a_past_adds_what_it_does_to_a_gain():
     """Their starts count as parameters, so what is left is what another value of theirs cannot explain."""
     field = hj.with_hidden(Pushed(a=jnp.array(1.5)), Lag(jnp.log(jnp.array([0.1])), places=(0,)))
     u, (theta, unravel) = jax.random.normal(jax.random.key(0), (20, 1)), ravel_parameters(field)
@@ -95,10 +92,7 @@ def test_hidden_states_are_unknown_at_the_start_of_each_window():
 
     jacobian = np.asarray(jax.jacfwd(predicted)(jnp.concatenate([theta, x[:-1:5, 1]])), float)
     np.testing.assert_allclose(np.linalg.inv(gram), np.linalg.inv(jacobian.T @ jacobian)[:2, :2], rtol=1e-2)
-
-
-def test_a_past_adds_what_its_disturbance_does_to_a_gain():
-    """ẋ = b u + e with u = 1: an estimate of b is wrong by the mean of e, which a fifth of a second forgets."""
+    # ẋ = b u + e with u = 1: an estimate of b is wrong by the mean of e, which a fifth of a second forgets.
     past = DisturbanceModel(GAIN, jnp.zeros((1, 2)), jnp.array([0.3, 1.0]), (0.2,), ())
     x, u = DT * 0.7 * jnp.arange(101)[:, None], jnp.ones((100, 1))
     quiet, found = (information_of(GAIN, x, u, DT, 5, jnp.array([NOISE]), past=each) for each in (None, past))
@@ -107,7 +101,7 @@ def test_a_past_adds_what_its_disturbance_does_to_a_gain():
     np.testing.assert_allclose(added, 0.3**2 * np.exp(-apart / 0.2).mean(), rtol=1e-3)
 
 
-def test_a_parameter_that_nothing_excites_is_named():
+def test_a_parameter_that_nothing_excites_is_named_and_an_empty_box_refused():
     model = Pushed(b=jnp.array(0.7), c=jnp.array(2.0))
     with pytest.warns(UserWarning, match="no input excites c"):
         found = search(model, FREE, ("b", "c"), steps=0)
@@ -115,6 +109,10 @@ def test_a_parameter_that_nothing_excites_is_named():
     assert found.parameters == ("b",)
     with pytest.warns(UserWarning, match="excites c"), pytest.raises(ValueError, match="no input excites any of c"):
         search(model, FREE, ("c",), steps=0)
+    refusal(lambda: hj.FlightBounds(low=(0.0, 0.0, 2.0), high=(1.0, 1.0, 1.0)), "low must be below high")
+    refusal(lambda: hj.FlightBounds(rotor_speed=(0.5, 1.2)), "two shares between 0 and 1")
+    refusal(lambda: hj.InputBounds((0.0,), (1.0, 2.0), (0.0,)), "equally many")
+    refusal(lambda: hj.InputBounds((0.0,), (1.0,), (0.0,), state_low=(0.0,)), "given together")
 
 
 @pytest.mark.parametrize(
@@ -133,13 +131,6 @@ def test_bad_input_is_refused_in_one_line(change, said):
     refusal(lambda: search(**given), said)
 
 
-def test_an_empty_box_is_refused():
-    refusal(lambda: hj.FlightBounds(low=(0.0, 0.0, 2.0), high=(1.0, 1.0, 1.0)), "low must be below high")
-    refusal(lambda: hj.FlightBounds(rotor_speed=(0.5, 1.2)), "two shares between 0 and 1")
-    refusal(lambda: hj.InputBounds((0.0,), (1.0, 2.0), (0.0,)), "equally many")
-    refusal(lambda: hj.InputBounds((0.0,), (1.0,), (0.0,), state_low=(0.0,)), "given together")
-
-
 @pytest.fixture(scope="module")
 def flights():
     """A flight after no step of the search, the best of its starts, and after a few."""
@@ -150,17 +141,13 @@ def flights():
 
 
 @pytest.mark.slow
-def test_a_flight_tells_more_than_any_start_and_keeps_its_limits(flights):
+def test_a_flight_tells_more_than_any_start_keeps_its_limits_and_is_what_the_vehicle_can_do(flights):
     begun, found = flights
     assert found.log_det > begun.log_det
     assert all(left >= 0 for left in [*begun.margins.values(), *found.margins.values()])
     assert found.parameters == ("Ix", "k")
     for name, value in {"Ix": hj.IRIS.inertia[0], "k": hj.IRIS.thrust_coefficient}.items():
         assert 0 < found.standard_errors[name] < value
-
-
-@pytest.mark.slow
-def test_a_flight_is_what_its_reference_says_and_the_vehicle_can_do(flights):
     found = flights[1]
     wanted = jax.vmap(lambda t: reference_state(found.reference, t, hj.IRIS.gravity))(jnp.asarray(found.t))
     np.testing.assert_allclose(found.states, wanted, atol=1e-3)

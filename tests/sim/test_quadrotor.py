@@ -108,14 +108,11 @@ def test_level_thrust_gains_what_cheeseman_and_bennett_say_and_no_more_below_hal
     np.testing.assert_allclose(gains, 4 / 3)
 
 
-def test_a_tilted_rotor_has_its_own_altitude_and_pushes_the_low_side_up():
+def test_a_tilted_rotor_has_its_own_altitude_and_its_push_turns_with_the_vehicle():
     tilted = hovering(0.3, tilt=0.5)  # about x: the left rotors (y > 0) rise
     altitudes = rotor_altitudes(tilted, parameters_of(IRIS).rotor_positions)
     np.testing.assert_allclose(altitudes, [0.3 + np.sin(0.5) * y for _, y in IRIS.rotor_positions])
     assert float(ground_effect(tilted, jnp.full(4, 650.0), T0, parameters_of(IRIS)).torque[0]) < -0.01
-
-
-def test_ground_effect_turns_with_the_vehicle():
     u, above = jnp.array([600.0, 800.0, 800.0, 600.0]), (hovering(0.3), hovering(0.3, jnp.pi / 2, (0.0, 0.0, 1.0)))
     straight, turned = (ground_effect(x, u, T0, parameters_of(IRIS)).torque for x in above)
     assert float(jnp.abs(straight[0])) > 1e-2

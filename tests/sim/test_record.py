@@ -105,7 +105,7 @@ def test_flights_that_go_wrong_and_windows_with_a_rotor_below_ground_are_dropped
     assert tally == {"flights": 6, "dropped_flights": 4, "windows": 8 - rejected, "rejected_windows": rejected}
 
 
-def test_splits_come_from_disjoint_flights_and_windows_do_not_overlap(monkeypatch):
+def test_splits_come_from_disjoint_flights_windows_do_not_overlap_and_it_is_said_if_every_flight_fails(monkeypatch):
     flown = []
 
     def numbered(domain, count, seconds, key):
@@ -124,9 +124,6 @@ def test_splits_come_from_disjoint_flights_and_windows_do_not_overlap(monkeypatc
     starts = [(row[0], round(float(row[1]), 3)) for row in dataset.splits["a"].x0.tolist()]
     assert len(set(starts)) == 300
     assert {start for _, start in starts} == {0.0, 1.0, 2.0, 3.0}
-
-
-def test_a_domain_in_which_every_flight_fails_says_so(monkeypatch):
     broken = level_flights(64)
     broken.states[:, 3, 2] = np.nan
     monkeypatch.setattr(recording, "random_flights", lambda *_: broken)

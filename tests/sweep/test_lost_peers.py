@@ -33,7 +33,7 @@ def meet(*processes, of=3, timeout=1.0):
         return list(pool.map(one, processes))
 
 
-def test_a_result_is_waited_for_and_an_error_of_the_exchange_is_a_lost_peer():
+def test_a_result_is_waited_for_an_error_of_the_exchange_is_a_lost_peer_and_who_never_comes_is_named():
     one, *_ = meet(0, 1, 2)
     assert one.waited_for(lambda: 3) == 3
 
@@ -42,9 +42,6 @@ def test_a_result_is_waited_for_and_an_error_of_the_exchange_is_a_lost_peer():
 
     with pytest.raises(PeerLost, match=r"^Gloo: connection closed$"):
         one.waited_for(broken)
-
-
-def test_who_never_comes_is_named_by_all():
     assert set(meet(0, 2, timeout=0.5)) == {"process 1 did not join within 0.5 s"}
     (alone,) = meet(1, timeout=0.5)
     assert alone.startswith("process 0 at 127.0.0.1:")

@@ -103,11 +103,10 @@ def compilations(caplog):
 def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
     blocks = []
     own = replace(SETTINGS, batch_size=5)  # no other test's, or its compilation would serve here too
+    given = {"width": 1, "block_seconds": 1e-9, "on_block": lambda *each: blocks.append(each)}
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         for _ in range(2):
-            swept(
-                starts(), PLANS, settings=own, width=1, block_seconds=1e-9, on_block=lambda *each: blocks.append(each)
-            )
+            swept(starts(), PLANS, settings=own, **given)
     assert len(blocks) > 3
     assert compilations(caplog) == 1
 
@@ -199,8 +198,16 @@ def test_evaluate_is_the_error_of_each_lane(final):
         np.testing.assert_allclose(errors[i], alone, rtol=1e-4)  # another program for the same float32 sums
 
 
-def test_plans_that_do_not_fit_the_data_are_refused():
-    """A gather would clamp an index outside the data and train on another window in silence."""
+def test_runs_stop_by_their_own_validation_windows_and_plans_that_do_not_fit_the_data_are_refused():
+    """Indices into a larger validation set do what that part of it does alone."""
+    own = [replace(each, validate_on=jnp.arange(5, 15)) for each in PLANS]
+    parted, alone = swept(starts(), own), swept(starts(), PLANS, validation=VALIDATION[5:15])
+    np.testing.assert_array_equal(parted.best_epoch, alone.best_epoch)
+    np.testing.assert_allclose(parted.best_mse, alone.best_mse, rtol=1e-4)  # another program for the same float32 sums
+    wrong = replace(own[1], validate_on=own[1].validate_on.at[0].set(20))
+    with pytest.raises(ValueError, match="validate_on contains 20, which is not an index of the 20 windows"):
+        swept(starts(), [own[0], wrong])
+    # A gather would clamp an index outside the data and train on another window in silence.
     for size in (41, 9):
         with pytest.raises(ValueError, match=f"n_train={size} must lie between batch_size=10 and .* 40 in train"):
             swept(starts(), [*PLANS[:2], plan(n_train=size)])
@@ -210,17 +217,6 @@ def test_plans_that_do_not_fit_the_data_are_refused():
     spoiled = eqx.tree_at(lambda w: w.u, VALIDATION, VALIDATION.u.at[1, 2, 0].set(jnp.nan))
     with pytest.raises(ValueError, match=r"^validation: u\[1, 2, 0\] is not finite"):
         swept(starts(), PLANS, validation=spoiled)
-
-
-def test_runs_stop_by_their_own_validation_windows():
-    """Indices into a larger validation set do what that part of it does alone."""
-    own = [replace(each, validate_on=jnp.arange(5, 15)) for each in PLANS]
-    parted, alone = swept(starts(), own), swept(starts(), PLANS, validation=VALIDATION[5:15])
-    np.testing.assert_array_equal(parted.best_epoch, alone.best_epoch)
-    np.testing.assert_allclose(parted.best_mse, alone.best_mse, rtol=1e-4)  # another program for the same float32 sums
-    wrong = replace(own[1], validate_on=own[1].validate_on.at[0].set(20))
-    with pytest.raises(ValueError, match="validate_on contains 20, which is not an index of the 20 windows"):
-        swept(starts(), [own[0], wrong])
 
 
 def test_lanes_are_stacked_and_picked_and_a_number_is_a_constant_of_all():
