@@ -53,12 +53,12 @@ def fields(adapted):
     return {name: found.field for name, found in adapted.results.items() if not isinstance(found, str)}
 
 
-def test_a_fit_beats_the_model_s_own_physics(adapted):
+def test_a_fit_beats_physics_every_method_adapts_or_refuses_in_a_line_and_least_squares_improves(adapted):
     system = adapted.system
     assert adapted.source.best_mse < eqx.filter_jit(rollout_mse)(system.model.physics, system.validation)
-
-
-def test_every_method_adapts_or_refuses_in_one_line(adapted):
+    fitted = adapted.results["least_squares"].field
+    before, after = (rollout_mse(field, adapted.system.test) for field in (adapted.source.best, fitted))
+    assert after < before
     refused = {name: found for name, found in adapted.results.items() if isinstance(found, str)}
     # The output layer of a user's own network is not known.
     assert set(refused) <= {"last_layer"}
@@ -69,12 +69,6 @@ def test_every_method_adapts_or_refuses_in_one_line(adapted):
             assert np.isfinite(result.mse_after)
             assert result.report().startswith(f"Adapted to {len(adapted.system.target)} windows")
             assert result.to_dict()["status"] == str(result.status)
-
-
-def test_least_squares_improves_windows_that_it_has_not_seen(adapted):
-    fitted = adapted.results["least_squares"].field
-    before, after = (rollout_mse(field, adapted.system.test) for field in (adapted.source.best, fitted))
-    assert after < before
 
 
 def test_a_file_gives_the_same_model_in_another_process(adapted, tmp_path):

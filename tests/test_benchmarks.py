@@ -14,10 +14,7 @@ from benchmarks.training_peers import BY_HAND, COMPILED, TORCHDIFFEQ
 
 @pytest.mark.parametrize(
     ("options", "complaint"),
-    [
-        (["--output", "file/a.json"], "--output file: cannot be written"),
-        (["--preset", "huge"], "--preset must be one of"),
-    ],
+    [(["--output", "file/a.json"], "--output file: cannot be written"), (["--preset", "huge"], "--preset must be one")],
 )
 def test_bad_input_is_refused_in_one_line_before_measuring(options, complaint, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("kept")
@@ -32,14 +29,11 @@ def test_bad_input_is_refused_in_one_line_before_measuring(options, complaint, t
     assert (tmp_path / "file").read_text() == "kept"
 
 
-def test_results_that_differ_are_not_timed():
+def test_results_that_differ_are_not_timed_and_a_ratio_is_taken_within_turns():
     with pytest.raises(Disagreement, match="sums differ by"):
         agree("sums", [np.ones(3), np.ones(2)], [np.ones(3), np.array([1, 1.1])], 0.05)
     with pytest.raises(Disagreement, match="nan"):
         agree("sums", np.array([np.nan]), np.ones(1), 0.05)
-
-
-def test_a_ratio_is_taken_within_turns():
     # The machine was ten times slower in the second turn: that is not a difference between the two.
     times = Times({"a": [1.0, 20.0, 3.0], "b": [2.0, 40.0, 4.0]})
     assert times.ratio("a", "b") == 0.5

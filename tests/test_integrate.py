@@ -1,5 +1,7 @@
 """Laws of trajectories under held inputs, in double precision."""
 
+from functools import partial
+
 import diffrax
 import equinox as eqx
 import jax
@@ -9,12 +11,10 @@ import pytest
 from choices import slow
 from pendulum import pendulum
 
-from hybrid_jax.dynamics import Hybrid, rigid_body
+from hybrid_jax import IRIS, Hybrid, residual_network, rigid_body
 from hybrid_jax.integrate import RK4, SOLVERS, integrate, rollout, rollout_batch
 from hybrid_jax.metrics import predict
-from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.training.loss import rollout_minibatch
-from hybrid_jax.vehicle import IRIS
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 
@@ -52,14 +52,9 @@ def reference(double_precision):
 
 
 @eqx.filter_jit
-def _path(torques, dt, solver, substeps):
-    if substeps > 1:
-        return integrate(pendulum(**FIELD), jnp.asarray(START), torques, dt, solver, substeps)
-    return rollout(pendulum(**FIELD), jnp.asarray(START), torques, dt, solver)
-
-
 def path_of(solver=None, substeps=1, torques=TORQUES, dt=DT):
-    return np.asarray(_path(jnp.asarray(torques), dt, solver, substeps))
+    of = partial(integrate, substeps=substeps) if substeps > 1 else rollout
+    return of(pendulum(**FIELD), jnp.asarray(START), jnp.asarray(torques), dt, solver)
 
 
 @pytest.mark.parametrize(("name", "order"), [*zip(SOLVERS, (4, 2, 2, 5, 5), strict=True)])
@@ -115,8 +110,7 @@ def test_substeps_and_their_gradient_are_those_of_steps_by_hand(solver):
 
 
 def test_a_batch_is_a_loop_of_rollouts():
-    rng = np.random.default_rng(0)
-    x0, u = jnp.asarray(rng.normal(size=(4, 2))), jnp.asarray(rng.normal(size=(4, 6, 1)))
+    x0, u = (jnp.asarray(np.random.default_rng(0).normal(size=size)) for size in ((4, 2), (4, 6, 1)))
     field = Hybrid(pendulum(), residual_network(2, 1, jax.random.key(0), hidden=5))
     together = rollout_batch(field, x0, u, DT)
     for i in range(4):

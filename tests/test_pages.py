@@ -16,7 +16,6 @@ from test_documentation import PACKAGES
 from test_layers import ORDER
 
 DOCS = ROOT / "docs"
-CODE = 78  # characters of a line of code
 
 
 def blocks(page):
@@ -45,22 +44,20 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch):
     spec.loader.exec_module(module)
 
 
-def test_the_picture_of_layers_is_that_of_the_imports():
+def test_the_picture_of_layers_is_that_of_the_imports_and_the_menu_has_some_thirty_entries():
     text = (DOCS / "architecture.md").read_text()
     layers = [re.findall(r"`(\w+)`", line.split("|")[1]) for line in text.splitlines() if line.startswith("| `")]
     assert [name for layer in layers for name in layer] == [*reversed(ORDER)]
+    _, menu = (ROOT / "mkdocs.yml").read_text().split("\nnav:\n")
+    assert 25 <= len(re.findall(r"\.\w+$", menu, flags=re.MULTILINE)) <= 32
 
 
 @pytest.mark.parametrize("page", written(), ids=lambda page: page.stem)
-def test_no_line_of_code_scrolls(page):
-    """Programs and notebooks have the same limit in docs/ruff.toml."""
-    code = re.findall(r"^```\w+\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
-    assert [line for block in code for line in block.splitlines() if len(line) > CODE] == []
-
-
-@pytest.mark.parametrize("page", written(), ids=lambda page: page.stem)
-def test_what_belongs_to_an_item_is_indented_by_four(page):
+def test_no_line_of_code_scrolls_and_what_belongs_to_an_item_is_indented_by_four(page):
     """Otherwise the list ends there, and the next item is set as a part of a paragraph."""
+    code = re.findall(r"^```\w+\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    # Programs and notebooks have the same limit in docs/ruff.toml.
+    assert [line for block in code for line in block.splitlines() if len(line) > 78] == []
     assert re.findall(r"\n\n {1,3}[^ \n].*|\n\n {4}[^`\n]*\n(?: {4}.*\n)*(?:-|\d+\.) .*", page.read_text()) == []
 
 
@@ -71,11 +68,6 @@ NOTEBOOKS = sorted(DOCS.glob("tutorials/*.ipynb"))
 def test_every_exercise_has_an_answer(notebook):
     text = notebook.read_text()
     assert text.count("## Exercise") == text.count("<summary>Answer") == 1
-
-
-def test_the_menu_has_some_thirty_entries():
-    _, menu = (ROOT / "mkdocs.yml").read_text().split("\nnav:\n")
-    assert 25 <= len(re.findall(r"\.\w+$", menu, flags=re.MULTILINE)) <= 32
 
 
 @pytest.mark.parametrize("page", written("results"), ids=lambda page: page.stem)

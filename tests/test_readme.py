@@ -31,21 +31,15 @@ def test_the_example_prints_what_it_shows(tmp_path):
         assert float(number) == pytest.approx(float(expected[name]), rel=0.5), name
 
 
-def test_the_names_that_it_gives_are_there():
+def test_the_names_and_extras_that_it_gives_are_there_and_it_is_read_in_a_minute():
     names = set(re.findall(r"`(hybrid_jax(?:\.\w+)+)[`(]", README))
     assert all(hasattr(hybrid_jax, name) for name in re.findall(r"`hj\.(\w+)", README))
     for name in names:
         found = hybrid_jax
         for part in name.split(".")[1:]:
             found = getattr(found, part, None) or import_module(f"{found.__name__}.{part}")
-
-
-def test_the_extras_that_it_names_exist():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(re.findall(r"\.\[(\w+)\]", README)) <= set(extras)
-
-
-def test_it_is_read_in_a_minute():
     assert len(README.splitlines()) <= LINES
     (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     assert len([line for line in code.splitlines() if line.strip()]) <= EXAMPLE

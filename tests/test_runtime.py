@@ -87,11 +87,8 @@ def printed(program, *cache, **more):
     return [int(number) for number in script("-c", program, *cache, env=own | more).split()]
 
 
-def test_no_module_makes_an_array_when_it_is_imported(tmp_path):
+def test_no_module_makes_an_array_when_it_is_imported_and_after_jax_has_begun_what_can_be_set_is_set(tmp_path):
     assert printed(IMPORTS, tmp_path)[0] > 100  # or the number of cores would be fixed before configure sets it
-
-
-def test_after_jax_has_begun_what_can_be_set_is_set(tmp_path):
     assert script("-c", LATE, env=os.environ | {"XDG_CACHE_HOME": str(tmp_path)}).split() == ["True", "True"]
 
 
@@ -123,7 +120,7 @@ def test_programs_that_a_kill_left_half_written_are_replaced(tmp_path):
     assert list(tmp_path.rglob("hybrid_jax/programs/*-cache"))
 
 
-def test_programs_used_longest_ago_make_room(tmp_path, monkeypatch):
+def test_programs_used_longest_ago_make_room_but_not_in_a_folder_that_the_user_named(tmp_path, monkeypatch):
     monkeypatch.setattr(runtime, "MOST", 4)
     for age, name in enumerate(("new-cache", "used-cache", "old-cache")):
         (tmp_path / name).write_bytes(b"--")
@@ -134,9 +131,6 @@ def test_programs_used_longest_ago_make_room(tmp_path, monkeypatch):
     monkeypatch.setattr(runtime, "UNUSED", -1)
     runtime._delete_stale(tmp_path)
     assert not list(tmp_path.glob("*-cache"))
-
-
-def test_nothing_is_deleted_in_a_folder_that_the_user_named(tmp_path):
     for name in ("theirs-cache", "notes.txt"):
         (tmp_path / name).write_bytes(b"")
         os.utime(tmp_path / name, (0, 0))
