@@ -29,6 +29,10 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
         relative = [part - one for part, one in zip(v, wind, strict=True)]
         air = [dot(column, relative) for column in zip(*attitude, strict=True)]
     force = _specific_force(constants, air, torque)
+    if is_present(constants["rotor_drag"]):
+        of_rotors, moment = _rotor_drag(vehicle, constants, air, omega, u)
+        force = [one + part / constants["mass"][0] for one, part in zip(force, of_rotors, strict=True)]
+        torque = [one + part for one, part in zip(torque, moment, strict=True)]
     faster = _velocity_error(constants, velocity, force)
     turning = rotation.derivative(q, omega)
     if is_present(moment := constants["aerodynamic_moment"]):
@@ -80,6 +84,19 @@ def _specific_force(constants: Constants, air, torque):
     if is_present(pull):
         x, y = x + pull[0] / mass * torque[1], y - pull[1] / mass * torque[0]
     return [x, y, z]
+
+
+def _rotor_drag(vehicle: Vehicle, constants: Constants, air, omega: Rows, u: Rows):
+    """Return the force [N] and torque [N m] of the rotors' drag −u_i H (Rᵀv + ω × r_i), at each hub r_i."""
+    (hx, hy, hz), (vx, vy, vz), (wx, wy, wz) = constants["rotor_drag"], air, omega
+    centre = constants["centre_of_mass"]
+    xs, ys = ([place[i] - centre[i] for place in vehicle.rotor_positions] for i in range(2))
+    total, x, y = sum(u[1:], u[0]), dot(xs, u), dot(ys, u)  # moments of the rotors' speeds
+    xx, yy, xy = (dot([a * b for a, b in zip(*pair, strict=True)], u) for pair in ((xs, xs), (ys, ys), (xs, ys)))
+    across, along = vx * y - wz * yy, vy * x + wz * xx
+    inflow = vz * y + wx * yy - wy * xy, vz * x + wx * xy - wy * xx
+    force = [-hx * (total * vx - wz * y), -hy * (total * vy + wz * x), -hz * (total * vz + wx * y - wy * x)]
+    return force, [-hz * inflow[0], hz * inflow[1], hx * across - hy * along]
 
 
 def _velocity_error(constants: Constants, velocity, force):

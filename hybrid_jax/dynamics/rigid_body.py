@@ -24,7 +24,7 @@ LEARNED = ("Ix", "Iy", "k")
 UNITS = {"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "k": "N s²", "k_rotors": "N s²", "torque_coefficient": "N m s²"}
 UNITS |= {"mass": "kg", "centre_of_mass": "m", "drag": "N s/m", "cable_pull": "1/m", "aerodynamic_moment": "N s"}
 UNITS |= {"added_drag": "1/s", "rate_damping": "N m s", "velocity_lag": "s", "wind": "m/s"}
-UNITS |= {"translational_lift": "N s²/m²"}
+UNITS |= {"translational_lift": "N s²/m²", "rotor_drag": "N s²/m"}
 INERTIAS = {"mass": VELOCITY, "Ix": BODY_RATES.start, "Iy": BODY_RATES.start + 1, "Iz": BODY_RATES.start + 2}
 
 
@@ -53,14 +53,16 @@ class RigidBody(AbstractVectorField):
     """A rigid body carried by its rotors, with further `Terms`; x (13) and u are as in `hybrid_jax.vehicle`.
 
         ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
-        m f = C (τ_y, −τ_x, 0) − D Rᵀv − m c Rᵀv + L (v_x² + v_y²) e_z,   E = diag(1, 1, 0)
+        m f = C (τ_y, −τ_x, 0) − D Rᵀv − m c Rᵀv + L (v_x² + v_y²) e_z + Σ d_i,   E = diag(1, 1, 0)
+        d_i = −u_i H (Rᵀv + ω × r_i), which also adds the torque Σ r_i × d_i
 
     T and τ are thrust and torque of the rotors about the centre of mass. A rotor's thrust is k_i u_i², with the same or
     different k_i, and G scales the torque where the speeds do not determine it. For rotor drag D, the moment A and the
     damping B see Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag
     for accurate tracking of high-speed trajectories", 2018 (A has the other sign there). C is a cable that pulls at 1/C
     below the centre of mass. The state lacks the load's position, but the torque that balances its moment reveals it.
-    L is the translational lift of rotors that fly across their axis at the speed (v_x² + v_y²)^½ of Rᵀv; see Svacha,
+    L is the translational lift of rotors that fly across their axis at the speed (v_x² + v_y²)^½ of Rᵀv, and H the drag
+    of each rotor at its hub r_i, which grows with its speed u_i (D is the same at the speeds of a hover); see Svacha,
     Mohta and Kumar, "Improving quadrotor trajectory tracking by compensating for aerodynamic effects", 2017.
 
     S and λ describe a state estimator that assumes that all force but gravity is along the body's z axis, and corrects
@@ -69,8 +71,8 @@ class RigidBody(AbstractVectorField):
 
     Four corrections describe a change of the body (`corrected`): `efficiency` e, a rotor's thrust and reaction torque
     relative to an intact rotor at the same speed; `reaction_torque`, a factor of all reaction torques, for example for
-    other propellers; `added_drag` c [1/s] along the body's axes; and `wind` w [m/s, world], for a body with D, A or L:
-    all but ṗ are then those at v − w.
+    other propellers; `added_drag` c [1/s] along the body's axes; and `wind` w [m/s, world], for a body with D, H, A or
+    L: all but ṗ are then those at v − w.
 
     Parameters are deviations from nominal that start at zero, so that one learning rate fits all: positive ones as
     log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The lag of the

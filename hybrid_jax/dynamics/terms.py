@@ -13,8 +13,9 @@ SPEED, FAST, RATE = 1.0, 10.0, 10.0
 POSITIVE = {"mass": (), "Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
 SIGNED = {"torque_gain": (3,), "centre_of_mass": (2,), "drag": (3,), "cable_pull": (2,), "aerodynamic_moment": (3, 3)}
 SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": (), "translational_lift": ()}
+SIGNED |= {"rotor_drag": (3,)}
 SHAPES = POSITIVE | SIGNED  # of all learnable parameters, for four rotors; see `shape_of`
-OF_AIR = {"drag", "aerodynamic_moment", "translational_lift"}  # a wind acts through these
+OF_AIR = {"drag", "rotor_drag", "aerodynamic_moment", "translational_lift"}  # a wind acts through these
 OF_VELOCITY = OF_AIR | {"velocity_lag", "velocity_gain"}  # not identifiable without a velocity
 # Of a body that has changed; see `rigid_body.corrected`.
 CORRECTIONS = {"efficiency": (4,), "reaction_torque": (), "added_drag": (3,), "wind": (3,)}
@@ -39,6 +40,7 @@ class Terms:
         velocity_gain: S, the ratio of the position's derivative to the logged velocity.
         velocity_lag: λ, time constant of the estimated velocity for forces across the thrust [s].
         translational_lift: L, force along z over the squared speed along x and y [N s²/m²].
+        rotor_drag: H of each rotor along x, y and z, at its hub, per its speed [N s²/m].
         motor_time_constant: lag of the rotors behind logged motor values [s]; applied to logs, not by the field.
     """
 
@@ -51,6 +53,7 @@ class Terms:
     velocity_gain: Three = (1.0, 1.0, 1.0)
     velocity_lag: float = 0.0
     translational_lift: float = 0.0
+    rotor_drag: Three = NONE
     motor_time_constant: float = 0.0
 
     def __post_init__(self):
@@ -96,5 +99,6 @@ def units_of(vehicle: Vehicle) -> dict[str, float]:
     arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / vehicle.rotors
     forces = {"drag": weight / SPEED, "aerodynamic_moment": weight * arm / SPEED, "rate_damping": weight * arm / RATE}
     forces["translational_lift"] = weight / FAST**2
+    forces["rotor_drag"] = weight / SPEED / (vehicle.rotors * vehicle.hover_speed)
     places = {"centre_of_mass": arm, "cable_pull": 1 / arm}
     return forces | places | dict.fromkeys((*CORRECTIONS, "torque_gain", "velocity_gain", "velocity_lag"), 1.0)

@@ -70,7 +70,7 @@ def test_it_can_be_what_the_simulator_flies(domain, efficiency, drag):
 
 
 def test_in_a_wind_the_accelerations_are_those_at_the_velocity_through_the_air():
-    names, wind = ("drag", "aerodynamic_moment", "translational_lift"), jnp.array([2.0, -3.0, 0.5])
+    names, wind = ("drag", "rotor_drag", "aerodynamic_moment", "translational_lift"), jnp.array([2.0, -3.0, 0.5])
     deviations = {name: 0.01 * (1 + leaf) for name, leaf in hj.rigid_body(hj.IRIS, names).deviations.items()}
     body, x = hj.RigidBody(deviations, hj.IRIS), moving()
     windy = hj.RigidBody(deviations | {"wind": wind, "added_drag": jnp.full(3, 0.2)}, hj.IRIS)

@@ -21,7 +21,7 @@ ALL = tuple(name for name in SHAPES if name not in ("mass", "k"))
 KNOWN = Terms(
     torque_gain=(0.9, 1.1, 0.8), centre_of_mass=(0.01, -0.02), drag=(0.3, 0.4, 0.1), cable_pull=(4.0, 3.0),
     aerodynamic_moment=((0.0, -0.02, 0.0), (0.03, 0.0, 0.01), (0.0, 0.005, 0.0)), rate_damping=(0.02, 0.03, 0.01),
-    velocity_gain=(0.95, 0.9, 1.02), velocity_lag=0.2, translational_lift=0.03,
+    velocity_gain=(0.95, 0.9, 1.02), velocity_lag=0.2, translational_lift=0.03, rotor_drag=(2e-4, 3e-4, 1e-4),
 )  # fmt: skip
 
 
@@ -38,17 +38,18 @@ def newton_euler(x, u, vehicle, terms, k):
     skew = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
     attitude = np.eye(3) + 2 * w * skew + 2 * skew @ skew
     velocity, rates = attitude.T @ x[VELOCITY], x[BODY_RATES]
-    force, torque = -np.diag(terms.drag) @ velocity, np.zeros(3)
+    force, torque, of_drag = -np.diag(terms.drag) @ velocity, np.zeros(3), np.zeros(3)
     force[2] += terms.translational_lift * (velocity[0] ** 2 + velocity[1] ** 2)
     for place, sign, speed, one in zip(vehicle.rotor_positions, vehicle.spin, u, k, strict=True):
-        lift = np.array([0, 0, one * speed**2])
-        force = force + lift
-        torque += np.cross([*(np.array(place) - terms.centre_of_mass), 0.0], lift)
+        hub = np.array([*(np.array(place) - terms.centre_of_mass), 0.0])
+        own = np.array([0, 0, one * speed**2])
+        drag = -speed * np.array(terms.rotor_drag) * (velocity + np.cross(rates, hub))
+        force, torque, of_drag = force + own + drag, torque + np.cross(hub, own), of_drag + np.cross(hub, drag)
         torque[2] += sign * vehicle.torque_coefficient * speed**2
     inertia = np.diag(vehicle.inertia)
     torque = np.array(terms.torque_gain) * torque
     force += np.array((*terms.cable_pull, 0.0)) * [torque[1], -torque[0], 0.0]
-    torque += np.array(terms.aerodynamic_moment) @ velocity - np.array(terms.rate_damping) * rates
+    torque += of_drag + np.array(terms.aerodynamic_moment) @ velocity - np.array(terms.rate_damping) * rates
     acceleration = attitude @ force / vehicle.mass - [0, 0, vehicle.gravity]
     unseen = terms.velocity_lag * np.array([1, 1, 0]) * force / vehicle.mass
     moved = attitude @ (terms.velocity_gain * velocity + unseen)
