@@ -16,7 +16,7 @@ from hybrid_jax.adaptation.auto import Auto, Choice
 from hybrid_jax.adaptation.expectation import expected_errors, longest_chain
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.outliers import outliers
-from hybrid_jax.adaptation.plausible import groups_of, values_of
+from hybrid_jax.adaptation.plausible import THETA, groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, blocks_of, correlated, overlap
@@ -283,7 +283,7 @@ def _parameters(
             least, most = (float(end - before[name]) for end in ends)
             if not least <= 0 <= most:
                 moved[name] = float(abs(value - before[name]) / max(most - least, TINY))
-            reason = BY_NETWORK if vague[i] else BY_ROTORS if scaled and groups[i] == "theta" else None
+            reason = BY_NETWORK if vague[i] else BY_ROTORS if scaled and groups[i] in THETA else None
             bound = {"effective": reason} if reason else {"low": float(low), "high": float(high)}
             change = {} if reason == BY_ROTORS else {"change": (least, most)}
             found[name] = replace(found[name], **bound, **change)

@@ -13,14 +13,17 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
+from hybrid_jax.dynamics.terms import OF_AIR
 from hybrid_jax.estimation.learned_numbers import logarithms
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters, names_of
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
-# Parameters of a corrected rigid body; the others are its own, θ_p.
-GROUPS = {"efficiency": "efficiency", "reaction_torque": "reaction_torque", "added_drag": "drag"}
+THETA = ("theta", "aerodynamics")  # the groups of θ_p
+# The groups of the parameters of a corrected rigid body; the others are in theta.
+GROUPS = dict.fromkeys((*OF_AIR, "rate_damping"), "aerodynamics")
+GROUPS |= {"efficiency": "efficiency", "reaction_torque": "reaction_torque", "added_drag": "drag"}
 GROUPS |= {"wind": "wind", "wind[2]": "updraft"}
 GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
 
@@ -69,6 +72,8 @@ class Plausible:
         updraft: its vertical component [m/s].
         torque: constant torque over the inertia [rad/s²].
         drag: added drag over the mass [1/s].
+        aerodynamics: coefficients of drag, lift, aerodynamic moments and damping, relative to the vehicle's weight and
+            arm at 1 m/s (lift: 10 m/s; damping: 10 rad/s).
         efficiency: logarithm of each rotor's efficiency.
         reaction_torque: logarithm of a factor of all reaction torques.
         disturbance: constant disturbance of another system, relative to each state's RMS rate in the windows.
@@ -84,6 +89,7 @@ class Plausible:
     wind: float = 3.0
     updraft: float = 0.5
     drag: float = 0.5
+    aerodynamics: float = 0.05
     efficiency: float = 0.3
     reaction_torque: float = 0.3
     disturbance: float = 1.0
@@ -148,7 +154,7 @@ def groups_of(names: Sequence[str]) -> list[str]:
 def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
     """Return which parameters of an extended field each candidate fits (c, p)."""
     names, found = names_of(field), {}
-    group = groups_of(names)
+    group = ["theta" if each in THETA else each for each in groups_of(names)]
     lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
     for name, fitted in CANDIDATES.items():
         if set(fitted) <= {*group, "theta"}:

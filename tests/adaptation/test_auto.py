@@ -100,8 +100,7 @@ def test_candidates_of_a_rigid_body_fit_what_their_names_say():
     fitted = {name: {*names[each].tolist()} for name, each in free_parameters(field).items()}
     assert [*fitted] == [name for name in CANDIDATES if name not in ("disturbance", "wind")]
     assert len(names) == ravel_parameters(field)[0].size == 3 + 4 + 1 + 3 + 6
-    assert fitted["source"] == set()
-    assert fitted["theta"] == {"Ix", "Iy", "k"}
+    assert (fitted["source"], fitted["theta"]) == (set(), {"Ix", "Iy", "k"})
     assert fitted["drag"] == {"Ix", "Iy", "k", *(f"added_drag[{i}]" for i in range(3))}
     # Four efficiencies and k would be five numbers for four.
     assert fitted["efficiency"] == {"Ix", "Iy", *(f"efficiency[{i}]" for i in range(4))}

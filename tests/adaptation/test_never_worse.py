@@ -90,6 +90,14 @@ def test_other_propellers_are_found_by_their_reaction_torque():
     np.testing.assert_allclose(found.parameters["reaction_torque"].value, 1.6, rtol=0.03)
 
 
+def test_also_a_body_that_learns_many_aerodynamic_coefficients_sees_a_small_change_of_drag():
+    learn, terms = ("Ix", "Iy", "k", "drag", "aerodynamic_moment", "translational_lift"), SOURCE.terms
+    windows = flown(0, 1.0, drag=0.8, count=60)
+    found = [hj.adapt(body, windows) for body in (SOURCE, hj.rigid_body(hj.IRIS, learn, terms))]
+    assert [each.chosen for each in found] == ["drag", "theta"]
+    assert all(error(each.field, windows) < error(SOURCE, windows) for each in found)
+
+
 def test_a_wind_is_found_by_drag_and_lift():
     terms, wind = Terms(drag=(0.5, 0.4, 0.2), translational_lift=0.05), [3.0, -2.0, 0.3]
     windy = hj.RigidBody({"wind": jnp.array(wind)}, hj.IRIS, terms)
