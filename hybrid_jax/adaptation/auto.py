@@ -21,7 +21,7 @@ from hybrid_jax.adaptation.selection import Fit, Posterior, Unchanged
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import Scale, ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations, masked
-from hybrid_jax.estimation.uncertainty import sandwich_of_repeated
+from hybrid_jax.estimation.uncertainty import sandwich_with_prior
 from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import FASTEST_COMPILE, UNOPTIMISED, jit_by_size
 from hybrid_jax.status import Status
@@ -255,7 +255,8 @@ def _conclude(field, larger, train: Trajectories, outcome, quantities: int, size
     alone, of_source, degrees = jnp.array(False), jnp.diag(nothing.apparent), jnp.inf
     if source is not None:
         own, alone, distinct = source
-        of_source = jnp.where(alone, sandwich_of_repeated(own.equations, len(start), distinct), of_source)
+        refitted = sandwich_with_prior(own.equations, len(start), distinct, own.noise / jnp.square(sizes))
+        of_source = jnp.where(alone, refitted, of_source)
         degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
     inherited = selection.spread(found.equations, free[taken] & found.seen, of_source)
     if step is not None:

@@ -121,11 +121,17 @@ def sandwich(equations: NormalEquations, fitted: int, cluster: int = 1) -> Float
     return _covariance(equations, fitted, cluster, len(equations.score))
 
 
-def sandwich_of_repeated(equations: NormalEquations, fitted: int, distinct: Int[Array, ""]) -> Float[Array, "p p"]:
-    """Compute `sandwich` if only the first `distinct` windows are independent and the others repeat them."""
+def sandwich_with_prior(
+    equations: NormalEquations, fitted: int, distinct: Int[Array, ""], precision: Float[Array, " p"]
+) -> Float[Array, "p p"]:
+    """Compute `sandwich` with a prior, if only the first `distinct` windows are independent and the others repeat them.
+
+    The precision is over the variance of an error. It holds directions that the windows hardly determine.
+    """
     of = jnp.arange(len(equations.score)) % distinct
     score = jax.ops.segment_sum(equations.score, of, len(equations.score))
-    return _covariance(equations._replace(score=score), fitted, 1, distinct)
+    half = score @ inverse(jnp.sum(equations.gram, axis=0) + jnp.diag(precision)).matrix
+    return distinct / jnp.maximum(distinct - fitted, 1) * half.T @ half
 
 
 @entry

@@ -1,5 +1,7 @@
 """Laws of the covariance of θ_p, against closed forms, and of its intervals, against simulation."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,8 @@ from pendulum import Push, pendulum, pushes, swings
 import hybrid_jax as hj
 from experiments.paper.conditions import measure, sensor_noise
 from hybrid_jax import IRIS, AbstractVectorField, Hybrid, fit_least_squares, rigid_body, with_disturbance
+from hybrid_jax.estimation.normal_equations import equations_of
+from hybrid_jax.estimation.uncertainty import sandwich, sandwich_with_prior
 from hybrid_jax.rotation import normalise
 from hybrid_jax.status import Status
 from hybrid_jax.vehicle import QUATERNION
@@ -94,6 +98,21 @@ def test_parameters_that_no_window_tells_apart_have_no_interval_and_others_have_
 LEARN = ("Ix", "k_rotors", "drag")
 ERRORS = np.arange(1, 9) / 100  # in the order of the leaves: Ix, drag, k_rotors
 Z = 1.959964  # of 95 %, from the normal distribution's table
+
+
+@pytest.mark.parametrize("alike", [0.3, 1e-2, 1e-4])
+def test_a_prior_bounds_what_windows_do_not_tell_apart_and_repeated_windows_add_nothing(alike):
+    """The variance along a direction with information λ and precision κ of the prior is λ / (λ + κ)² ≤ 1 / 4κ."""
+    rng, size, windows, fitted = np.random.default_rng(0), 0.5, 400, 3
+    design = rng.normal(size=(windows, 5, fitted))
+    design[..., 2] = design[..., 1] + alike * design[..., 2]
+    equations = jax.vmap(equations_of)(jnp.asarray(design), 0.1 * rng.normal(size=(windows, 5)))
+    of = partial(sandwich_with_prior, fitted=fitted, distinct=jnp.array(windows))
+    held = of(equations, precision=jnp.full(fitted, 0.01 / size**2))
+    assert held[1, 1] + held[2, 2] - 2 * held[1, 2] < 2 * 1.2 * size**2 / 4
+    np.testing.assert_allclose(held[0, 0], sandwich(equations, fitted)[0, 0], rtol=0.01)
+    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), equations)
+    np.testing.assert_allclose(of(twice, precision=jnp.full(fitted, 0.02 / size**2)), held, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize(("level", "z"), [(0.6826895, 1.0), (0.95, Z)])
