@@ -128,9 +128,9 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
     }
     rows = []
     for name in config.compared:
-        errors = np.asarray(_errors(fits[name]().fields, target.splits["test"], settings(config)), float)
+        errors = np.asarray(_errors(fits[name]().fields, target.splits["test"], settings(config)))
         tags = {"candidate": name, "probability": None, "taken": False}
-        for i, own in enumerate(errors.tolist()):
+        for i, own in enumerate(errors):
             case = {"draw": i // config.seeds, "seed": i % config.seeds}
             rows.append(tags | {INSIDE: None} | case | dict(zip(ERRORS, own, strict=True)))
     return rows

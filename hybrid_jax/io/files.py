@@ -60,6 +60,8 @@ def json_value(value: Any) -> Any:
             return value
         case float():
             return value if math.isfinite(value) else None
+        case np.generic() if value.dtype == np.float32:
+            return json_value(float(str(value)))  # its own nine digits; it has no more
         case np.generic() | np.ndarray():
             return json_value(value.tolist())
         case Path():
