@@ -14,7 +14,7 @@ from experiments.worlds.world import DT, World
 from hybrid_jax.adaptation import Adaptation, FineTune, Method, Parameter
 
 # Learned without a network.
-PHYSICS = "Ix", "Iy", "Iz", "k", "drag", "aerodynamic_moment", "rate_damping", "translational_lift"
+PHYSICS = "Ix", "Iy", "Iz", "k", "drag", "aerodynamic_moment", "rate_damping", "translational_lift", "rotor_drag"
 CHANGING = 1.0  # m/s² and rad/s²: the filter's prior of a disturbance
 
 
