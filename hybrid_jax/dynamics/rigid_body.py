@@ -62,8 +62,8 @@ class RigidBody(AbstractVectorField):
     for accurate tracking of high-speed trajectories", 2018 (A has the other sign there). C is a cable that pulls at 1/C
     below the centre of mass. The state lacks the load's position, but the torque that balances its moment reveals it.
     L is the translational lift of rotors that fly across their axis at the speed (v_x² + v_y²)^½ of Rᵀv, and H the drag
-    of each rotor at its hub r_i, which grows with its speed u_i (D is the same at the speeds of a hover); see Svacha,
-    Mohta and Kumar, "Improving quadrotor trajectory tracking by compensating for aerodynamic effects", 2017.
+    of each rotor at its hub r_i, which grows with its speed u_i; near hover it acts like D = Σ u_i H and a damping. See
+    Svacha, Mohta and Kumar, "Improving quadrotor trajectory tracking by compensating for aerodynamic effects", 2017.
 
     S and λ describe a state estimator that assumes that all force but gravity is along the body's z axis, and corrects
     its velocity v̂ for other forces only by the position: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the thrust.
