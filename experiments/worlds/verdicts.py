@@ -3,6 +3,7 @@
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from experiments.reporting.claims import Claim, Part, Undecided, all_of, every
 from experiments.reporting.names import label
@@ -113,6 +114,7 @@ def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
             xlabel="error / error\nof the source\n(log scale)",
         )
         tick_errors(axes.xaxis, *axes.get_xlim(), room=2.2)
+    panels[0].xaxis.set_major_locator(LogLocator(100.0))  # the panels are narrow, and share their axis
     name_lines(panels[0], [label(*case) for case in names])
     caption = "Error of the adapted model over the source's, by the change and the flight that it adapted to"
     title = "Is an adapted model ever worse than its source? (lower is better)"
