@@ -101,7 +101,7 @@ def method_table(rows: Results) -> Table:
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
     """Draw the error over the source's in each case, for each world and draw."""
     worlds, names = rows.unique("world"), [*dict.fromkeys(case[1:] for case in _cases(rows))]
-    figure, (panels,) = subplots(1.3 + 0.3 * len(names), 1, len(worlds), sharey=True, sharex=True)
+    figure, (panels,) = subplots(max(1.3 + 0.3 * len(names), 2.8), 1, len(worlds), sharey=True, sharex=True)
     for axes, world in zip(panels, worlds, strict=True):
         axes.axvline(1.0, color="0.4", linestyle=":", label="not adapted")
         for (_, *case), own in _cases(rows.where(world=world)).items():
