@@ -58,7 +58,8 @@ class Auto(Method):
     """Choose the most probable of several changes; see `selection`.
 
     The candidates for a rigid body are no change, new θ_p, and new θ_p with constant forces and torques, wind, drag and
-    rotor efficiencies; for other systems no change, new θ_p, and new θ_p with a constant disturbance. A change must
+    rotor efficiencies, each with the aerodynamic coefficients of θ_p held or free; for other systems no change, new
+    θ_p, and new θ_p with a constant disturbance. A change must
     also predict left-out blocks of windows better. A penalised change of the network's weights is then tried on top.
     If physics without the network predicts the source's own motion better, it replaces the source.
 

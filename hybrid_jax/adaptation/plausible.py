@@ -28,7 +28,7 @@ GROUPS |= {"wind": "wind", "wind[2]": "updraft"}
 GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
 
 # The groups of parameters that each candidate fits. A candidate applies if the field has all of its groups.
-CANDIDATES: Mapping[str, tuple[str, ...]] = {
+_CHANGES: Mapping[str, tuple[str, ...]] = {
     "source": (),
     "theta": ("theta",),
     "reaction_torque": ("reaction_torque",),
@@ -44,9 +44,14 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "force_torque_drag": ("theta", "force", "torque", "drag"),
     "all": ("theta", "force", "torque", "drag", "efficiency", "reaction_torque"),
 }
+# Physics may have twenty aerodynamic coefficients. Ten seconds determine many, so that each change would cost evidence.
+CANDIDATES = _CHANGES | {
+    f"{name}_aerodynamics": (*groups, "aerodynamics") for name, groups in _CHANGES.items() if "theta" in groups
+}
 WORDS = {
     "source": "no change",
     "theta": "new physical parameters",
+    "aerodynamics": "aerodynamic coefficients",
     "reaction_torque": "a factor of all reaction torques",
     "disturbance": "a constant disturbance",
     "force": "a constant force",
@@ -154,7 +159,7 @@ def groups_of(names: Sequence[str]) -> list[str]:
 def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
     """Return which parameters of an extended field each candidate fits (c, p)."""
     names, found = names_of(field), {}
-    group = ["theta" if each in THETA else each for each in groups_of(names)]
+    group = groups_of(names)
     lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
     for name, fitted in CANDIDATES.items():
         if set(fitted) <= {*group, "theta"}:
