@@ -16,7 +16,7 @@ from hybrid_jax.control.observer import MOTION
 from hybrid_jax.dynamics import ConstantDisturbance, Hybrid, with_disturbance
 from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.rigid_body import RigidBody, corrected, rigid_body
-from hybrid_jax.dynamics.terms import Terms, units_of
+from hybrid_jax.dynamics.terms import units_of
 from hybrid_jax.online import Hypothesis, OnlineAdaptation
 from hybrid_jax.rotation import body_z
 from hybrid_jax.sim.forces import DRAG_COEFFICIENT
@@ -65,14 +65,13 @@ def hypotheses(world: str) -> tuple[Hypothesis, ...]:
 def nominal(world: str) -> RigidBody:
     """The vehicle without ground effect; its inertia, centre of mass, efficiencies and drag may change."""
     own = body_of(world)
-    drag, damping = tuple(own.drag.tolist()), tuple(own.damping.tolist())
-    body = rigid_body(own.vehicle, LEARNED, Terms(drag=drag, rate_damping=damping, translational_lift=own.lift))
+    body = rigid_body(own.vehicle, LEARNED, own.terms)
     return corrected(body, ("efficiency", "added_drag"))  # type: ignore  # a rigid body as well
 
 
 def true_theta(world: str, change: str) -> Float[np.ndarray, " 12"]:
     """Return `nominal`'s θ after a change; since its mass is fixed, another mass changes all other parameters."""
-    before, (vehicle, drag, _, _, lost) = body_of(world).vehicle, body_of(world, change)
+    before, (vehicle, _, drag, lost) = body_of(world).vehicle, body_of(world, change)
     share = before.mass / vehicle.mass
     inertia = np.log(share * np.divide(vehicle.inertia, before.inertia))
     centre = np.subtract(before.rotor_positions, vehicle.rotor_positions)[0] / units_of(before)["centre_of_mass"]

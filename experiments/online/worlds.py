@@ -16,6 +16,7 @@ from hybrid_jax.control.loop import Plant
 from hybrid_jax.control.sensitivities import lagged_speeds
 from hybrid_jax.dynamics import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.sim.flight import random_flights
 from hybrid_jax.vehicle import Input, Vehicle
 
@@ -24,12 +25,11 @@ STILL = 1e-9  # m/s of air, since the norm of zero has no derivative
 
 
 class Body(NamedTuple):
-    """A vehicle as the agents model it, with `dynamics.terms.Terms` in SI units, and the share `lost` by rotor 0."""
+    """A vehicle as the agents model it, its whole `drag` in hover [N s/m], and the share `lost` by rotor 0."""
 
     vehicle: Vehicle
+    terms: Terms
     drag: Float[np.ndarray, "3"]
-    damping: Float[np.ndarray, "3"]
-    lift: float
     lost: float
 
 
@@ -51,16 +51,15 @@ def is_rotorpy(world: str) -> bool:
 
 
 def body_of(world: str, change: str = NOTHING) -> Body:
-    """Return a vehicle after a change; of RotorPy with the rotors' drag at hover speed, and without the frame's."""
+    """Return a vehicle after a change; of RotorPy without the drag of the frame."""
     own, vehicle = WORLDS[world], WORLDS[world].changed(change)
     if not isinstance(own, RotorPy):
         domain = domain_of(change)
         drag, lost = np.full(3, domain.drag_coefficient), LOST_THRUST * (weak_rotor in domain.forces)
-        return Body(vehicle, drag, np.zeros(3), 0.0, lost)
+        return Body(vehicle, Terms(drag=tuple(drag.tolist())), drag, lost)
     c = own.truth(change)
-    each, (x, y) = vehicle.hover_speed * np.array(c.rotor_drag), c.rotors[:, :2].T
-    damping = [each[2] * y @ y, each[2] * x @ x, each[1] * x @ x + each[0] * y @ y]
-    return Body(vehicle, len(x) * each, np.array(damping), len(x) * c.lift, 1 - c.efficiency[0])
+    terms = Terms(rotor_drag=c.rotor_drag, translational_lift=len(c.rotors) * c.lift)
+    return Body(vehicle, terms, len(c.rotors) * vehicle.hover_speed * np.array(c.rotor_drag), 1 - c.efficiency[0])
 
 
 def truth_of(world: str, change: str, clock: float) -> Any:
