@@ -45,7 +45,7 @@ INERTIA = {name: PRIOR[name] for name in ("Ix", "Iy", "Iz")}
 
 def own_drag(world: str) -> Float[np.ndarray, "3"]:
     """Return a vehicle's drag along its axes before a change [1/s]."""
-    return body_of(world).drag / body_of(world).vehicle.mass
+    return body_of(world).drag(body_of(world).vehicle)
 
 
 def hypotheses(world: str) -> tuple[Hypothesis, ...]:
@@ -71,12 +71,13 @@ def nominal(world: str) -> RigidBody:
 
 def true_theta(world: str, change: str) -> Float[np.ndarray, " 12"]:
     """Return `nominal`'s θ after a change; since its mass is fixed, another mass changes all other parameters."""
-    before, (vehicle, _, drag, lost) = body_of(world).vehicle, body_of(world, change)
+    known, truth = body_of(world), body_of(world, change)
+    before, vehicle = known.vehicle, truth.vehicle
     share = before.mass / vehicle.mass
     inertia = np.log(share * np.divide(vehicle.inertia, before.inertia))
     centre = np.subtract(before.rotor_positions, vehicle.rotor_positions)[0] / units_of(before)["centre_of_mass"]
-    efficiency = math.log(share) + np.log1p([-lost, *[0.0] * (before.rotors - 1)])
-    return np.concatenate([inertia, drag / vehicle.mass - own_drag(world), centre, efficiency])
+    efficiency = math.log(share) + np.log1p([-truth.lost, *[0.0] * (before.rotors - 1)])
+    return np.concatenate([inertia, truth.drag(vehicle) - known.drag(vehicle), centre, efficiency])
 
 
 def with_theta(world: str, theta: Float[Array | np.ndarray, " 12"]) -> AbstractVectorField:

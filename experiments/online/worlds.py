@@ -25,12 +25,16 @@ STILL = 1e-9  # m/s of air, since the norm of zero has no derivative
 
 
 class Body(NamedTuple):
-    """A vehicle as the agents model it, its whole `drag` in hover [N s/m], and the share `lost` by rotor 0."""
+    """A vehicle as the agents model it, and the share of its thrust that rotor 0 has `lost`."""
 
     vehicle: Vehicle
     terms: Terms
-    drag: Float[np.ndarray, "3"]
     lost: float
+
+    def drag(self, vehicle: Vehicle) -> Float[np.ndarray, "3"]:
+        """Return the drag by these terms where a vehicle hovers, over the mass [1/s]."""
+        of_rotors = vehicle.rotors * vehicle.hover_speed * np.array(self.terms.rotor_drag)
+        return (np.array(self.terms.drag) + of_rotors) / self.vehicle.mass
 
 
 class Equations(AbstractVectorField):
@@ -55,11 +59,11 @@ def body_of(world: str, change: str = NOTHING) -> Body:
     own, vehicle = WORLDS[world], WORLDS[world].changed(change)
     if not isinstance(own, RotorPy):
         domain = domain_of(change)
-        drag, lost = np.full(3, domain.drag_coefficient), LOST_THRUST * (weak_rotor in domain.forces)
-        return Body(vehicle, Terms(drag=tuple(drag.tolist())), drag, lost)
+        c = domain.drag_coefficient
+        return Body(vehicle, Terms(drag=(c, c, c)), LOST_THRUST * (weak_rotor in domain.forces))
     c = own.truth(change)
     terms = Terms(rotor_drag=c.rotor_drag, translational_lift=len(c.rotors) * c.lift)
-    return Body(vehicle, terms, len(c.rotors) * vehicle.hover_speed * np.array(c.rotor_drag), 1 - c.efficiency[0])
+    return Body(vehicle, terms, 1 - c.efficiency[0])
 
 
 def truth_of(world: str, change: str, clock: float) -> Any:

@@ -95,16 +95,21 @@ def test_physics_that_needs_no_network_takes_the_sources_place():
 
 
 def test_candidates_of_a_rigid_body_fit_what_their_names_say():
-    field = extended(hj.rigid_body(hj.IRIS), 13)
-    names = np.array([*named_parameters(field)])
-    fitted = {name: {*names[each].tolist()} for name, each in free_parameters(field).items()}
-    without = {name: set(groups) for name, groups in CANDIDATES.items()}
-    assert [*fitted] == [name for name, groups in without.items() if not groups & {"disturbance", "wind", "aerodynamics"}]
+    def fitted(field):
+        names = np.array([*named_parameters(field)])
+        return names, {name: {*names[each].tolist()} for name, each in free_parameters(field).items()}
+
+    field, dragged = (extended(body, 13) for body in (hj.rigid_body(hj.IRIS), hj.rigid_body(hj.IRIS, ("Ix", "drag"))))
+    names, found = fitted(field)
+    others = {"disturbance", "wind", "aerodynamics"}
+    assert [*found] == [name for name, groups in CANDIDATES.items() if others.isdisjoint(groups)]
     assert len(names) == ravel_parameters(field)[0].size == 3 + 4 + 1 + 3 + 6
-    assert (fitted["source"], fitted["theta"]) == (set(), {"Ix", "Iy", "k"})
-    assert fitted["drag"] == {"Ix", "Iy", "k", *(f"added_drag[{i}]" for i in range(3))}
+    assert (found["source"], found["theta"]) == (set(), {"Ix", "Iy", "k"})
+    assert found["drag"] == {"Ix", "Iy", "k", *(f"added_drag[{i}]" for i in range(3))}
     # Four efficiencies and k would be five numbers for four.
-    assert fitted["efficiency"] == {"Ix", "Iy", *(f"efficiency[{i}]" for i in range(4))}
+    assert found["efficiency"] == {"Ix", "Iy", *(f"efficiency[{i}]" for i in range(4))}
+    held, free = (fitted(dragged)[1][name] for name in ("theta", "theta_aerodynamics"))
+    assert (held, free) == ({"Ix"}, {"Ix", *(f"drag[{i}]" for i in range(3))})
 
 
 def test_a_heavy_penalty_holds_fine_tuning_at_the_source():
