@@ -59,8 +59,8 @@ def body_of(world: str, change: str = NOTHING) -> Body:
     own, vehicle = WORLDS[world], WORLDS[world].changed(change)
     if not isinstance(own, RotorPy):
         domain = domain_of(change)
-        c = domain.drag_coefficient
-        return Body(vehicle, Terms(drag=(c, c, c)), LOST_THRUST * (weak_rotor in domain.forces))
+        drag = domain.drag_coefficient
+        return Body(vehicle, Terms(drag=(drag, drag, drag)), LOST_THRUST * (weak_rotor in domain.forces))
     c = own.truth(change)
     terms = Terms(rotor_drag=c.rotor_drag, translational_lift=len(c.rotors) * c.lift)
     return Body(vehicle, terms, 1 - c.efficiency[0])
