@@ -125,7 +125,6 @@ class Auto(Method):
                     _, found, starts = _fits(larger, still, train, rows, *options)
         units = selection.blocks_of(len(train), self.blocks, flights)
         weights = anchored.weights_of(larger)[0].size if network else 0
-        units = selection.blocks_of(len(train), self.blocks, flights)
 
         def ends_of(thetas, change: Array | None = None) -> Array:
             change = jnp.zeros((len(thetas), weights)) if change is None else change
