@@ -142,11 +142,15 @@ class Stages:
         return states
 
     def timed(self, name: str, work: Callable[[], Result], doing: str = "") -> Result:
-        """Return the result of `work()` and add its time to the stage `name`; `doing` is shown meanwhile."""
-        began = time.perf_counter()
+        """Return the result of `work()` and add its time to the stage `name`; `doing` is shown meanwhile.
+
+        The time of a stage within another counts once.
+        """
+        began, before = time.perf_counter(), sum(self.seconds.values())
         with Line(name, self._console, doing) if doing else nullcontext():
             result = work()
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+        within = sum(self.seconds.values()) - before
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began - within
         return result
 
     def parts(self, name: str, jobs: Sequence[Callable[[], Result]]) -> list[Result]:

@@ -169,6 +169,13 @@ def test_finished_parts_are_kept_and_stages_run_in_order_on_what_they_need_and_c
     assert found == {one: 1, two: (2, ["two"])}
 
 
+def test_the_time_of_a_stage_within_another_counts_once(tmp_path, monkeypatch):
+    stages, ticks = Stages(tmp_path, Console(quiet=True)), iter(range(4))
+    monkeypatch.setattr("time.perf_counter", lambda: next(ticks))
+    stages.timed("outer", lambda: stages.timed("inner", lambda: None))
+    assert stages.seconds == {"outer": 2, "inner": 1}
+
+
 SWEEPS, WARM = 200, 40  # caches and the allocator have settled after WARM sweeps
 
 
