@@ -62,8 +62,7 @@ def of_changes():
         yield "results/index", best.format(f"{100 * np.mean(ratios <= NEAR):.0f} %")
         yield "results/index", f"{ratios.max():.2f} times"
         mean = {way: [[of_each_case(own, way, e).mean() for own in groups] for e in ERRORS] for way in (*TUNED, AUTO)}
-        more = np.sum(np.greater(*(mean[way][0] for way in TUNED)))
-        yield "results/index", f"{WORDS[more]} of the seven"
+        yield "results/index", f"{WORDS[np.sum(np.greater(*(mean[way][0] for way in TUNED)))]} of the seven"
         for way, words in (TUNED[1], "m without adaptation,"), (AUTO, "m with"):
             yield "results/index", f"{min(mean[way][1]) ** 0.5:.2f} to {max(mean[way][1]) ** 0.5:.2f} {words}"
     inside = np.mean([row["expected_inside"] for row in committed("changes") if row["expected_inside"] is not None])
@@ -119,8 +118,8 @@ def of_adapting_in_flight():
     low = rows.where(reference="low_pass").group("change")
     shares = [100 * np.mean([[*row["inside"].values()] for row in own]) for own in low.values()]
     yield "notes/online", f"{min(shares):.0f} to {max(shares):.0f} % of the intervals"
-    alarms = sum(row["alarms"] > 0 for row in low["nothing"])
-    yield "notes/online", f"false alarm in {alarms} of {len(low['nothing'])} flights"
+    alarmed = [row["alarms"] > 0 for row in low["nothing"]]
+    yield "notes/online", f"false alarm in {sum(alarmed)} of {len(alarmed)} flights"
 
 
 def of_intervals():
@@ -129,8 +128,7 @@ def of_intervals():
         ("iris", "{} % of the 95 % intervals contain the true value, and {} % of {} intervals that are pooled"),
     ):
         fitted = fitted_of_coverage().where(world=world)
-        shares = (100 * np.mean([row[kind] for row in fitted if row[kind] is not None]) for kind in KINDS)
-        numbers = [f"{share:.0f}" for share in shares]
+        numbers = [f"{100 * np.mean([row[kind] for row in fitted if row[kind] is not None]):.0f}" for kind in KINDS]
         yield "results/intervals", text.format(*numbers, len(fitted))
     wide, small = {}, []
     for (domain, *_), own in fitted.group("domain", "noise", "parameter").items():
@@ -142,22 +140,16 @@ def of_intervals():
     low, high = f"{min(small):.0f} to {max(small):.0f} % too small", lines("docs/results/intervals.md")["gusty wind"][1]
     yield "results/intervals", f"the values are {low}"
     yield "explanation/failures", f"{low}, and 95 % intervals of one source contain the true value in {high} % of"
-    worlds = json.loads((REFERENCE / "worlds/report.json").read_text())
-    harm, *said = (claim["measured"] for claim in worlds["claims"])
-    harms = [
-        [float(number) for number in re.findall(r"([\d.]+), worst ([\d.]+)$", case)[0]] for case in harm.split("; ")
-    ]
-    sound = sum(mean <= MEAN and worst <= EACH for mean, worst in harms)
-    yield "explanation/failures", f"no harm in {sound} of {len(harms)} cases"
+    claims = json.loads((REFERENCE / "worlds/report.json").read_text())["claims"]
+    harm, *said = (claim["measured"] for claim in claims)
+    harms = [[*map(float, re.findall(r"([\d.]+), worst ([\d.]+)$", case)[0])] for case in harm.split("; ")]
+    sound = [mean <= MEAN and worst <= EACH for mean, worst in harms]
+    yield "explanation/failures", f"no harm in {sum(sound)} of {len(sound)} cases"
     yield "explanation/failures", f"up to {max(worst for _, worst in harms):g} times as large in single flights"
     shares = re.findall(r"(\d+) of \d+ sources: ([\d.]+)%", said[0])
-    texts = (
-        "{1} % of {0} intervals of an Iris contained",
-        "{1} % of {0} of the Hummingbird",
-        "{1} % of {0} of a Crazyflie",
-    )
-    for text, share in zip(texts, shares, strict=True):
-        yield "results/intervals", text.format(*share)
+    texts = "intervals of an Iris contained", "of the Hummingbird", "of a Crazyflie"
+    for text, (cases, share) in zip(texts, shares, strict=True):
+        yield "results/intervals", f"{share} % of {cases} {text}"
     shares = sorted(re.findall(r": ([\d.]+)%", said[1]), key=float)
     yield "results/intervals", f"contained the errors in {shares[0]} to {shares[-1]} % of the cases"
     page = (REFERENCE / "worlds/report.md").read_text()

@@ -70,9 +70,8 @@ def test_an_oracle_of_the_wind_expects_its_force():
 def test_what_l1_commands_is_what_its_model_lacks(world):
     agent = L1(nominal(world), 5.0, np.float32(5.0), 0.01)
     missing = jnp.array([-0.5, 1.0, -2.0, 0.3])  # thrust [m/s²] and ω̇ that the model lacks
-    u = jnp.asarray(SPEEDS[0])
+    u, x = jnp.asarray(SPEEDS[0]), jnp.zeros(13).at[3].set(1.0)
     commanded = agent.command((None, None, missing), None, u)
-    x = jnp.zeros(13).at[3].set(1.0)
     gained = agent.field(x, commanded)[9:] - agent.field(x, u)[9:]
     np.testing.assert_allclose(gained, -missing, atol=2e-3)
     np.testing.assert_allclose(agent.effective((None, None, missing), commanded), u, rtol=1e-5)
