@@ -32,7 +32,7 @@ class Body(NamedTuple):
     lost: float
 
     def drag(self, vehicle: Vehicle) -> Float[np.ndarray, "3"]:
-        """Return the drag by these terms where a vehicle hovers, over the mass [1/s]."""
+        """Return the drag by these terms at another vehicle's hover speed, over this mass [1/s]."""
         of_rotors = vehicle.rotors * vehicle.hover_speed * np.array(self.terms.rotor_drag)
         return (np.array(self.terms.drag) + of_rotors) / self.vehicle.mass
 

@@ -59,9 +59,9 @@ class Auto(Method):
 
     The candidates for a rigid body are no change, new θ_p, and new θ_p with constant forces and torques, wind, drag and
     rotor efficiencies, each with the aerodynamic coefficients of θ_p held or free; for other systems no change, new
-    θ_p, and new θ_p with a constant disturbance. A change must
-    also predict left-out blocks of windows better. A penalised change of the network's weights is then tried on top.
-    If physics without the network predicts the source's own motion better, it replaces the source.
+    θ_p, and new θ_p with a constant disturbance. A change must also predict left-out blocks of windows better. A
+    penalised change of the network's weights is then tried on top. If physics without the network predicts the source's
+    own motion better, it replaces the source.
 
     Attributes:
         networks: whether the network may change.

@@ -44,7 +44,7 @@ _CHANGES: Mapping[str, tuple[str, ...]] = {
     "force_torque_drag": ("theta", "force", "torque", "drag"),
     "all": ("theta", "force", "torque", "drag", "efficiency", "reaction_torque"),
 }
-# Physics may have twenty aerodynamic coefficients. Ten seconds determine many, so that each change would cost evidence.
+# Physics may have twenty aerodynamic coefficients, and each that is fitted costs evidence: so they are held, or free.
 CANDIDATES = _CHANGES | {
     f"{name}_aerodynamics": (*groups, "aerodynamics") for name, groups in _CHANGES.items() if "theta" in groups
 }
