@@ -265,7 +265,7 @@ def _parameters(
         covariance = np.asarray(sandwich(choice.equations, int(free.sum()), cluster))[np.ix_(places, places)]
         covariance = covariance + np.diag(np.where(unseen, np.inf, 0.0))
         inherited, of_source = np.asarray(choice.inherited)[np.ix_(places, places)], float(choice.degrees)
-    # `absorbed` is a bound, not an estimate from a sample, so its degrees are infinite (GUM, G.4.3).
+    # `absorbed` is not estimated from a sample of errors, so its degrees are infinite (GUM, G.4.3).
     parts = np.stack([np.diag(covariance), np.diag(inherited), absorbed])
     degrees = satterthwaite(parts, np.array([own_degrees, of_source, np.inf]))
     of_change = satterthwaite(parts[:2], np.array([own_degrees, of_source]))  # the source has the same network

@@ -10,14 +10,15 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hybrid_jax.adaptation.selection import TINY, left_out_steps
 from hybrid_jax.batches import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned, trainable
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import disturbance_units, physics_of
-from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
+from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors, ravel_parameters
 from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, inverse
 from hybrid_jax.estimation.starts import Starts, from_starts
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
@@ -122,34 +123,35 @@ def weights_of(field: AbstractVectorField) -> tuple[Float[Array, " w"], Callable
 
 
 class Effect(NamedTuple):
-    """The squared difference that the network makes to the predictions, summed over the windows.
+    """The network's effect b on the predictions of n windows."""
 
-    Attributes:
-        total: over all states.
-        of_states: of each state, less what another initial state explains.
-    """
-
-    total: Float[Array, ""]
-    of_states: Float[Array, " d"]
+    total: Float[Array, ""]  # ‖b‖² over all windows and states
+    score: Float[Array, "n p"]  # Jᵀ b of each window, with the Jacobian J in θ_p, less what another start explains
 
 
 @jit_by_size(UNOPTIMISED)
 def network_effect(
-    field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale, starts: Starts | None
+    field: AbstractVectorField, windows: Trajectories, starts: Starts | None, solver: Solver, scale: Scale
 ) -> Effect:
-    weights, _ = weights_of(field)
-    smooth, weigh = from_starts(windows, starts)
+    (theta, unravel), (weights, _) = ravel_parameters(field), weights_of(field)
 
-    def effect(part: Trajectories):
-        def errors(change: Float[Array, " w"]):
-            changed: Any = with_change(field, change)
-            return jax.vmap(lambda window: prediction_errors(changed, window, solver, scale))(part)
+    def of_windows(part: tuple[Trajectories, Starts | None]) -> tuple[Float[Array, " c"], Float[Array, "c p"]]:
+        smooth, weigh = from_starts(*part)
 
-        return jax.lax.map(errors, jnp.stack([jnp.zeros_like(weights), -weights]))  # one copy of the rollout
+        def errors(thetas: Float[Array, "c p"], change: Float[Array, " w"]):
+            def one(theta, window):
+                return prediction_errors(with_change(unravel(theta), change), window, solver, scale)
 
-    there, without = jnp.moveaxis(in_chunks(lambda part: jnp.moveaxis(effect(part), 0, 1), smooth, CHUNK), 1, 0)
-    apart = jnp.square(weigh(there) - weigh(without))
-    return Effect(jnp.sum(jnp.square(there - without)), jnp.sum(apart, axis=(0, 1)))
+            found = jax.vmap(one)(thetas, smooth)
+            return weigh(found), found
+
+        thetas = jnp.broadcast_to(theta, (len(smooth.x), len(theta)))
+        weighted, pull, there = jax.vjp(lambda thetas: errors(thetas, jnp.zeros_like(weights)), thetas, has_aux=True)
+        weighted_without, without = errors(thetas, -weights)
+        return jnp.sum(jnp.square(there - without), axis=(1, 2)), pull(weighted - weighted_without)[0]
+
+    total, score = in_chunks(of_windows, (windows, starts), CHUNK)
+    return Effect(jnp.sum(total), score)
 
 
 def quantities_of(field: AbstractVectorField, windows: Trajectories) -> int:
@@ -161,24 +163,28 @@ def quantities_of(field: AbstractVectorField, windows: Trajectories) -> int:
 
 
 def taken_by_network(
-    effect: Float[Array, " d"], equations: NormalEquations, of_states: Float[Array, "d p p"], quantities: int
+    equations: NormalEquations,
+    score: Float[Array, "n p"],
+    blocks: tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]],
 ) -> Float[Array, " p"]:
-    """Compute each parameter's variance due to an effect that physics lacks and that is as large as the network's.
+    """Compute each parameter's variance due to effects that the network represents and physics may have.
 
-    An effect b moves a fit by H⁻¹ Jᵀ b, H = JᵀJ. By the Cauchy–Schwarz inequality, this moves parameter j by at most
-    Σ_s ‖b_s‖ (H⁻¹ J_sᵀ J_s H⁻¹)_jj^½ over states s, if b is proportional to the parameter's own effect. A random
-    mixture of q orthogonal effects, one of which is the parameter's own, shares on average 1/q of its square with it,
-    so the variance is the squared bound over q.
+    On a block of windows, the network's effect b alone moves parameter j by H_b⁻¹ Jᵀ b, as far as that block determines
+    it. The variance is the mean square of this over blocks, weighted by how much each determines the parameter. It is
+    not the mean that counts: physics that was fitted before the network leaves no effect in the mean, but what physics
+    lacks, for example ground effect, is not the same everywhere.
 
     Args:
-        effect: ‖b_s‖², see `Effect`.
-        equations: normal equations of the same windows for the fitted parameters.
-        of_states: J_sᵀ J_s for all parameters.
-        quantities: the number q of quantities on which an effect may depend.
+        equations: normal equations of each window for the fitted parameters, with H⁻¹ = Σ_b H⁻¹ H_b H⁻¹.
+        score: Jᵀ b of each window, see `Effect`.
+        blocks: window indices of each block and which count, see `selection.blocks_of`.
     """
-    found = inverse(jnp.sum(equations.gram, axis=0)).matrix
-    moved = jnp.sqrt(jnp.maximum(jnp.einsum("pq,sqr,rp->sp", found, of_states, found), 0.0))
-    return jnp.square(jnp.sqrt(effect) @ moved) / quantities
+    places, counted = blocks
+    matrix = inverse(jnp.sum(equations.gram, axis=0)).matrix
+    gram = jnp.sum(equations.gram[places] * counted[..., None, None], axis=1)
+    score = jnp.sum(score[places] * counted[..., None], axis=1)
+    weights = jnp.maximum(jnp.einsum("pq,bqr,rp->bp", matrix, gram, matrix), TINY)
+    return jnp.diagonal(matrix) * jnp.sum(jnp.square(score @ matrix) / weights, axis=0)
 
 
 def without_network(field: AbstractVectorField) -> AbstractVectorField:

@@ -100,7 +100,8 @@ class Auto(Method):
         # Only these settings matter. The scale is an array, so that another value does not compile again.
         scale, solver = scale_of(settings.objective), settings.solver
         larger, physics, sizes = _begin(self, field, train)
-        options, effect, step = (sizes, solver, scale, self.max_steps), None, None
+        whole = larger  # which physics without the network may replace
+        options, effect, step, score = (sizes, solver, scale, self.max_steps), None, None, None
         quantities = anchored.quantities_of(larger, train)
         still, network = np.zeros(sizes.shape, sizes.dtype), anchored.has_network(field)
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
@@ -115,7 +116,7 @@ class Auto(Method):
         (found, every, starts), fitted = first, _ = _fits(larger, still, train, both, *options), None
         for _ in range(ROUNDS):
             if network:  # even if physics replaced the source: the effect is the difference of the two models
-                effect = anchored.network_effect(field, train, solver, scale, starts)
+                effect = anchored.network_effect(whole, train, starts, solver, scale)
             given = source, quantities, learned_from, shares, effect
             chosen, nothing, move, rows = _judge(larger, found, every, *given, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
@@ -137,7 +138,12 @@ class Auto(Method):
         if self.networks and network:
             step = _fit_network(self, _anchor(larger, train, starts, found, solver, scale), found, nothing, units)
             step, ends = _confirm_network(step, ends, ends_of(left_out, step.left_out), source, scale)
-        return _conclude(field, larger, train, (found, chosen, ends, source, nothing, effect, step), quantities, sizes)
+        if network:
+            at = ravel_parameters(larger)[1](found.theta.astype(sizes.dtype))
+            score = anchored.network_effect(at, train, starts, solver, scale).score
+        alike = units if traced or selection.correlated(train) > 1 else selection.blocks_of(len(train), len(train))
+        outcome = found, chosen, ends, source, nothing, score, step
+        return _conclude(field, larger, train, outcome, alike, sizes)
 
 
 _shares = jit_by_size(UNOPTIMISED)(selection.shares_outside)
@@ -243,22 +249,23 @@ def _confirm_network(
 
 
 @jit_by_size(UNOPTIMISED)
-def _conclude(field, larger, train: Trajectories, outcome, quantities: int, sizes) -> Solution:
+def _conclude(field, larger, train: Trajectories, outcome, blocks, sizes) -> Solution:
     """Summarise the outcome, with the variances that the source and its network add."""
-    found, chosen, ends, source, nothing, effect, step = outcome
+    found, chosen, ends, source, nothing, score, step = outcome
     start = ravel_parameters(larger)[0]
     names, free = zip(*free_parameters(larger).items(), strict=True)
     free, taken, change = jnp.stack(free), chosen.taken, None
     theta = chosen.theta.at[taken].set(found.theta)
     probability, rejected = chosen.probability, chosen.naive > chosen.naive[taken]
-    equations = masked(found.equations, free[taken] & found.seen)
+    fitted = free[taken] & found.seen
+    equations = masked(found.equations, fitted)
     alone, of_source, degrees = jnp.array(False), jnp.diag(nothing.apparent), jnp.inf
     if source is not None:
         own, alone, distinct = source
         refitted = sandwich_with_prior(own.equations, len(start), distinct, own.noise / jnp.square(sizes))
         of_source = jnp.where(alone, refitted, of_source)
         degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
-    inherited = selection.spread(found.equations, free[taken] & found.seen, of_source)
+    inherited = selection.spread(found.equations, fitted, of_source)
     if step is not None:
         removed = anchored.weights_of(larger)[0] - anchored.weights_of(field)[0]  # all, if physics replaced it
         better = step.odds > selection.STRONG
@@ -268,9 +275,9 @@ def _conclude(field, larger, train: Trajectories, outcome, quantities: int, size
         free, theta = (jnp.concatenate([each, each[taken][None]]) for each in (free, theta))
         names, taken = (*names, NETWORK), jnp.where(better, len(names), taken)
     absorbed = jnp.zeros_like(start)
-    if effect is not None:
-        most = anchored.taken_by_network(effect.of_states, equations, found.of_states, quantities)
-        absorbed = jnp.where(alone, absorbed, most)
+    if score is not None:
+        taken_over = anchored.taken_by_network(equations, jnp.where(fitted, score, 0.0), blocks)
+        absorbed = jnp.where(alone, absorbed, taken_over)
     # Only rigid bodies: other systems' sizes are relative to the source's value and depend on the parametrisation.
     vague = jnp.sqrt(absorbed) > VAGUE * (sizes if "drag" in groups_of(names_of(larger)) else jnp.inf)
     first = names, probability, rejected, taken, alone, (*names_of(larger),), free, theta, equations, change, ends

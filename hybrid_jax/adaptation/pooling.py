@@ -19,10 +19,10 @@ SOURCES = 3  # the fewest: the variance between two is too uncertain
 def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parameter]:
     """Combine the parameters of several results. Intervals include the variance within and between results.
 
-    Sources with different seeds differ in what their networks absorbed. The variance between them replaces the bound
-    that a single result has, as in multiple imputation (Rubin, Multiple Imputation for Nonresponse in Surveys, 1987,
-    Sec. 3.1). It does not show what all networks absorbed alike, for example a drag that physics lacks: a parameter
-    that most results call effective remains so, without an interval.
+    Sources with different seeds differ in what their networks absorbed, and the variance between them shows it, as in
+    multiple imputation (Rubin, Multiple Imputation for Nonresponse in Surveys, 1987, Sec. 3.1). It does not show what
+    all networks absorbed alike, for example a drag that physics lacks: the variance of each result counts whole, and a
+    parameter that most results call effective remains so, without an interval.
 
     Args:
         results: adaptations of sources that were trained with different seeds, all to the same windows.
@@ -89,11 +89,7 @@ def _estimates(result: Adaptation) -> dict[str, tuple[float, float, float]]:
     theta, _ = ravel_parameters(result.field)
     assert result.covariance is not None
     assert result.degrees is not None
-    whole = np.diag(result.covariance)
-    own = whole - (0.0 if result.absorbed is None else result.absorbed)
-    with np.errstate(invalid="ignore"):  # infinite, where nothing was fitted
-        degrees = result.degrees * np.square(own / whole)  # `satterthwaite`, without the part of infinite degrees
-    known = zip(theta.tolist(), own.tolist(), degrees.tolist(), strict=True)
+    known = zip(theta.tolist(), np.diag(result.covariance).tolist(), result.degrees.tolist(), strict=True)
     return dict(zip(named_parameters(result.field), known, strict=True))
 
 

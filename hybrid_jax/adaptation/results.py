@@ -79,7 +79,7 @@ class Adaptation:
         covariance: covariance in the physics' own parametrisation, of effective parameters too; None without intervals.
         degrees: effective degrees of freedom of each variance, see `pooling.satterthwaite`; ∞ for the normal
             distribution; None without intervals.
-        absorbed: the part of each variance that bounds what the network may have taken; None without intervals.
+        absorbed: the part of each variance due to what the network may have taken; None without intervals.
         changed: parameters that differ significantly from the source's, the most significant first.
         set_aside: number of samples in windows with outliers, which were not used.
         not_measured: share of the states of the windows, 0 to 1, that are NaN, which counts as not measured.

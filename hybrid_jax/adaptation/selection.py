@@ -36,7 +36,6 @@ class Fit(NamedTuple):
 
     theta: Float[Array, " p"]  # the p parameters, in the order of `ravel_parameters`
     equations: NormalEquations  # of each window, at theta
-    of_states: Float[Array, "d p p"]  # JᵀJ of the errors of each state, summed over windows
     noise: Float[Array, ""]  # variance of one error over scale, from differences of successive errors
     seen: Bool[Array, " p"]  # which parameters the windows determine beyond rounding and better than the prior
     steps: Int[Array, ""]  # evaluations of the Jacobian
@@ -74,8 +73,7 @@ def fit_each(
         more = jnp.diagonal(jnp.sum(equations.gram, axis=0)) > noise / jnp.square(sizes)
         seen = more & normal_equations.has_effect(equations, windows, scale)
         theta = ravel_parameters(found.field)[0]
-        of_states = jnp.einsum("nsdp,nsdq->dpq", jacobian, jacobian)
-        fit = Fit(theta, masked(equations, seen), of_states, noise, seen, found.steps, found.status)
+        fit = Fit(theta, masked(equations, seen), noise, seen, found.steps, found.status)
         return (jacobian, r, ~jnp.any(free)), fit  # if nothing was fitted, these are at the start
 
     shape = jax.eval_shape(weigh, smooth.x)
@@ -97,7 +95,7 @@ def unchanged(
 
     Where windows are unlike that motion (`shares_outside`), the network's error is taken to be as large as its effect,
     and a fifth of it if that motion is unknown. Each parameter could explain a share of that error, see
-    `anchored.taken_by_network` for `quantities`.
+    `anchored.quantities_of`.
     """
     outside, missed = (ERRING, 1.0) if own is None else shares
     unknown = jnp.square(outside * missed) * jnp.asarray(added)

@@ -31,8 +31,8 @@ def test_sources_that_differ_widen_the_interval():
     pooled, alone = hj.pool(results)["log_length"], results[1].parameters["log_length"]
     assert pooled.low < np.log(LENGTH) < pooled.high
     assert pooled.high - pooled.low > 1.5 * (alone.high - alone.low)
-    bounded = [replace(each, covariance=4 * each.covariance, absorbed=3 * np.diag(each.covariance)) for each in results]
-    assert hj.pool([replace(each, degrees=16 * each.degrees) for each in bounded])["log_length"] == pooled
+    shared = hj.pool([replace(each, covariance=1e4 * each.covariance) for each in results])["log_length"]
+    assert shared.high - shared.low > 50 * (alone.high - alone.low)  # all may have absorbed the same
     assert pooled.value == pytest.approx(np.mean([each.parameters["log_length"].value for each in results]), abs=1e-5)
     effective = [{"log_length": replace(each.parameters["log_length"], effective="why")} for each in results]
     most = [replace(each, parameters=own) for each, own in zip(results[:2], effective, strict=False)]

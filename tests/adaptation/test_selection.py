@@ -66,7 +66,7 @@ def test_left_out_blocks_confirm_a_change_of_all_and_not_of_two():
         def fit(offset):
             r = errors - offset
             equations = NormalEquations(jnp.ones((10, 1, 1)), -r[:, None], r**2)
-            return Fit(jnp.array([offset]), equations, jnp.ones((1, 1, 1)), 0.01, jnp.array([True]), 1, 0)
+            return Fit(jnp.array([offset]), equations, 0.01, jnp.array([True]), 1, 0)
 
         found, blocks = fit(errors.mean()), blocks_of(10, 10)
         thetas = selection.left_out_thetas(found, jnp.array([True]), 1.0, 0.0, blocks)
@@ -80,7 +80,7 @@ def test_large_gains_of_some_blocks_do_not_hide_the_small_ones_of_others(least, 
     gains, blocks = np.repeat([4.0, 1.0, least], [2, 3, 5]), blocks_of(10, 10)
     still = NormalEquations(jnp.ones((10, 1, 1)), jnp.zeros((10, 1)), jnp.ones(10))
     before, after = (
-        Fit(jnp.zeros(1), still._replace(square=jnp.exp(-own)), jnp.ones((1, 1, 1)), 0.01, jnp.array([True]), 1, 0)
+        Fit(jnp.zeros(1), still._replace(square=jnp.exp(-own)), 0.01, jnp.array([True]), 1, 0)
         for own in (0 * gains, gains)
     )
     assert selection.surely_lower(after, before, jnp.zeros((10, 1)), blocks) == sure
@@ -98,7 +98,7 @@ def test_single_precision_suffices_where_a_prior_is_far_wider_than_what_the_wind
         j, r = jacobian.astype(dtype), errors.astype(dtype)
         equations = jax.vmap(equations_of)(*map(jnp.asarray, (j, r)))
         every = np.linalg.lstsq(j.reshape(-1, p), -r.ravel())[0]
-        source = Fit(jnp.zeros(p), equations, jnp.ones((1, p, p)), jnp.ones(()), jnp.ones(p, bool), 1, 0)
+        source = Fit(jnp.zeros(p), equations, jnp.ones(()), jnp.ones(p, bool), 1, 0)
         every = source._replace(theta=jnp.asarray(every), equations=source.at(every))
         found = jax.jit(posterior)(source, every, jnp.zeros(p), free, jnp.full(p, 100.0), jnp.zeros(p))
         return int(found.taken), float(found.probability[1])
