@@ -169,13 +169,14 @@ def taken_by_network(
 ) -> Float[Array, " p"]:
     """Compute each parameter's variance due to effects that the network represents and physics may have.
 
-    On a block of windows, the network's effect b alone moves parameter j by H_b⁻¹ Jᵀ b, as far as that block determines
-    it. The variance is the mean square of this over blocks, weighted by how much each determines the parameter. It is
-    not the mean that counts: physics that was fitted before the network leaves no effect in the mean, but what physics
-    lacks, for example ground effect, is not the same everywhere.
+    A block of windows with the network's effect b on its predictions moves the fit by m = H⁻¹ Jᵀ b and has the share
+    w = H⁻¹ H_b H⁻¹ of the covariance H⁻¹, so it says that parameter j is wrong by m_j (H⁻¹)_jj / w_jj. The variance is
+    the mean square of this over blocks, weighted by w_jj. It is not the mean that counts: physics that was fitted
+    before the network leaves no effect in the mean, but what physics lacks, for example ground effect, is not the same
+    everywhere.
 
     Args:
-        equations: normal equations of each window for the fitted parameters, with H⁻¹ = Σ_b H⁻¹ H_b H⁻¹.
+        equations: normal equations of each window for the fitted parameters; H is the sum of their matrices.
         score: Jᵀ b of each window, see `Effect`.
         blocks: window indices of each block and which count, see `selection.blocks_of`.
     """
