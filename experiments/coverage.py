@@ -183,6 +183,8 @@ def coverage_figure(rows: Results) -> Figure:
         _draw_shares(axes, fitted.where(world=world, noise=noise), changes)
         name_lines(axes, [*map(names.label, changes)])
         axes.set_title(f"{names.label(str(world))},\n{'without noise' if noise == 'none' else 'with sensor noise'}")
+    least = panels[0, 0].get_xlim()[0]  # of all panels
+    panels[0, 0].set_xlim(min(80.0, 1.1 * least - 10.0), 100.5)  # with room for names
     for axes in panels[-1]:
         axes.set_xlabel("intervals that contain\nthe true value [%]")
     meaning = "Ix, Iy: moments of inertia; k: thrust coefficient"
@@ -204,7 +206,6 @@ def _draw_shares(axes: Axes, rows: Results, changes: list) -> None:
             axes.plot(share, y, marker, ms=4, color=colour, label=label, clip_on=False)
         edge = {"xycoords": axes.get_yaxis_transform()}
         note(axes, parameter, (0.0, y), (3, 0), va="center", color="0.4", **edge)
-    axes.set_xlim(min(80.0, axes.get_xlim()[0]), 100.5)
 
 
 def conclusion(rows: Results) -> list[str]:

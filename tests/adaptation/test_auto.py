@@ -169,13 +169,9 @@ def test_the_network_takes_from_a_parameter_what_a_block_of_windows_would_move_i
     """Also if the mean over blocks is zero, as after physics was fitted first; other effects take nothing."""
     columns = np.linalg.qr(np.random.default_rng(0).normal(size=(50, 3)))[0]
     jacobian = np.broadcast_to(columns[:, :2], (20, 50, 2))  # the third column is an effect of no parameter
-    gram = jnp.asarray(np.einsum("nep,neq->npq", jacobian, jacobian))
-    signs = np.repeat([1, -1, 1, -1, 0], 4)  # of the effect in each block
-    effects = signs[:, None] * (0.3 * columns[:, 0] + 5.0 * columns[:, 2])
-    equations, score = (
-        NormalEquations(gram, jnp.zeros((20, 2)), jnp.zeros(20)),
-        np.einsum("nep,ne->np", jacobian, effects),
-    )
+    gram, signs = np.einsum("nep,neq->npq", jacobian, jacobian), np.repeat([1, -1, 1, -1, 0], 4)  # 4 in a block
+    score = np.einsum("nep,ne->np", jacobian, signs[:, None] * (0.3 * columns[:, 0] + 5.0 * columns[:, 2]))
+    equations = NormalEquations(jnp.asarray(gram), jnp.zeros((20, 2)), jnp.zeros(20))
     found = taken_by_network(equations, jnp.asarray(score), blocks_of(20, 5))
     np.testing.assert_allclose(found, [0.8 * 0.3**2, 0.0], atol=1e-6)
 
