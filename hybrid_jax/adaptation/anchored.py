@@ -22,7 +22,7 @@ from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
 from hybrid_jax.estimation.normal_equations import CHUNK, NormalEquations, inverse
 from hybrid_jax.estimation.starts import Starts, from_starts
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, errors_of
 
 RANK = 32  # dimensions of the subspace
 PENALTIES = (1.0, 1e-1, 1e-2, 1e-3)  # over the largest eigenvalue of JᵀJ
@@ -140,7 +140,11 @@ def network_effect(
 
         def errors(thetas: Float[Array, "c p"], change: Float[Array, " w"]):
             def one(theta, window):
-                return prediction_errors(with_change(unravel(theta), change), window, solver, scale)
+                found = prediction_errors(with_change(unravel(theta), change), window, solver, scale)
+                held = -errors_of(jnp.broadcast_to(window.x0, window.x.shape), window.x)
+                held = held if scale is None else held / scale
+                # Without its network a model may diverge: then its prediction is the start.
+                return jnp.where(jnp.isfinite(jnp.sum(jnp.square(found))), found, held.astype(found.dtype))
 
             found = jax.vmap(one)(thetas, smooth)
             return weigh(found), found
