@@ -134,9 +134,9 @@ def of_intervals():
     for (world, domain, *_), own in fitted_of_coverage().group("world", "domain", "noise", "parameter").items():
         needed = np.quantile(np.abs(own.numbers("error")), 0.95)
         wide.setdefault((world, domain == "gusty_wind"), []).append(np.median(own.numbers("half_width")) / needed)
-    steady, gusty, other, abroad = (f"{min(each):.1f} to {max(each):.1f} times" for each in wide.values())
+    steady, gusty, steady_abroad, gusty_abroad = (f"{min(each):.1f} to {max(each):.1f} times" for each in wide.values())
     yield "results/intervals", f"Iris' pooled intervals are {steady} as wide as needed, and {gusty} in gusts"
-    yield "results/intervals", f"The Hummingbird's are {other} as wide, and {abroad} in gusts"
+    yield "results/intervals", f"The Hummingbird's are {steady_abroad} as wide, and {gusty_abroad} in gusts"
     abroad = fitted_of_coverage().where(world="hummingbird", parameter="k")
     worst = abroad.where(domain="parameter_shift", noise="none")
     yield "results/intervals", f"The {100 * np.mean(worst['inside']):.0f} % are those of the Hummingbird's k without"
