@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Container
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ Constants = dict[str, Rows | tuple[float, ...]]  # name → entries: numbers if 
 
 def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
     """Return ẋ of a multirotor with learned parameters θ_p. Terms that are neither learned nor present cost nothing."""
-    constants = nominal_values(vehicle, terms) | theta
+    constants = _loaded(nominal_values(vehicle, terms) | theta)
     q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
     thrust, torque = _wrench(vehicle, constants, u)
     gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], jnp.result_type(thrust)), (3,) + (1,) * thrust.ndim)
@@ -46,6 +47,17 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     if is_present(force):
         acceleration = acceleration + in_world(attitude, force)
     return jnp.concatenate([position, turning, acceleration, _euler(inertia, torque, omega)])
+
+
+def _loaded(constants: Constants) -> Constants:
+    """Return the constants with the mass and the centre of mass of a load added."""
+    changed: dict[str, Any] = {}
+    if is_present(ratio := constants["mass_ratio"], absent=1.0):
+        changed["mass"] = (ratio[0] * constants["mass"][0],)
+    if is_present(shift := constants["centre_shift"]):
+        pairs = zip(constants["centre_of_mass"], shift, strict=True)
+        changed["centre_of_mass"] = tuple(one + other for one, other in pairs)
+    return constants | changed
 
 
 def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):

@@ -23,9 +23,10 @@ from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, STATE_NAMES, ST
 LEARNED = ("Ix", "Iy", "k")
 UNITS = {"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "k": "N s²", "k_rotors": "N s²", "torque_coefficient": "N m s²"}
 UNITS |= {"mass": "kg", "centre_of_mass": "m", "drag": "N s/m", "cable_pull": "1/m", "aerodynamic_moment": "N s"}
-UNITS |= {"added_drag": "1/s", "rate_damping": "N m s", "velocity_lag": "s", "wind": "m/s"}
+UNITS |= {"centre_shift": "m", "added_drag": "1/s", "rate_damping": "N m s", "velocity_lag": "s", "wind": "m/s"}
 UNITS |= {"translational_lift": "N s²/m²", "rotor_drag": "N s²/m"}
-INERTIAS = {"mass": VELOCITY, "Ix": BODY_RATES.start, "Iy": BODY_RATES.start + 1, "Iz": BODY_RATES.start + 2}
+INERTIAS = {"mass": VELOCITY, "mass_ratio": VELOCITY}
+INERTIAS |= {name: BODY_RATES.start + i for i, name in enumerate(("Ix", "Iy", "Iz"))}
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,11 @@ class RigidBody(AbstractVectorField):
     its velocity v̂ for other forces only by the position: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the thrust.
     Then v − v̂ is λ times the force in the log: f plus the residual. S models the same for drag only.
 
-    Four corrections describe a change of the body (`corrected`): `efficiency` e, a rotor's thrust and reaction torque
+    Corrections describe a change of the body (`corrected`): `efficiency` e, a rotor's thrust and reaction torque
     relative to an intact rotor at the same speed; `reaction_torque`, a factor of all reaction torques, for example for
-    other propellers; `added_drag` c [1/s] along the body's axes; and `wind` w [m/s, world], for a body with D, H, A or
-    L: all but ṗ are then those at v − w.
+    other propellers; `mass_ratio`, a factor of m, and `centre_shift` [m], a shift of the centre of mass along x and y,
+    both of a load; `added_drag` c [1/s] along the body's axes; and `wind` w [m/s, world], for a body with D, H, A or L:
+    all but ṗ are then those at v − w.
 
     Parameters are deviations from nominal that start at zero, so that one learning rate fits all: positive ones as
     log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The lag of the

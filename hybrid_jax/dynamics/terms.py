@@ -18,8 +18,9 @@ SHAPES = POSITIVE | SIGNED  # of all learnable parameters, for four rotors; see 
 OF_AIR = {"drag", "rotor_drag", "aerodynamic_moment", "translational_lift"}  # a wind acts through these
 OF_VELOCITY = OF_AIR | {"velocity_lag", "velocity_gain"}  # not identifiable without a velocity
 # Of a body that has changed; see `rigid_body.corrected`.
-CORRECTIONS = {"efficiency": (4,), "reaction_torque": (), "added_drag": (3,), "wind": (3,)}
-LOGARITHMIC = (*POSITIVE, "efficiency", "reaction_torque")
+CORRECTIONS = {"efficiency": (4,), "reaction_torque": (), "mass_ratio": (), "centre_shift": (2,)}
+CORRECTIONS |= {"added_drag": (3,), "wind": (3,)}
+LOGARITHMIC = (*POSITIVE, "efficiency", "reaction_torque", "mass_ratio")
 Three = tuple[float, float, float]
 NONE = (0.0, 0.0, 0.0)
 
@@ -89,7 +90,8 @@ def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...
     k, (ix, iy, iz) = vehicle.thrust_coefficient, vehicle.inertia
     own = {"Ix": (ix,), "Iy": (iy,), "Iz": (iz,), "k": (k,), "k_rotors": (k,) * vehicle.rotors}
     own |= {"mass": (vehicle.mass,), "torque_coefficient": (vehicle.torque_coefficient,)}
-    own |= {"efficiency": (1.0,) * vehicle.rotors, "reaction_torque": (1.0,), "added_drag": NONE, "wind": NONE}
+    own |= {"efficiency": (1.0,) * vehicle.rotors, "reaction_torque": (1.0,), "mass_ratio": (1.0,)}
+    own |= {"centre_shift": (0.0, 0.0), "added_drag": NONE, "wind": NONE}
     return own | {name: tuple(np.ravel(getattr(terms, name)).tolist()) for name in SIGNED}
 
 
@@ -100,5 +102,5 @@ def units_of(vehicle: Vehicle) -> dict[str, float]:
     forces = {"drag": weight / SPEED, "aerodynamic_moment": weight * arm / SPEED, "rate_damping": weight * arm / RATE}
     forces["translational_lift"] = weight / FAST**2
     forces["rotor_drag"] = weight / SPEED / (vehicle.rotors * vehicle.hover_speed)
-    places = {"centre_of_mass": arm, "cable_pull": 1 / arm}
-    return forces | places | dict.fromkeys((*CORRECTIONS, "torque_gain", "velocity_gain", "velocity_lag"), 1.0)
+    places = {"centre_of_mass": arm, "centre_shift": arm, "cable_pull": 1 / arm}
+    return dict.fromkeys((*CORRECTIONS, "torque_gain", "velocity_gain", "velocity_lag"), 1.0) | forces | places

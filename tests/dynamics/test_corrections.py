@@ -29,7 +29,7 @@ U = jnp.array([640.0, 660.0, 650.0, 630.0])
 def changed(efficiency=(1.0, 1.0, 1.0, 1.0), drag=0.0, reaction=1.0):
     factors = {"efficiency": efficiency, "reaction_torque": reaction}
     deviations = {name: jnp.log(jnp.array(each)) for name, each in factors.items()} | {"added_drag": jnp.full(3, drag)}
-    return hj.RigidBody(BODY.deviations | deviations, hj.IRIS)
+    return hj.RigidBody(corrected(BODY).deviations | deviations, hj.IRIS)
 
 
 def moving():

@@ -12,7 +12,7 @@ from systems import ODD, columns, infer_batch, one_by_one, train_batch
 from hybrid_jax import IRIS, AbstractVectorField, Frozen, Hybrid, rotation
 from hybrid_jax.dynamics import ConstantDisturbance, HoldState
 from hybrid_jax.dynamics.rigid_body import LEARNED, FrozenRates, RigidBody, perturbed, rigid_body
-from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
+from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms, units_of
 from hybrid_jax.vehicle import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
@@ -151,12 +151,13 @@ def test_a_body_that_does_not_turn_tells_where_its_cable_pulls():
     np.testing.assert_allclose(IRIS.mass * derivative[VELOCITY], pull, atol=1e-12)
 
 
-def test_a_learned_mass_is_that_of_a_heavier_vehicle():
-    heavier = replace(IRIS, mass=1.3 * IRIS.mass)
-    learned = RigidBody({"mass": jnp.log(1.3)}, IRIS, KNOWN)
-    np.testing.assert_allclose(learned.theta()["mass"], heavier.mass)
+@pytest.mark.parametrize(("mass", "centre"), [("mass", "centre_of_mass"), ("mass_ratio", "centre_shift")])
+def test_a_learned_mass_or_load_is_that_of_a_heavier_vehicle(mass, centre):
+    heavier, terms, shift = replace(IRIS, mass=1.3 * IRIS.mass), replace(KNOWN, centre_of_mass=(0.03, -0.03)), [2, -1]
+    learned = RigidBody({mass: jnp.log(1.3), centre: 0.01 * np.array(shift) / units_of(IRIS)[centre]}, IRIS, KNOWN)
+    np.testing.assert_allclose(learned.theta()[mass], heavier.mass if mass == "mass" else 1.3)
     x, u = columns()
-    expected = one_by_one(rigid_body(heavier, (), KNOWN), x, u)
+    expected = one_by_one(rigid_body(heavier, (), terms), x, u)
     np.testing.assert_allclose(one_by_one(learned, x, u), expected, rtol=1e-13, atol=1e-13)
 
 
