@@ -24,7 +24,7 @@ THETA = ("theta", "aerodynamics")  # the groups of θ_p
 # The groups of the parameters of a corrected rigid body; the others are in theta.
 GROUPS = dict.fromkeys((*OF_AIR, "rate_damping"), "aerodynamics")
 GROUPS |= {"efficiency": "efficiency", "reaction_torque": "reaction_torque", "added_drag": "drag"}
-GROUPS |= {"wind": "wind", "wind[2]": "updraft"}
+GROUPS |= {"wind": "wind", "wind[2]": "updraft", "mass_ratio": "mass", "centre_shift": "centre"}
 GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
 
 # The groups of parameters that each candidate fits. A candidate applies if the field has all of its groups.
@@ -38,6 +38,9 @@ _CHANGES: Mapping[str, tuple[str, ...]] = {
     "wind": ("theta", "wind", "updraft"),
     "drag": ("theta", "drag"),
     "efficiency": ("theta", "efficiency"),
+    "load": ("theta", "mass", "centre"),
+    "force_load": ("theta", "force", "mass", "centre"),
+    "wind_load": ("theta", "wind", "updraft", "mass", "centre"),
     "force_torque": ("theta", "force", "torque"),
     "force_drag": ("theta", "force", "drag"),
     "force_efficiency": ("theta", "force", "efficiency"),
@@ -60,8 +63,11 @@ WORDS = {
     "torque": "a constant torque",
     "drag": "drag along each axis of the body",
     "efficiency": "the efficiency of each rotor",
+    "mass": "the mass with a load",
+    "centre": "the centre of mass",
 }
-CONFOUNDED = ("k", "k_rotors")  # parameters that are not identifiable beside the rotors' efficiencies
+# Parameters of θ_p that are not identifiable beside those of a group.
+CONFOUNDED = {"efficiency": ("k", "k_rotors"), "mass": ("k", "k_rotors", "mass"), "centre": ("centre_of_mass",)}
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,8 @@ class Plausible:
         aerodynamics: coefficients of drag, lift, aerodynamic moments and damping, relative to the vehicle's weight and
             arm at 1 m/s (lift: 10 m/s; damping: 10 rad/s).
         efficiency: logarithm of each rotor's efficiency.
+        mass: logarithm of the mass with a load over the mass before.
+        centre: shift of the centre of mass along x and y, relative to the vehicle's arm.
         reaction_torque: logarithm of a factor of all reaction torques.
         disturbance: constant disturbance of another system, relative to each state's RMS rate in the windows.
 
@@ -96,6 +104,8 @@ class Plausible:
     drag: float = 0.5
     aerodynamics: float = 0.05
     efficiency: float = 0.3
+    mass: float = 0.3
+    centre: float = 0.2
     reaction_torque: float = 0.3
     disturbance: float = 1.0
 
@@ -160,9 +170,9 @@ def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
     """Return which parameters of an extended field each candidate fits (c, p)."""
     names, found = names_of(field), {}
     group = groups_of(names)
-    lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
     for name, fitted in CANDIDATES.items():
         if set(fitted) <= {*group, "theta"}:
-            free = np.array([each in fitted for each in group])
-            found[name] = free & ~lost if "efficiency" in fitted else free
+            lost = {other for each in fitted for other in CONFOUNDED.get(each, ())}
+            pairs = zip(names, group, strict=True)
+            found[name] = np.array([each in fitted and own.split("[")[0] not in lost for own, each in pairs])
     return found

@@ -103,7 +103,7 @@ def test_candidates_of_a_rigid_body_fit_what_their_names_say():
     names, found = fitted(field)
     others = {"disturbance", "wind", "aerodynamics"}
     assert [*found] == [name for name, groups in CANDIDATES.items() if others.isdisjoint(groups)]
-    assert len(names) == ravel_parameters(field)[0].size == 3 + 4 + 1 + 3 + 6
+    assert len(names) == ravel_parameters(field)[0].size == 3 + 4 + 1 + 1 + 2 + 3 + 6
     assert (found["source"], found["theta"]) == (set(), {"Ix", "Iy", "k"})
     assert found["drag"] == {"Ix", "Iy", "k", *(f"added_drag[{i}]" for i in range(3))}
     # Four efficiencies and k would be five numbers for four.
@@ -181,12 +181,9 @@ def test_results_of_auto_are_pooled_with_what_the_networks_express():
     assert pooled.low < np.log(LENGTH) < pooled.high
 
 
-def test_one_window_warns():
+def test_one_window_warns_and_a_source_without_its_motion_says_how_to_add_it(monkeypatch):
     with pytest.warns(UserWarning, match="windows: 1 are too few to determine 1 parameters"):
         assert adapt(pendulum(), flown(pendulum(), count=1)).chosen == "source"
-
-
-def test_a_source_without_its_motion_says_how_to_add_it(monkeypatch):
     monkeypatch.setattr(auto.Auto, "solve", lambda self, field, *_, **__: Solution(field))
     with pytest.warns(UserWarning, match=r"its training windows are unknown.*; pass learned_"):
         adapt(hybrid(), flown(hybrid()))

@@ -8,6 +8,7 @@ import pytest
 from pendulum import DAMPING, LENGTH, pendulum
 
 import hybrid_jax as hj
+from experiments.flying.changes import LOADED
 from hybrid_jax.dynamics import ConstantDisturbance, Terms
 from hybrid_jax.trajectories import windows_of
 
@@ -83,11 +84,19 @@ def test_the_report_says_why_a_change_was_refused(share, reason):
     assert next(line for line in found.report().splitlines() if reason in line).startswith("Rejected: theta: ")
 
 
-def test_other_propellers_are_found_by_their_reaction_torque():
-    other = replace(hj.IRIS, torque_coefficient=1.6 * hj.IRIS.torque_coefficient)
-    found = hj.adapt(SOURCE, flown(0, 1.0, drag=0.5, vehicle=other))
-    assert found.chosen == "reaction_torque"
-    np.testing.assert_allclose(found.parameters["reaction_torque"].value, 1.6, rtol=0.03)
+SHIFT = np.subtract(hj.IRIS.rotor_positions, LOADED.rotor_positions)[0]
+LOAD = {"mass_ratio": LOADED.mass / hj.IRIS.mass, "Ix": LOADED.inertia[0], "Iy": LOADED.inertia[1]}
+LOAD |= {f"centre_shift[{i}]": SHIFT[i] for i in range(2)}
+PROPELLERS = replace(hj.IRIS, torque_coefficient=1.6 * hj.IRIS.torque_coefficient)
+
+CASES = [(PROPELLERS, "reaction_torque", {"reaction_torque": 1.6}), (LOADED, "load", LOAD)]
+
+
+@pytest.mark.parametrize(("vehicle", "chosen", "truth"), CASES)
+def test_other_propellers_and_a_load_are_found(vehicle, chosen, truth):
+    found = hj.adapt(SOURCE, flown(0, 1.0, drag=0.5, vehicle=vehicle))
+    assert found.chosen == chosen
+    np.testing.assert_allclose([found.parameters[name].value for name in truth], [*truth.values()], rtol=0.03)
 
 
 def test_also_a_body_that_learns_many_aerodynamic_coefficients_sees_a_small_change_of_drag():
