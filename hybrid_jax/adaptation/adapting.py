@@ -18,7 +18,7 @@ from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge,
 from hybrid_jax.adaptation.outliers import outliers
 from hybrid_jax.adaptation.plausible import THETA, groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
-from hybrid_jax.adaptation.results import Adaptation, Parameter
+from hybrid_jax.adaptation.results import NETWORK, Adaptation, Parameter
 from hybrid_jax.adaptation.selection import TINY, blocks_of, correlated, overlap
 from hybrid_jax.dynamics import disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space, trainable
@@ -88,7 +88,8 @@ def adapt(
         validation: windows for early stopping and penalties; you should take them from another flight. By default the
             last fifth of `windows` is held out if the method needs validation.
         learned_from: windows that the source was trained on, by default those that `hj.fit` stores in its networks.
-            "auto" uses them to estimate the source's own error, and the report warns if `windows` are unlike them.
+            "auto" uses them to estimate the source's own error, and the report warns if `windows` are unlike them. If
+            you pass them in the order of time, `expected` has better intervals.
         settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, which is
             independent of units; "auto" scales by `learned_from` instead if it is known.
         level: confidence level of the intervals, between 0 and 1.
@@ -189,12 +190,15 @@ def _chosen(choice: Choice, windows: Trajectories, space: StateSpace, flights) -
     seconds, ends = windows.horizon * windows.dt, np.asarray(choice.ends)
     chain = seconds * longest_chain(windows, blocks_of(len(windows), len(ends), flights))
     horizons = round(seconds, 9), round(chain, 9)
+    usual = None if choice.usual is None else np.asarray(choice.usual)
+    if usual is not None and (choice.names[int(choice.taken)] == NETWORK or not np.isfinite(usual).all()):
+        usual = None  # the source's errors tell nothing of another network
     return {
         "candidates": dict(zip(choice.names, np.asarray(choice.probability).tolist(), strict=True)),
         "chosen": choice.names[int(choice.taken)],
         "physics_only": bool(choice.alone),
         "rejected": tuple(name for name, one in zip(choice.names, np.asarray(choice.rejected), strict=True) if one),
-        "expected": expected_errors(ends, horizons, space, flights is not None),
+        "expected": expected_errors(ends, horizons, space, flights is not None, usual),
         "units": {one.name: one.unit for one in space.quantities},
     }
 

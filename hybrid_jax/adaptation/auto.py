@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import anchored, selection
-from hybrid_jax.adaptation.expectation import errors_of_units, no_higher
+from hybrid_jax.adaptation.expectation import errors_of_units, no_higher, parts_of_flights
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, extended, free_parameters, groups_of, names_of
 from hybrid_jax.adaptation.results import NETWORK
@@ -30,6 +30,7 @@ from hybrid_jax.trajectories import Trajectories
 
 PLAUSIBLE = Plausible()
 VAGUE = 1 / 3  # of a plausible change: if the network may have absorbed more, a parameter is called effective
+SIMILAR = 2.0  # factor between variances of noise up to which errors of the source and of this flight are comparable
 ROUNDS = 2  # the second linearises at the first's result: squared errors are not quadratic over large changes
 
 
@@ -51,17 +52,18 @@ class Choice(NamedTuple):
     degrees: Float[Array, ""]  # degrees of freedom of `inherited`
     absorbed: Float[Array, " p"]  # variance of what the network may have absorbed, see `taken_by_network`
     vague: Bool[Array, " p"]  # rigid bodies only: whether that is a large part of a plausible change
+    usual: Float[Array, "r 2 d"] | None = None  # the source's errors on parts of its own flights, if these are known
 
 
 @dataclass(frozen=True)
 class Auto(Method):
     """Choose the most probable of several changes; see `selection`.
 
-    The candidates for a rigid body are no change, new θ_p, and new θ_p with constant forces and torques, wind, drag and
-    rotor efficiencies, each with the aerodynamic coefficients of θ_p held or free; for other systems no change, new
-    θ_p, and new θ_p with a constant disturbance. A change must also predict left-out blocks of windows better. A
-    penalised change of the network's weights is then tried on top. If physics without the network predicts the source's
-    own motion better, it replaces the source.
+    The candidates for a rigid body are no change, new θ_p, and new θ_p with constant forces and torques, wind, drag,
+    rotor efficiencies and a load, each with the aerodynamic coefficients of θ_p held or free; for other systems no
+    change, new θ_p, and new θ_p with a constant disturbance. A change must also predict left-out blocks of windows
+    better. A penalised change of the network's weights is then tried on top. If physics without the network predicts
+    the source's own motion better, it replaces the source.
 
     Attributes:
         networks: whether the network may change.
@@ -91,7 +93,8 @@ class Auto(Method):
 
         Args:
             learned_from: windows that the source was trained on, by default those that it stores; without them its
-                network is assumed to err by a fifth of its effect (`selection.ERRING`).
+                network is assumed to err by a fifth of its effect (`selection.ERRING`). If they follow each other, they
+                also tell how much errors differ between flights, see `expectation.expected_errors`.
             flights: the flight of each window (n,), if there are several: expected errors then come from left-out
                 flights instead of blocks.
         """
@@ -107,6 +110,7 @@ class Auto(Method):
         both, source = np.outer([0, 1], np.ones(len(names_of(larger)))) > 0, None  # fit nothing, and everything
         learned_from = motion_of(field) if learned_from is None else learned_from
         shares = None if learned_from is None else _shares(field, learned_from, train)
+        known = None if traced or flights is not None else learned_from  # several flights need no others
         if learned_from is not None:
             distinct, learned_from = jnp.array(min(len(learned_from), len(train))), selection.alike(learned_from, train)
             own = _fits(larger, still, learned_from, both, *options, distinct)[0]
@@ -127,9 +131,9 @@ class Auto(Method):
         units = selection.blocks_of(len(train), self.blocks, flights)
         weights = anchored.weights_of(larger)[0].size if network else 0
 
-        def ends_of(thetas, change: Array | None = None) -> Array:
+        def ends_of(thetas, change: Array | None = None, windows: Trajectories = train) -> Array:
             change = jnp.zeros((len(thetas), weights)) if change is None else change
-            return errors_of_units(larger, thetas, change, train, units, solver)
+            return errors_of_units(larger, thetas, change, windows, units, solver)
 
         sure, left_out = _left_out(self, larger, found, first[0], chosen, None if flights is None else units)
         same = jnp.broadcast_to(ravel_parameters(larger)[0], left_out.shape)
@@ -143,7 +147,12 @@ class Auto(Method):
             score = anchored.network_effect(at, train, starts, solver, scale).score
         alike = units if traced or selection.correlated(train) > 1 else selection.blocks_of(len(train), len(train))
         outcome = found, chosen, ends, source, nothing, score, step
-        return _conclude(field, larger, train, outcome, alike, sizes)
+        solution = _conclude(field, larger, train, outcome, alike, sizes)
+        if known is None or source is None or not 1 / SIMILAR < float(found.noise / source.own.noise) < SIMILAR:
+            return solution
+        parts = (selection.alike(known[part], train) for part in parts_of_flights(known, train))
+        usual = [jnp.mean(ends_of(same, windows=part), axis=0) for part in parts]
+        return solution._replace(choice=solution.choice._replace(usual=jnp.stack(usual) if usual else None))
 
 
 _shares = jit_by_size(UNOPTIMISED)(selection.shares_outside)

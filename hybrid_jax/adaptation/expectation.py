@@ -10,7 +10,7 @@ import scipy  # not scipy.stats, which takes half a second to import
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax.adaptation import anchored
-from hybrid_jax.adaptation.selection import ALIKE, MOST
+from hybrid_jax.adaptation.selection import ALIKE, ENOUGH, MOST
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
 from hybrid_jax.integrate import compact, rollout
@@ -19,7 +19,9 @@ from hybrid_jax.state_space import StateSpace
 from hybrid_jax.trajectories import Trajectories, errors_of
 
 LEVEL = 0.8
+USUAL = 0.95  # level of the interval in which the error of a flight like the source's is
 JOINED = 10  # adjacent windows, at most so many, are joined and predicted as one
+PARTS = 30  # of the source's flights, at most so many
 FAR = 30  # times the error: wider intervals say nothing and are not printed
 NO_INTERVAL = "no interval: the parts left out are too few or differ too much"
 Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
@@ -38,33 +40,64 @@ def expected(logs: Float[np.ndarray, "n ..."], flights: int | None = None) -> Fl
     return np.exp([middle, middle - half, middle + half])
 
 
+def parts_of_flights(learned_from: Trajectories | None, windows: Trajectories) -> list[slice]:
+    """Return where the source's training windows follow each other for as long as `windows`, for at most `PARTS` parts.
+
+    There are none if they are longer or shorter than these, are unknown, or give too few parts for a standard error.
+    """
+    n, first, parts = len(windows), 0, list[slice]()
+    if learned_from is None or learned_from.horizon != windows.horizon or not np.isclose(learned_from.dt, windows.dt):
+        return parts
+    breaks = (np.asarray(learned_from.x0)[1:] != np.asarray(learned_from.x)[:-1, -1]).any(axis=1)
+    for end in [*np.flatnonzero(breaks) + 1, len(learned_from)]:
+        parts += [slice(at, at + n) for at in range(first, end - n + 1, n)]
+        first = end
+    kept = np.linspace(0, len(parts) - 1, min(len(parts), PARTS)).astype(int)
+    return [parts[i] for i in kept] if len(parts) >= ENOUGH else []
+
+
 def expected_errors(
-    squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, float], space: StateSpace, flights: bool = False
+    squares: Float[np.ndarray, "b 2 d"],
+    seconds: tuple[float, float],
+    space: StateSpace,
+    flights: bool = False,
+    of_source: Float[np.ndarray, "r 2 d"] | None = None,
 ) -> Expected:
     """Return the RMSE at the end of single and of joined windows, with an 80 % prediction interval for another flight.
 
     `squares` are mean squared errors, NaN where a state was not measured, of whole flights if `flights` (see
-    `expected`), else of blocks of one flight; `seconds` are the durations of the windows. The interval from blocks
-    (Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7) uses Student's t for the logarithm of their mean. Squares
-    are skewed, and a few blocks seldom contain the largest, so their sample standard deviation is too small. They are
-    taken as lognormal: the logarithm of the mean then has the variance s²/b + s⁴ / (2 (b − 1)), with s² the variance
-    of the logarithms (Cox's method; Zhou and Gao, Statistics in Medicine 1997).
+    `expected`), else of blocks of one flight; `seconds` are the durations of the windows. Intervals (Hahn and Meeker,
+    Statistical Intervals, 1991, Sec. 4.7) use Student's t for the logarithm of the mean square of a flight. Errors
+    `of_source` on parts of its own flights, each as long as this flight, tell how much it varies, if it could be one of
+    them itself: in their 95 % prediction interval.
+
+    Otherwise the variance comes from the blocks. Squares are skewed, and a few blocks seldom contain the largest, so
+    their sample standard deviation is too small. They are taken as lognormal: the logarithm of the mean then has the
+    variance s²/b + s⁴ / (2 (b − 1)), with s² the variance of the logarithms (Cox's method; Zhou and Gao, Statistics in
+    Medicine 1997), and `ALIKE` blocks count as one.
     """
     blocks = len(squares)
     with warnings.catch_warnings(action="ignore"):  # a state that no end measures
         squares = np.where(np.isnan(squares), np.nanmean(squares, axis=0), squares)
     squares = np.where(np.isfinite(squares), squares, np.nan)  # a diverged one has no RMSE
-    quantile = scipy.special.stdtrit(max(blocks - 1, 1), (1 + LEVEL) / 2)
 
-    def around(group: slice, factor: float, horizon: int) -> tuple[float, float, float]:
-        power = np.maximum(factor**2 * squares[:, horizon, group].sum(axis=-1), np.finfo(np.float32).tiny)
+    def power_of(squares: Float[np.ndarray, "n 2 d"], group: slice, factor: float, horizon: int) -> Array:
+        return np.maximum(factor**2 * squares[:, horizon, group].sum(axis=-1), np.finfo(np.float32).tiny)
+
+    def around(*which) -> tuple[float, float, float]:
+        power, variance, degrees = power_of(squares, *which), np.inf, 1
         if flights:
             value, low, high = expected(np.log(power) / 2)
             return float(value), float(low), float(high)
-        away = np.inf
         if blocks > 1:
-            variance = np.log(power).var(ddof=1)
-            away = quantile * 0.5 * np.sqrt(2 * ALIKE * (variance / blocks + variance**2 / (2 * (blocks - 1))))
+            variance, degrees = np.log(power).var(ddof=1), blocks - 1
+            variance = ALIKE * (variance / blocks + variance**2 / (2 * degrees))
+        if of_source is not None:
+            n, logs = len(of_source), np.log(power_of(of_source, *which))
+            error = (logs.var(ddof=1) * (1 + 1 / n)) ** 0.5
+            if abs(np.log(power.mean()) - logs.mean()) <= scipy.special.stdtrit(n - 1, (1 + USUAL) / 2) * error:
+                variance, degrees = logs.var(ddof=1), n - 1
+        away = scipy.special.stdtrit(degrees, (1 + LEVEL) / 2) * np.sqrt(variance / 2)  # of two flights' RMSE
         rmse = np.sqrt(power.mean())
         return float(rmse), float(rmse * np.exp(-away)), float(rmse * np.exp(away))
 

@@ -8,12 +8,13 @@ import pytest
 from pendulum import LENGTH, flown, hybrid, pendulum, swings
 
 import hybrid_jax as hj
+from hybrid_jax.adaptation import expectation
 from hybrid_jax.adaptation.expectation import errors_at_ends, expected, expected_errors, lines_of, longest_chain
 from hybrid_jax.adaptation.selection import blocks_of
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.state_space import StateSpace
-from hybrid_jax.trajectories import concatenate, split
+from hybrid_jax.trajectories import concatenate, split, windows_of
 
 LINE = StateSpace().padded(1)
 
@@ -68,16 +69,18 @@ def test_errors_after_windows_that_touch_are_those_of_one_long_prediction():
     np.testing.assert_allclose(padded, found, rtol=1e-5)
 
 
-@pytest.mark.parametrize("flights", [2, 3, 6])
+@pytest.mark.parametrize("flights", [2, 3, 6, 12])
 def test_the_interval_of_several_flights_holds_another_one_that_differs_from_them(flights):
+    """Of the twelve all but one are the source's; one in twenty is unlike these and bounds nothing."""
     rng, shape = np.random.default_rng(0), (2000, flights + 1, 10)
     squares = np.exp(rng.normal(size=(2000, flights + 1, 1)) + 0.1 * rng.normal(size=shape)).mean(axis=-1)
     held = []
     for *seen, other in squares:
-        of_flights = np.broadcast_to(np.reshape(seen, (-1, 1, 1)), (flights, 2, 1))
-        ((_, low, high),) = expected_errors(of_flights, (0.1, 0.1), LINE, flights=True)["0.1 s"].values()
+        own, given = np.broadcast_to(np.reshape(seen, (-1, 1, 1)), (flights, 2, 1)), ((0.1, 0.1), LINE)
+        new = {"of_source": own[1:]} if flights == 12 else {"flights": True}
+        ((_, low, high),) = expected_errors(own[: None if "flights" in new else 1], *given, **new)["0.1 s"].values()
         held.append(low <= np.sqrt(other) <= high)
-    assert np.mean(held) == pytest.approx(0.8, abs=0.03)
+    assert np.mean(held) == pytest.approx(0.8, abs=0.04)
 
 
 def test_errors_to_expect_are_those_of_each_flight_with_what_the_others_teach():
@@ -92,6 +95,19 @@ def test_errors_to_expect_are_those_of_each_flight_with_what_the_others_teach():
         errors.append(hj.rollout_batch(field, one.x0, one.u, one.dt)[:, -1] - one.x[:, -1])
     logs = np.log([float(jnp.sqrt(jnp.mean(each[:, 0] ** 2))) for each in errors])
     np.testing.assert_allclose(found.expected["0.4 s"]["x[0]"], expected(logs), rtol=0.01)
+
+
+def test_the_source_is_asked_on_parts_of_its_flights_that_are_as_long_as_the_new_one():
+    whole, field = swings(12, steps=40), pendulum(0.8)
+    states = np.concatenate([whole.x0[:, None], whole.x], axis=1)
+    known = concatenate([windows_of(x, u, whole.dt, steps=4) for x, u in zip(states, np.asarray(whole.u), strict=True)])
+    assert expectation.parts_of_flights(known, known[:10]) == [slice(i, i + 10) for i in range(0, 120, 10)]
+    assert expectation.parts_of_flights(known, known[:11]) == expectation.parts_of_flights(known[::2], known[:10]) == []
+    found = hj.adapt(field, known[:10], learned_from=known)
+    away = np.asarray(hj.rollout_batch(field, known.x0, known.u, whole.dt)[:, -1] - known.x[:, -1])
+    logs = np.log(np.mean(np.square(away).reshape(12, 10, 2), axis=1)) / 2
+    for (value, _, high), own in zip(found.expected["0.2 s"].values(), logs.T, strict=True):
+        assert np.log(high / value) == pytest.approx(1.3634 * 2**0.5 * own.std(ddof=1), rel=1e-3)  # Student, 11, 90 %
 
 
 def test_a_flight_unlike_those_learned_from_is_named():
