@@ -2,7 +2,6 @@
 
 import inspect
 import json
-import re
 import textwrap
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,14 +13,13 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 from pendulum import LENGTH, flown, hybrid, pendulum, swings
+from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax import METHODS, AbstractVectorField, Adaptation, FineTune, LeastSquares, Method, Solution, adapt
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, physics_of
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.status import Status
-
-PUSH = jnp.array([0.0, 1.5])
 
 
 class Own(hj.training.TrajectoryLoss.__base__):
@@ -59,7 +57,6 @@ def test_every_method_has_the_same_result(name):
     method = METHODS[name]
     method = replace(method, max_epochs=3) if isinstance(method, FineTune) else name
     result = adapt(hybrid(0.55), data, method=method)
-    assert isinstance(result, Adaptation)
     assert np.isfinite(result.mse_after)
     assert jax.tree.structure(physics_of(result.field)) == jax.tree.structure(pendulum())
     fitted = "least_squares" in name or result.chosen in ("theta", "disturbance")  # and the network stayed as it is
@@ -131,9 +128,8 @@ class Recorded(hj.adaptation.Auto):
 def test_errors_count_by_the_source_s_motion_also_in_a_hover():
     """Otherwise the source that is kept would depend on the flight that it adapts to."""
     hover = replace(swings(20), x0=1e-3 * swings(20).x0, x=1e-3 * swings(20).x)
-    found = [
-        adapt(hybrid(), windows, method=Recorded(), learned_from=swings(20)).steps for windows in (hover, swings(20))
-    ]
+    both = hover, swings(20)
+    found = [adapt(hybrid(), each, method=Recorded(), learned_from=both[1]).steps for each in both]
     assert found[0] == found[1] > 0
 
 
@@ -146,7 +142,7 @@ def test_a_disturbance_that_is_not_zero_is_moved_to_no_other_states():
     still = hj.with_disturbance(hj.with_disturbance(pendulum(), (0,)), (1,))
     assert disturbance_of(still).indices == (1,)
     with pytest.raises(ValueError, match="indices: the field already has a disturbance of other states"):
-        hj.with_disturbance(hj.Hybrid(pendulum(), ConstantDisturbance(PUSH[1:], (1,))), (0,))
+        hj.with_disturbance(hj.Hybrid(pendulum(), ConstantDisturbance(jnp.array([1.5]), (1,))), (0,))
 
 
 class Weights(AbstractVectorField):
@@ -156,16 +152,9 @@ class Weights(AbstractVectorField):
         return x * self.gains.sum()
 
 
-@pytest.mark.parametrize(
-    ("method", "options", "said"),
-    [
-        (FineTune, {"frozen": "residuals"}, "frozen must be 'physics', 'residual' or None, got 'residuals'"),
-        (LeastSquares, {"indices": 1}, "indices must be different integers of at least 0, got 1"),
-    ],
-)
-def test_a_method_that_makes_no_sense_is_refused(method, options, said):
-    with pytest.raises(ValueError, match=f"^{re.escape(said)}$"):
-        method(**options)
+def test_a_method_that_makes_no_sense_is_refused():
+    refusal(lambda: FineTune(frozen="residuals"), "^frozen must be 'physics', 'residual' or None, got 'residuals'$")
+    refusal(lambda: LeastSquares(indices=1), "^indices must be different integers of at least 0, got 1$")
 
 
 WIDE = replace(swings(40), u=np.zeros((40, 8, 2), np.float32))

@@ -69,21 +69,14 @@ def test_intervals_hold_if_a_part_of_the_variance_is_known_better_than_the_rest(
     assert degrees.max() <= freedom.sum()
 
 
-def test_a_parameter_that_is_not_determined_has_finite_degrees_of_freedom():
+def test_few_degrees_of_freedom_widen_the_interval_and_a_parameter_that_is_not_determined_has_some():
+    """Of equal estimates it is Student's, but for the correction of Barnard and Rubin."""
     found = satterthwaite(np.array([[np.inf, 0.0, 1.0], [1.0, 0.0, 0.0]]), np.array([4.0, np.inf]))
     np.testing.assert_allclose(found, [4.0, 4.0, 4.0])
-
-
-def test_few_degrees_of_freedom_widen_the_interval():
-    """Of equal estimates it is Student's, but for the correction of Barnard and Rubin."""
     wide, narrow = (combined(np.full(3, 2.0), np.full(3, 0.25), degrees=degrees)[1] for degrees in (9, np.inf))
     assert 2.26 / 1.96 * narrow < wide < 1.4 * narrow
-
-
-def test_estimates_that_disagree_are_known_as_well_as_their_own_variance():
-    """Hardly any variance within: it is Student's interval of the estimates alone, also with few blocks of windows."""
-    estimates = np.array([1.0, 2.0, 3.0])
-    _, away = combined(estimates, np.full(3, 1e-9), degrees=9)
+    # Hardly any variance within: it is Student's interval of the estimates alone, also with few blocks of windows.
+    _, away = combined(np.array([1.0, 2.0, 3.0]), np.full(3, 1e-9), degrees=9)
     assert away == pytest.approx(scipy.stats.t.ppf(0.975, 2) * np.sqrt(4 / 3), rel=1e-6)
 
 

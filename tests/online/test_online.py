@@ -171,14 +171,13 @@ def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
         ({"prior": {"frition": 0.1}}, "prior: frition must be among friction, idle"),
         ({"prior": {"friction": 0.1}}, "prior: idle must be given, 0 if it should stay constant"),
         ({"prior": 0.0}, "prior must be positive for at least one parameter, got 0 for all"),
-        ({"disturbance": 1.0}, "indices must say"),
+        ({"disturbance": 1.0}, "indices must say"), ({"noise": 0.0}, "noise must be"),
         ({"disturbance": (1.0, 1.0), "indices": (0,)}, "disturbance must be one number, or 1, one for each dist"),
-        ({"noise": 0.0}, "noise must be"),
         ({"hypotheses": hj.Hypothesis("a", {"idle": 0.3})}, "hypotheses must be a list of Hypothesis, got Hypothesis"),
         ({"hypotheses": [hj.Hypothesis("a", {"idle": 1})], "prior": HELD}, "hypothesis a: idle must be among"),
         ({"field": hj.Model(SLIDE)}, "field: must be a function .* got Model; pass its .field"),
     ],
-)
+)  # fmt: skip
 def test_a_filter_that_makes_no_sense_is_refused(options, said):
     with pytest.raises(ValueError, match=f"^{said}"):
         OnlineAdaptation(**({"field": SLIDE, "dt": DT, "noise": NOISE} | options))
