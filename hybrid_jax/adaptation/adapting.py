@@ -12,13 +12,13 @@ import numpy as np
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.anchored import has_network
-from hybrid_jax.adaptation.auto import Auto, Choice
+from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.expectation import expected_errors, longest_chain
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.outliers import outliers
 from hybrid_jax.adaptation.plausible import THETA, groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
-from hybrid_jax.adaptation.results import NETWORK, Adaptation, Parameter
+from hybrid_jax.adaptation.results import NETWORK, Adaptation, Choice, Parameter
 from hybrid_jax.adaptation.selection import TINY, blocks_of, correlated, overlap
 from hybrid_jax.dynamics import disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space, trainable

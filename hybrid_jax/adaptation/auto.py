@@ -16,11 +16,11 @@ from hybrid_jax.adaptation import anchored, selection
 from hybrid_jax.adaptation.expectation import errors_of_units, no_higher, parts_of_flights
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, extended, free_parameters, groups_of, names_of
-from hybrid_jax.adaptation.results import NETWORK
+from hybrid_jax.adaptation.results import NETWORK, Choice
 from hybrid_jax.adaptation.selection import Fit, Posterior, Unchanged
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import Scale, ravel_parameters
-from hybrid_jax.estimation.normal_equations import NormalEquations, masked
+from hybrid_jax.estimation.normal_equations import masked
 from hybrid_jax.estimation.uncertainty import sandwich_with_prior
 from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import FASTEST_COMPILE, UNOPTIMISED, jit_by_size
@@ -32,27 +32,6 @@ PLAUSIBLE = Plausible()
 VAGUE = 1 / 3  # of a plausible change: if the network may have absorbed more, a parameter is called effective
 SIMILAR = 2.0  # factor between variances of noise up to which errors of the source and of this flight are comparable
 ROUNDS = 2  # the second linearises at the first's result: squared errors are not quadratic over large changes
-
-
-class Choice(NamedTuple):
-    """The c candidates and the chosen one, with the p parameters of the extended physics, see `extended`."""
-
-    names: tuple[str, ...]  # of the candidates
-    probability: Float[Array, " c"]  # of each change; the network's is relative to the one chosen before it
-    rejected: Bool[Array, " c"]  # which would be more probable than the chosen one if the source had no errors
-    taken: Int[Array, ""]  # index of the chosen candidate
-    alone: Bool[Array, ""]  # whether physics without the network replaced the source
-    parameters: tuple[str, ...]  # names of the parameters
-    free: Bool[Array, "c p"]  # which parameters each candidate fitted
-    theta: Float[Array, "c p"]  # in the physics' own parametrisation, to first order unless chosen
-    equations: NormalEquations  # of each window at the chosen parameters
-    change: Float[Array, "c w"] | None  # of the network's weights; None without a trainable network
-    ends: Float[Array, "b 2 d"]  # errors of left-out blocks or flights, see `errors_at_ends`
-    inherited: Float[Array, "p p"]  # covariance due to errors of the parameters that the source keeps
-    degrees: Float[Array, ""]  # degrees of freedom of `inherited`
-    absorbed: Float[Array, " p"]  # variance of what the network may have absorbed, see `taken_by_network`
-    vague: Bool[Array, " p"]  # rigid bodies only: whether that is a large part of a plausible change
-    usual: Float[Array, "r 2 d"] | None = None  # the source's errors on parts of its own flights, if these are known
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ class Solution(NamedTuple):
         field: the adapted field.
         steps: number of epochs, or of evaluations of the Jacobian; 0 for a closed form.
         status: how the method ended.
-        choice: the candidates of `Auto` and the chosen one, an `auto.Choice`; None for another method.
+        choice: the candidates of `Auto` and the chosen one, a `results.Choice`; None for another method.
     """
 
     field: AbstractVectorField

@@ -4,15 +4,16 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from dataclasses import field as attribute
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax.adaptation.expectation import Expected, lines_of
 from hybrid_jax.adaptation.plausible import CANDIDATES, WORDS
 from hybrid_jax.adaptation.selection import STRONG
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.io.files import json_value
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import WARN
@@ -22,6 +23,27 @@ SHOWN = 0.01  # less probable candidates are not reported
 NOT_CONFIRMED = "errors in windows that were left out of the fit do not confirm it"
 AS_LARGE = "the source's own errors may be as large without any change"
 UNLIKE = ", as its network is unknown outside of its training range"
+
+
+class Choice(NamedTuple):
+    """The c candidates and the chosen one, with the p parameters of the extended physics, see `extended`."""
+
+    names: tuple[str, ...]  # of the candidates
+    probability: Float[Array, " c"]  # of each change; the network's is relative to the one chosen before it
+    rejected: Bool[Array, " c"]  # which would be more probable than the chosen one if the source had no errors
+    taken: Int[Array, ""]  # index of the chosen candidate
+    alone: Bool[Array, ""]  # whether physics without the network replaced the source
+    parameters: tuple[str, ...]  # names of the parameters
+    free: Bool[Array, "c p"]  # which parameters each candidate fitted
+    theta: Float[Array, "c p"]  # in the physics' own parametrisation, to first order unless chosen
+    equations: NormalEquations  # of each window at the chosen parameters
+    change: Float[Array, "c w"] | None  # of the network's weights; None without a trainable network
+    ends: Float[Array, "b 2 d"]  # errors of left-out blocks or flights, see `errors_at_ends`
+    inherited: Float[Array, "p p"]  # covariance due to errors of the parameters that the source keeps
+    degrees: Float[Array, ""]  # degrees of freedom of `inherited`
+    absorbed: Float[Array, " p"]  # variance of what the network may have absorbed, see `taken_by_network`
+    vague: Bool[Array, " p"]  # rigid bodies only: whether that is a large part of a plausible change
+    usual: Float[Array, "r 2 d"] | None = None  # the source's errors on parts of its own flights, if these are known
 
 
 @dataclass(frozen=True)
