@@ -43,7 +43,7 @@ def expected(logs: Float[np.ndarray, "n ..."], flights: int | None = None) -> Fl
 def parts_of_flights(learned_from: Trajectories | None, windows: Trajectories) -> list[slice]:
     """Return where the source's training windows follow each other for as long as `windows`, for at most `PARTS` parts.
 
-    There are none if they are longer or shorter than these, are unknown, or give too few parts for a standard error.
+    There are none if the training windows are unknown or of another length, or give fewer parts than `ENOUGH`.
     """
     n, first, parts = len(windows), 0, list[slice]()
     if learned_from is None or learned_from.horizon != windows.horizon or not np.isclose(learned_from.dt, windows.dt):
@@ -67,14 +67,13 @@ def expected_errors(
 
     `squares` are mean squared errors, NaN where a state was not measured, of whole flights if `flights` (see
     `expected`), else of blocks of one flight; `seconds` are the durations of the windows. Intervals (Hahn and Meeker,
-    Statistical Intervals, 1991, Sec. 4.7) use Student's t for the logarithm of the mean square of a flight. Errors
-    `of_source` on parts of its own flights, each as long as this flight, tell how much it varies, if it could be one of
-    them itself: in their 95 % prediction interval.
+    Statistical Intervals, 1991, Sec. 4.7) use Student's t for the logarithm of the mean square of a flight.
 
-    Otherwise the variance comes from the blocks. Squares are skewed, and a few blocks seldom contain the largest, so
-    their sample standard deviation is too small. They are taken as lognormal: the logarithm of the mean then has the
-    variance s²/b + s⁴ / (2 (b − 1)), with s² the variance of the logarithms (Cox's method; Zhou and Gao, Statistics in
-    Medicine 1997), and `ALIKE` blocks count as one.
+    Its variance is that of the source's errors on parts of its own flights, each as long as this flight (`of_source`),
+    if this flight's error is in their 95 % prediction interval. Otherwise it comes from the blocks. Squares are skewed,
+    and a few blocks seldom contain the largest, so their sample standard deviation is too small. They are taken as
+    lognormal: the logarithm of the mean then has the variance s²/b + s⁴ / (2 (b − 1)), with s² the variance of the
+    logarithms (Cox's method; Zhou and Gao, Statistics in Medicine 1997), and `ALIKE` blocks count as one.
     """
     blocks = len(squares)
     with warnings.catch_warnings(action="ignore"):  # a state that no end measures
