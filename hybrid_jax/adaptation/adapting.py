@@ -13,13 +13,12 @@ from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.anchored import has_network
 from hybrid_jax.adaptation.auto import Auto
-from hybrid_jax.adaptation.expectation import expected_errors, longest_chain
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.outliers import outliers
 from hybrid_jax.adaptation.plausible import THETA, groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
-from hybrid_jax.adaptation.results import NETWORK, Adaptation, Choice, Parameter
-from hybrid_jax.adaptation.selection import TINY, blocks_of, correlated, overlap
+from hybrid_jax.adaptation.results import Adaptation, Choice, Parameter
+from hybrid_jax.adaptation.selection import TINY, correlated, overlap
 from hybrid_jax.dynamics import disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space, trainable
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, physics_of
@@ -187,18 +186,12 @@ def _mse(errors, windows: Trajectories) -> float:
 
 
 def _chosen(choice: Choice, windows: Trajectories, space: StateSpace, flights) -> dict[str, Any]:
-    seconds, ends = windows.horizon * windows.dt, np.asarray(choice.ends)
-    chain = seconds * longest_chain(windows, blocks_of(len(windows), len(ends), flights))
-    horizons = round(seconds, 9), round(chain, 9)
-    usual = None if choice.usual is None else np.asarray(choice.usual)
-    if usual is not None and (choice.names[int(choice.taken)] == NETWORK or not np.isfinite(usual).all()):
-        usual = None  # the source's errors tell nothing of another network
     return {
         "candidates": dict(zip(choice.names, np.asarray(choice.probability).tolist(), strict=True)),
         "chosen": choice.names[int(choice.taken)],
         "physics_only": bool(choice.alone),
         "rejected": tuple(name for name, one in zip(choice.names, np.asarray(choice.rejected), strict=True) if one),
-        "expected": expected_errors(ends, horizons, space, flights is not None, usual),
+        "expected": choice.expected(windows, space, flights),
         "units": {one.name: one.unit for one in space.quantities},
     }
 

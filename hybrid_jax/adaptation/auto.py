@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation import anchored, selection
+from hybrid_jax.adaptation import anchored, evidence, selection
+from hybrid_jax.adaptation.evidence import Posterior
 from hybrid_jax.adaptation.expectation import errors_of_units, no_higher, parts_of_flights
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, extended, free_parameters, groups_of, names_of
 from hybrid_jax.adaptation.results import NETWORK, Choice
-from hybrid_jax.adaptation.selection import Fit, Posterior, Unchanged
+from hybrid_jax.adaptation.selection import Fit, Unchanged
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import Scale, ravel_parameters
 from hybrid_jax.estimation.normal_equations import masked
@@ -36,7 +37,7 @@ ROUNDS = 2  # the second linearises at the first's result: squared errors are no
 
 @dataclass(frozen=True)
 class Auto(Method):
-    """Choose the most probable of several changes; see `selection`.
+    """Choose the most probable of several changes; see `evidence`.
 
     The candidates for a rigid body are no change, new θ_p, and new θ_p with constant forces and torques, wind, drag,
     rotor efficiencies and a load, each with the aerodynamic coefficients of θ_p held or free; for other systems no
@@ -107,6 +108,10 @@ class Auto(Method):
                 (_, found, starts), fitted = _fits(larger, move, train, rows, *options), rows
                 if not traced and int(found.status) == Status.DIVERGED:
                     _, found, starts = _fits(larger, still, train, rows, *options)
+        rival, move, rows = evidence.rival(larger, every, chosen)
+        if traced or int(rival) != int(chosen.taken):
+            fits = (found, starts), _fits(larger, move, train, rows, *options)[1:]
+            (found, starts), chosen = evidence.better(larger, every, fits, chosen, rival, nothing, sizes)
         units = selection.blocks_of(len(train), self.blocks, flights)
         weights = anchored.weights_of(larger)[0].size if network else 0
 
@@ -186,7 +191,7 @@ def _judge(
     # A source may err in its force and drag; a wind, which could explain the same errors again, is not its own.
     air = np.isin(groups_of(names_of(larger)), ("wind", "updraft"))
     nothing = nothing._replace(apparent=jnp.where(air, 0.0, nothing.apparent))
-    found = selection.posterior(around, every, start, free, sizes, nothing.apparent)
+    found = evidence.posterior(around, every, start, free, sizes, nothing.apparent)
     rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
     return found, nothing, selection.without_others(every, rows[1], start).astype(sizes.dtype), rows
 
@@ -233,7 +238,7 @@ def _confirm_network(
     sure = no_higher(changed, ends, scale)
     sure = sure if source is None else sure & ~source.alone
     step = step._replace(odds=jnp.where(sure, step.odds, 0.0))
-    return step, jnp.where(step.odds > selection.STRONG, changed, ends)
+    return step, jnp.where(step.odds > evidence.STRONG, changed, ends)
 
 
 @jit_by_size(UNOPTIMISED)
@@ -256,10 +261,10 @@ def _conclude(field, larger, train: Trajectories, outcome, blocks, sizes) -> Sol
     inherited = selection.spread(found.equations, fitted, of_source)
     if step is not None:
         removed = anchored.weights_of(larger)[0] - anchored.weights_of(field)[0]  # all, if physics replaced it
-        better = step.odds > selection.STRONG
+        better = step.odds > evidence.STRONG
         change = jnp.tile(removed, (len(names) + 1, 1)).at[-1].add(step.change)
         probability = jnp.append(probability, step.odds / (1 + step.odds))
-        rejected = jnp.append(rejected, (step.naive > selection.STRONG) & ~better & ~alone)
+        rejected = jnp.append(rejected, (step.naive > evidence.STRONG) & ~better & ~alone)
         free, theta = (jnp.concatenate([each, each[taken][None]]) for each in (free, theta))
         names, taken = (*names, NETWORK), jnp.where(better, len(names), taken)
     absorbed = jnp.zeros_like(start)

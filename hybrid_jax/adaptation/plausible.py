@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -176,3 +176,14 @@ def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
             pairs = zip(names, group, strict=True)
             found[name] = np.array([each in fitted and own.split("[")[0] not in lost for own, each in pairs])
     return found
+
+
+def rivals(candidates: Sequence[str]) -> Int[np.ndarray, " c"]:
+    """Return the index of the candidate with a wind in place of each one's force, or a force in place of a wind.
+
+    It is the candidate's own if there is none. To first order the two are alike.
+    """
+    others = [one.replace("wind", "force") if "wind" in one else one.replace("force", "wind") for one in candidates]
+    return np.array(
+        [candidates.index(other if other in candidates else one) for one, other in zip(candidates, others, strict=True)]
+    )

@@ -9,14 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hybrid_jax.adaptation.expectation import Expected, lines_of
+from hybrid_jax.adaptation.evidence import STRONG
+from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of, longest_chain
 from hybrid_jax.adaptation.plausible import CANDIDATES, WORDS
-from hybrid_jax.adaptation.selection import STRONG
+from hybrid_jax.adaptation.selection import blocks_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.io.files import json_value
+from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
-from hybrid_jax.trajectories import WARN
+from hybrid_jax.trajectories import WARN, Trajectories
 
 NETWORK = "network"  # the candidate that changes the network
 SHOWN = 0.01  # less probable candidates are not reported
@@ -44,6 +46,17 @@ class Choice(NamedTuple):
     absorbed: Float[Array, " p"]  # variance of what the network may have absorbed, see `taken_by_network`
     vague: Bool[Array, " p"]  # rigid bodies only: whether that is a large part of a plausible change
     usual: Float[Array, "r 2 d"] | None = None  # the source's errors on parts of its own flights, if these are known
+
+    def expected(
+        self, windows: Trajectories, space: StateSpace, flights: Int[np.ndarray, " n"] | None = None
+    ) -> Expected:
+        """Return the errors to expect on another flight, see `expected_errors`."""
+        seconds, ends = windows.horizon * windows.dt, np.asarray(self.ends)
+        chain = seconds * longest_chain(windows, blocks_of(len(windows), len(ends), flights))
+        usual = None if self.usual is None else np.asarray(self.usual)
+        if usual is not None and (self.names[int(self.taken)] == NETWORK or not np.isfinite(usual).all()):
+            usual = None  # the source's errors tell nothing of another network
+        return expected_errors(ends, (round(seconds, 9), round(chain, 9)), space, flights is not None, usual)
 
 
 @dataclass(frozen=True)

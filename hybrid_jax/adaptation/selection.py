@@ -1,8 +1,4 @@
-"""Choose the change by Bayes factors (Kass and Raftery 1995) from a quadratic form around one fit of everything.
-
-The prior of a change is its plausible size (`Plausible`) plus the apparent change on the source's own motion, since a
-source is not exact. A change is chosen only on strong evidence.
-"""
+"""Fits of changes, the source's own errors, and left-out blocks of windows."""
 
 from typing import Any, NamedTuple
 
@@ -27,7 +23,6 @@ ENOUGH = 5  # blocks that give a standard error
 MOST = 1.0  # largest log-gain of a block that counts: more would only add to the standard error
 ALIKE = 2  # so many blocks of a flight count as one: neighbouring blocks are alike, and another flight differs more
 ERRING = 0.2  # error of a network over its effect, if its training windows are unknown
-STRONG = 20.0  # odds of a change over no change that are strong evidence (Kass and Raftery 1995)
 TINY = float(np.finfo(np.float32).tiny)
 
 
@@ -119,51 +114,6 @@ def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:
     return jax.tree.map(lambda leaf, other: jnp.asarray(leaf[places], jnp.result_type(other)), own, windows)
 
 
-class Posterior(NamedTuple):
-    """The posterior of c candidates."""
-
-    theta: Float[Array, "c p"]  # to first order
-    probability: Float[Array, " c"]  # of each change
-    naive: Float[Array, " c"]  # the same probability if the source had no errors
-    taken: Int[Array, ""]  # index of the chosen candidate
-    sizes: Float[Array, " p"]  # the prior for a fit that assumes the variance of the noise, not the dispersion
-
-
-def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array, " p"]) -> Posterior:
-    """Compare candidates by the squared errors around one fit; `sizes` and `apparent` are the prior of the changes.
-
-    A parameter with an infinite size gets the variance that one window determines as its prior.
-    """
-    variance = dispersion(every, sizes)  # what remains if everything may change
-    information = jnp.sum(around.equations.gram, axis=0) / variance
-    pull = -jnp.sum(around.at(start).score, axis=0) / variance
-    one_window = len(around.equations.score) / jnp.maximum(jnp.diagonal(information), TINY)
-    plausible = jnp.where(jnp.isfinite(sizes), jnp.square(sizes), one_window)
-
-    def of_candidate(prior: tuple[Float[Array, " p"], Float[Array, " p"]]):
-        change, wide = prior[0], prior[0] + prior[1]
-        wide, free = jnp.maximum(wide, TINY), wide > 0
-        held = jnp.where(free & free[:, None], information, 0.0) + jnp.diag(jnp.where(free, 1 / wide, 1.0))
-        # All eigenvalues are only as exact as the largest, so the matrix is scaled to a unit diagonal.
-        unit = 1 / jnp.sqrt(jnp.diagonal(held))
-        values, vectors = jnp.linalg.eigh(unit[:, None] * held * unit)
-        values = jnp.maximum(values, len(values) * jnp.finfo(values.dtype).eps)
-        along = vectors.T @ jnp.where(free, unit * pull, 0.0)
-        volume = 2 * jnp.log(unit) - jnp.where(free, jnp.log(wide), 0.0) - jnp.log(values)
-        mean = change / wide * unit * (vectors @ (along / values))
-        evidence = 0.5 * jnp.sum(jnp.square(along) / values + volume)
-        return mean, evidence
-
-    changes = jnp.where(jnp.asarray(free) & around.seen, plausible, 0.0)
-    of_source = jnp.broadcast_to(apparent, changes.shape)
-    priors = jnp.tile(changes, (2, 1)), jnp.concatenate([of_source, jnp.zeros_like(changes)])
-    move, evidence = (jnp.split(each, 2) for each in jax.lax.map(of_candidate, priors))
-    evidence, naive = (jnp.where(jnp.isfinite(each), each, -jnp.inf).at[0].max(-1e30) for each in evidence)
-    taken = jnp.where(jnp.max(evidence) > evidence[0] + np.log(STRONG), jnp.argmax(evidence), 0)
-    held = sizes * jnp.sqrt(every.noise / variance)
-    return Posterior(start + jnp.nan_to_num(move[0]), jax.nn.softmax(evidence), jax.nn.softmax(naive), taken, held)
-
-
 def spread(equations: NormalEquations, free: Bool[Array, " p"], of_source: Float[Array, "p p"]) -> Float[Array, "p p"]:
     """Propagate the covariance of the parameters that are not free to the fitted ones."""
     gram = jnp.sum(equations.gram, axis=0)
@@ -172,20 +122,6 @@ def spread(equations: NormalEquations, free: Bool[Array, " p"], of_source: Float
     effect = jnp.where(free | ~known, 0.0, fitted @ gram)
     found = effect @ jnp.where(known & known[:, None], of_source, 0.0) @ effect.T
     return found + jnp.diag(jnp.maximum(-jnp.diagonal(found), 0.0))  # rounding
-
-
-def dispersion(found: Fit, sizes) -> Float[Array, ""]:
-    """Estimate the variance of an error from the variation between blocks (Wedderburn 1974), at least the noise's."""
-    places, counted = blocks_of(len(found.equations.score), BLOCKS)
-    score = jnp.sum(found.equations.score[places] * counted[..., None], axis=1)
-    total = jnp.sum(found.equations.gram, axis=0)
-    # Scaled to unit effect; parameters that are not identifiable stay at the source.
-    prior = found.noise / jnp.square(sizes)
-    unit = 1 / jnp.sqrt(jnp.diagonal(total) + prior)
-    held = unit[:, None] * (total + jnp.diag(prior)) * unit
-    matrix = inverse(held).matrix
-    spread = jnp.einsum("bp,pq,bq->", score * unit, matrix, score * unit) * len(places) / max(len(places) - 1, 1)
-    return jnp.maximum(spread / jnp.maximum(jnp.sum(matrix * unit[:, None] * total * unit), TINY), found.noise)
 
 
 def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Trajectories) -> Float[Array, "2"]:

@@ -13,8 +13,9 @@ from pendulum import LENGTH, flown, hybrid, pendulum
 import hybrid_jax as hj
 from hybrid_jax.adaptation import FineTune, Solution, adapt, auto
 from hybrid_jax.adaptation.anchored import fit_anchored, subspace, taken_by_network, with_change
+from hybrid_jax.adaptation.evidence import STRONG
 from hybrid_jax.adaptation.plausible import CANDIDATES, extended, free_parameters
-from hybrid_jax.adaptation.selection import STRONG, blocks_of
+from hybrid_jax.adaptation.selection import blocks_of
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations
