@@ -3,13 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
 from experiments.paper import study
@@ -32,12 +31,14 @@ from hybrid_jax.adaptation.auto import Auto, candidate
 from hybrid_jax.adaptation.expectation import errors_at_ends, expected_errors
 from hybrid_jax.adaptation.methods import scale_of
 from hybrid_jax.adaptation.plausible import extended
-from hybrid_jax.adaptation.selection import BLOCKS, alike, blocks_of, fit_each
+from hybrid_jax.adaptation.results import Choice
+from hybrid_jax.adaptation.selection import BLOCKS, blocks_of, fit_each
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.metrics import window_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
+from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import STATE_SIZE
@@ -96,22 +97,24 @@ def adapted(world: World, change: str, known: Sources, config: ChangesConfig, st
     """Return the rows of a change: every candidate, and the methods to compare with, for every draw and seed."""
     target = dataset(world, change, target_splits(config), config, stages)
     pool, test, drawn = target.splits["train"], target.splits["test"], windows_of(METHOD, config.sizes[0], config)[0]
+    flights, shared = pool[drawn[:: config.seeds]], settings(config)
 
-    flights, seeds = pool[drawn[:: config.seeds]], range(config.seeds)
-    shared, learned = settings(config), alike(known.windows, pool[drawn[0]])
+    def of_seed(draw: int, seed: int) -> list[Row]:
+        field, windows = lane(known.fields, seed), pool[drawn[draw * config.seeds + seed]]
+        choice = METHOD.solve(field, windows, windows, shared, known.windows).choice
+        tested = jax.device_get(_candidates(field, choice, windows, flights, test, shared))
+        inside = _share_inside(choice, windows, np.delete(tested.flown, draw, 0))
+        rows = []
+        for i, name in enumerate(choice.names):
+            taken = i == int(choice.taken)
+            tags = {"domain": change, "candidate": name, "draw": draw, "seed": seed, "taken": taken}
+            numbers = dict(zip(ERRORS, tested.errors[i], strict=True))
+            probability = float(choice.probability[i])
+            rows.append(tags | numbers | {"probability": probability, INSIDE: inside if taken else None})
+        return rows
 
     def of_draw(draw: int) -> Found:
-        own = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
-        found = jax.device_get(_candidates(known.fields, own, flights, test, shared, learned))
-        inside = [_share_inside(found.ends[seed], np.delete(found.flown[seed], draw, 0)) for seed in seeds]
-
-        def row(seed: int, i: int) -> Row:
-            taken = bool(found.taken[seed] == i)
-            tags = {"domain": change, "candidate": found.names[i], "draw": draw, "seed": seed, "taken": taken}
-            numbers = dict(zip(ERRORS, found.errors[seed, i], strict=True))
-            return tags | numbers | {"probability": found.probability[seed, i], INSIDE: inside[seed] if taken else None}
-
-        return [row(seed, i) for seed in seeds for i in range(len(found.names))], {}
+        return [row for seed in range(config.seeds) for row in of_seed(draw, seed)], {}
 
     jobs = {f"flight {draw}": partial(of_draw, draw) for draw in range(config.draws)}
     found = stages.kept(f"adapt {target.config['domain']}", jobs, identity_of(config.described(), known.fields, target))
@@ -136,50 +139,37 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
     return rows
 
 
-class Tested(eqx.Module):
-    """Of each seed: the candidates' `ERRORS`, and the `BlockErrors` of left-out blocks and of each flight."""
+class Tested(NamedTuple):
+    """The `ERRORS` of c candidates, and the `errors_at_ends` of the adapted model on each of f flights."""
 
-    names: tuple[str, ...] = eqx.field(static=True)
-    probability: Array
-    errors: Array
-    taken: Array
-    ends: Array
-    flown: Array
+    errors: Float[Array, "c 2"]
+    flown: Float[Array, "f 2 d"]
 
 
 @jit_with(FAST_COMPILE)
 def _candidates(
-    fields: Any, windows: Trajectories, flights: Trajectories, test: Trajectories, shared: Settings, known: Trajectories
-):
-    places = blocks_of(windows.x0.shape[1], BLOCKS)
+    field: AbstractVectorField,
+    choice: Choice,
+    windows: Trajectories,
+    flights: Trajectories,
+    test: Trajectories,
+    shared: Settings,
+) -> Tested:
+    larger, places = extended(field, STATE_SIZE), blocks_of(len(windows), BLOCKS)
+    # Of candidates that were not taken `choice` knows the parameters to first order alone.
+    options = METHOD.plausible.sizes(larger, windows), shared.solver, scale_of(shared.objective)
+    fits, _ = fit_each(candidate(larger, choice, 0), windows, choice.free, *options, METHOD.max_steps)
+    choice = choice._replace(theta=fits.theta)
+    adapted = candidate(larger, choice, choice.taken)
 
-    def one(run) -> Tested:
-        field, windows = run
-        choice = METHOD.solve(field, windows, windows, shared, known).choice
-        larger = extended(field, STATE_SIZE)
-        # Of candidates that were not taken `choice` knows the parameters to first order alone.
-        options = METHOD.plausible.sizes(larger, windows), shared.solver, scale_of(shared.objective)
-        fits, _ = fit_each(candidate(larger, choice, 0), windows, choice.free, *options, METHOD.max_steps)
-        choice = choice._replace(theta=fits.theta)
+    def error(index):
+        return _both_errors(candidate(larger, choice, index), test, shared)
 
-        def error(index):
-            return _both_errors(candidate(larger, choice, index), test, shared)
-
-        adapted = candidate(larger, choice, choice.taken)
-        return Tested(
-            choice.names,
-            probability=choice.probability,
-            errors=jax.lax.map(error, jnp.arange(len(choice.names))),
-            taken=choice.taken,
-            ends=choice.ends,
-            flown=jax.lax.map(partial(of_flight, adapted), flights),
-        )
-
-    def of_flight(field, flight):
+    def of_flight(flight):
         blocks = jax.tree.map(lambda leaf: leaf[places[0]], flight), jnp.asarray(places[1])
-        return jnp.mean(jax.lax.map(lambda b: errors_at_ends(field, b[0], b[1], shared.solver), blocks), axis=0)
+        return jnp.mean(jax.lax.map(lambda b: errors_at_ends(adapted, b[0], b[1], shared.solver), blocks), axis=0)
 
-    return jax.lax.map(one, (fields, windows))
+    return Tested(jax.lax.map(error, jnp.arange(len(choice.names))), jax.lax.map(of_flight, flights))
 
 
 @jit_with(FAST_COMPILE)
@@ -191,14 +181,12 @@ def _both_errors(field: AbstractVectorField, test: Trajectories, shared: Setting
     return jnp.stack([jnp.mean(window_mse(field, test, EVERY, shared.solver, scale)) for scale in SCALES])
 
 
-def _share_inside(ends: np.ndarray, flown: np.ndarray) -> float | None:
+def _share_inside(choice: Choice, windows: Trajectories, flown: np.ndarray) -> float | None:
     """Return the share of other flights' errors inside the 80 % interval; None without flights."""
-    options = (1.0, 2.0), RIGID_BODY_SPACE  # names of the horizons, which do not matter
-    expected = expected_errors(ends, *options).values()
-    inside = []
+    expected, inside = choice.expected(windows, RIGID_BODY_SPACE), []
     for of_flight in flown:
-        truth = expected_errors(of_flight[None], *options).values()
-        for known, own in zip(expected, truth, strict=True):
+        truth = expected_errors(of_flight[None], (1.0, 2.0), RIGID_BODY_SPACE)  # names of horizons do not matter
+        for known, own in zip(expected.values(), truth.values(), strict=True):
             inside += [low <= own[name][0] <= high for name, (_, low, high) in known.items()]
     return float(np.mean(inside)) if inside else None
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -48,6 +48,7 @@ class CoverageConfig(OneFlight):
     """Number of sources to pool."""
     draws: Count = 100
     """Number of flights; each source adapts to one at a time."""
+    noise_on: Literal["all", "target"] = "target"
     clean: bool = True
     """Also adapt to the same flights without noise."""
     changes: Several[Change] = RIGHT
@@ -59,7 +60,7 @@ class CoverageConfig(OneFlight):
             raise ValueError(f"--seeds must be at least {SOURCES}, got {self.seeds}")
 
 
-SHORT: dict[str, Any] = ONE_FLIGHT | {"seeds": SOURCES}
+SHORT: dict[str, Any] = ONE_FLIGHT | {"seeds": SOURCES, "noise_on": "target"}
 PRESETS = {
     "paper": CoverageConfig(),
     "quick": preset_like(CoverageConfig, replace(QUICK, **SHORT, draws=20)),

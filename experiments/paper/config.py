@@ -214,8 +214,6 @@ class OneFlight(Config):
     """own: only the N target trajectories. Or the number of validation trajectories, as in the source."""
     noise: float = 1.0
     """White noise on the states of all flights but the test flights; 1 is typical of motion capture and a gyroscope."""
-    noise_on: Literal["all", "target"] = "target"
-    """Flights with noise. all: before and after the change. target: only after it."""
     changes: Several[Change] = CHANGED
     """Changes of the vehicle."""
     source_training: Annotated[Training, options.Named(name="pretraining")] = "physics_first"
@@ -231,7 +229,7 @@ class OneFlight(Config):
 
 
 # The same for every preset of these experiments.
-ONE_FLIGHT: dict[str, Any] = {"noise": 1.0, "noise_on": "target", "draw": "contiguous", "validation": "own"}
+ONE_FLIGHT: dict[str, Any] = {"noise": 1.0, "draw": "contiguous", "validation": "own"}
 
 
 def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:

@@ -15,12 +15,11 @@ from experiments.worlds.flights import in_each_world
 
 NAME = "worlds"
 TAGS = "world", "change", "flight", "draw", "seed", "method"
-NOISY: dict[str, Any] = ONE_FLIGHT | {"noise_on": "all"}
 PRESETS = {
-    "paper": WorldsConfig(seeds=3, draws=3, noise_on="all"),
+    "paper": WorldsConfig(seeds=3, draws=3),
     "quick": preset_like(
         WorldsConfig,
-        replace(BOTH_ENDS, **NOISY, seeds=1, draws=4),
+        replace(BOTH_ENDS, **ONE_FLIGHT, seeds=1, draws=4),
         worlds=("iris", "hummingbird"),
         changes=("nothing", "motor_lag", "battery", "reaction_torque", "external_force", "parameter_shift"),
         learn_from=("moving", "hover", "near_ground", "outliers"),
@@ -28,7 +27,7 @@ PRESETS = {
     ),
     "smoke": preset_like(
         WorldsConfig,
-        replace(SMOKE, **NOISY),
+        replace(SMOKE, **ONE_FLIGHT),
         worlds=("hummingbird",),
         changes=("nothing",),
         learn_from=("short",),
