@@ -1,10 +1,13 @@
-"""Laws of `adapt`: one call and one result for every system and method."""
+"""Laws of `adapt`: one call and one result for every system and method; and of its memory."""
 
 import inspect
 import json
 import textwrap
+import time
+import warnings
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -12,11 +15,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
-from pendulum import LENGTH, flown, hybrid, pendulum, swings
+from pendulum import LENGTH, Pendulum, flown, hybrid, pendulum, swings
+from smoke import script
 from surface import refusal
 
 import hybrid_jax as hj
-from hybrid_jax import METHODS, AbstractVectorField, Adaptation, FineTune, LeastSquares, Method, Solution, adapt
+from hybrid_jax import (
+    METHODS,
+    AbstractVectorField,
+    Adaptation,
+    FineTune,
+    LeastSquares,
+    Method,
+    Solution,
+    adapt,
+    runtime,
+)
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, physics_of
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.status import Status
@@ -179,3 +193,42 @@ def test_bad_input_is_refused_in_one_line(field, options, said):
     with pytest.raises(ValueError, match=said) as caught:
         adapt(field, swings(40), **options)
     assert "\n" not in str(caught.value)
+
+
+PATHS = "import sys; sys.path[:0] = ['tests', 'tests/adaptation']"
+
+
+def adapted(method, sizes):
+    """Memory [MiB] and processor time [s] after each adaptation."""
+    warnings.simplefilter("ignore")
+    jax.config.update("jax_enable_compilation_cache", False)  # the compiler takes 150 MiB where it is first needed
+    network = hj.residual_network(2, 1, jax.random.key(0), hidden=4, norm="none", activation="tanh")
+    field, flights = hj.Hybrid(Pendulum(jnp.float32(0.0)), network), swings(max(sizes))
+    flights = jax.tree.map(np.asarray, flights)
+    for size in sizes:
+        began = time.process_time()
+        hj.adapt(field, flights[:size], method=method)
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        print(pages / 256, time.process_time() - began)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from Linux's /proc")
+@pytest.mark.parametrize(("method", "sizes"), [("auto", "[40] * 500"), ("least_squares", "range(40, 90)")])
+def test_memory_and_time_stay_where_they_are(method, sizes):
+    """Every size of data has programs of its own, which took 46 MiB for ever."""
+    code = f"{PATHS}; from test_adapt import adapted; adapted({method!r}, {sizes})"
+    memory, seconds = np.array([list(map(float, line.split())) for line in script("-c", code).splitlines()]).T
+    assert memory[-1] - memory[1] < 100
+    if sizes.startswith("["):
+        assert memory[99] < 1.05 * memory[1]
+        assert np.median(seconds[90:110]) < 1.5 * np.median(seconds[1:11])
+
+
+def test_programs_of_a_third_size_replace_the_others():
+    made = []
+    program = runtime.jit_by_size()(lambda x: made.append(x.shape) or x)
+    for size in (1, 2, 1, 2, 3, 3, 1):
+        runtime.keep_programs("test", size)
+        program(jnp.zeros(size))
+    assert made == [(1,), (2,), (3,), (1,)]

@@ -1,4 +1,4 @@
-"""Laws of the covariance of θ_p, against closed forms, and of its intervals, against simulation."""
+"""Laws of the covariance of θ_p, against closed forms, of its intervals, against simulation, and of what both need."""
 
 from functools import partial
 
@@ -13,11 +13,15 @@ from pendulum import Push, pendulum, pushes, swings
 import hybrid_jax as hj
 from experiments.paper.conditions import measure, sensor_noise
 from hybrid_jax import IRIS, AbstractVectorField, Hybrid, fit_least_squares, rigid_body, with_disturbance
-from hybrid_jax.estimation.normal_equations import equations_of
+from hybrid_jax.batches import in_chunks, solve
+from hybrid_jax.estimation.normal_equations import equations_of, inverses
 from hybrid_jax.estimation.uncertainty import sandwich, sandwich_with_prior
 from hybrid_jax.rotation import normalise
 from hybrid_jax.status import Status
 from hybrid_jax.vehicle import QUATERNION
+
+ROOTS = np.random.default_rng(0).normal(size=(4, 3, 3)).astype(np.float32)
+POSITIVE, RIGHT = ROOTS @ ROOTS.swapaxes(1, 2) + np.eye(3, dtype=np.float32), np.ones((4, 3, 2), np.float32)
 
 
 def closed_form(windows, design, gains):
@@ -168,3 +172,43 @@ def test_intervals_cover_the_truth_of_exact_physics(measured):
     # A half-width is 1.96 standard errors; the mean of 100 fits is within four of its own: there is no bias.
     error = (high - low).mean(axis=1) / (2 * Z * np.sqrt(REPEATS))
     assert (np.abs(value.mean(axis=1) - 1) < 4 * error).all()
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "expected"),
+    [
+        (jax.vmap(solve), (POSITIVE, RIGHT), np.linalg.solve(POSITIVE, RIGHT)),
+        (lambda grams: inverses(grams).matrix, (POSITIVE,), np.linalg.inv(POSITIVE)),
+    ],
+)
+def test_no_batch_is_factored_at_once(function, arguments, expected):
+    np.testing.assert_allclose(function(*arguments), expected, atol=1e-4)
+    calls = [line for line in jax.jit(function).lower(*arguments).as_text().splitlines() if "lapack" in line]
+    assert calls
+    assert not any("4x3x3" in line for line in calls), calls
+
+
+def test_a_derivative_goes_through_an_inverse():
+    slope = jax.grad(lambda scale: jnp.sum(inverses(scale * POSITIVE).matrix))(2.0)
+    np.testing.assert_allclose(slope, -np.linalg.inv(POSITIVE).sum() / 4, rtol=1e-4)
+
+
+def norms(values):
+    return {"norm": jnp.linalg.norm(values, axis=1), "cube": values**3}
+
+
+@pytest.mark.parametrize("size", [1, 4, 5, 7, 9])
+def test_results_do_not_depend_on_the_size_of_chunks(size):
+    values = np.random.default_rng(0).normal(size=(7, 2)).astype(np.float32)
+    found = in_chunks(norms, values, size)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), found, norms(values))
+
+
+@pytest.mark.parametrize("distinct", [1, 3, 7])
+def test_values_that_repeat_are_evaluated_once(distinct):
+    """What follows the first chunks is never looked at."""
+    values = np.random.default_rng(0).normal(size=(distinct, 2)).astype(np.float32)
+    repeated = values[np.arange(7) % distinct]
+    poisoned = np.where(np.arange(7)[:, None] < -(-distinct // 3) * 3, repeated, np.nan)
+    found = jax.jit(lambda many: in_chunks(norms, poisoned, 3, many))(jnp.array(distinct))
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), found, norms(repeated))
