@@ -109,8 +109,8 @@ def adapted(world: World, change: str, known: Sources, config: ChangesConfig, st
             taken = i == int(choice.taken)
             tags = {"domain": change, "candidate": name, "draw": draw, "seed": seed, "taken": taken}
             numbers = dict(zip(ERRORS, tested.errors[i], strict=True))
-            probability = float(choice.probability[i])
-            rows.append(tags | numbers | {"probability": probability, INSIDE: inside if taken else None})
+            numbers |= {"probability": tested.probability[i], INSIDE: inside if taken else None}
+            rows.append(tags | numbers)
         return rows
 
     def of_draw(draw: int) -> Found:
@@ -142,6 +142,7 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
 class Tested(NamedTuple):
     """The `ERRORS` of c candidates, and the `errors_at_ends` of the adapted model on each of f flights."""
 
+    probability: Float[Array, " c"]
     errors: Float[Array, "c 2"]
     flown: Float[Array, "f 2 d"]
 
@@ -169,7 +170,8 @@ def _candidates(
         blocks = jax.tree.map(lambda leaf: leaf[places[0]], flight), jnp.asarray(places[1])
         return jnp.mean(jax.lax.map(lambda b: errors_at_ends(adapted, b[0], b[1], shared.solver), blocks), axis=0)
 
-    return Tested(jax.lax.map(error, jnp.arange(len(choice.names))), jax.lax.map(of_flight, flights))
+    errors = jax.lax.map(error, jnp.arange(len(choice.names)))
+    return Tested(choice.probability, errors, jax.lax.map(of_flight, flights))
 
 
 @jit_with(FAST_COMPILE)

@@ -205,9 +205,8 @@ def measured(dataset: Dataset, level: float, seed: int) -> Dataset:
             start_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode())))
             x0 = np.array(measure(jnp.asarray(windows.x0), noise, start_key))
             x = np.asarray(measure(jnp.asarray(windows.x), noise, key))
-            if dataset.config.get("splits", {}).get(name, {}).get("flights"):
-                # Windows that touch share the sample between them.
-                touching = 1 + np.flatnonzero((windows.x0[1:] == windows.x[:-1, -1]).all(axis=1))
-                x0[touching] = x[touching - 1, -1]
+            # Windows that touch share the sample between them.
+            touching = 1 + np.flatnonzero((windows.x0[1:] == windows.x[:-1, -1]).all(axis=1))
+            x0[touching] = x[touching - 1, -1]
             splits[name] = Trajectories(x0, windows.u, x, windows.dt)
     return Dataset(splits, {**dataset.metadata, "noise": level})

@@ -199,8 +199,7 @@ def test_noise_has_its_size_spares_the_test_split_and_is_one_for_both_windows_th
     windows = placeholder(SplitSpec(6, 10, flights=2))
     chained = replace(windows, x=windows.x + np.arange(6)[:, None, None], x0=windows.x0 - 1)
     chained.x0[[1, 2, 4, 5]] = chained.x[[0, 1, 3, 4], -1]
-    data = Dataset({"train": chained}, {"config": {"splits": {"train": {"flights": 2}}}})
-    noisy = measured(data, 1.0, 0).splits["train"]
+    noisy = measured(Dataset({"train": chained}, {}), 1.0, 0).splits["train"]
     np.testing.assert_array_equal(noisy.x0[[1, 2, 4, 5]], noisy.x[[0, 1, 3, 4], -1])
     assert (noisy.x0[[0, 3], :3] != chained.x0[[0, 3], :3]).all()
 
