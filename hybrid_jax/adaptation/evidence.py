@@ -19,6 +19,7 @@ from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 
 STRONG = 20.0  # odds of a change over no change that are strong evidence (Kass and Raftery 1995)
+FAR = 3.0  # plausible sizes: a larger change imitates something else
 
 
 class Posterior(NamedTuple):
@@ -60,7 +61,10 @@ def rival(larger, every: Fit, chosen: Posterior) -> tuple[Int[Array, ""], Float[
 def better(
     larger, every: Fit, fits: tuple, chosen: Posterior, other: Int[Array, ""], nothing: Unchanged, sizes
 ) -> tuple[Any, Posterior]:
-    """Return the more probable of the chosen change and another, with the errors around the fit of each."""
+    """Return the more probable of the chosen change and another, with the errors around the fit of each.
+
+    The other must be plausible (`FAR`): with updrafts, a storm can imitate a force.
+    """
     start, free = ravel_parameters(larger)[0], jnp.stack([*free_parameters(larger).values()])
     pair, variance = jnp.stack([chosen.taken, other]), dispersion(every, sizes)
 
@@ -70,6 +74,8 @@ def better(
         return jnp.where(jnp.isfinite(total), total, -1e30)
 
     odds = jax.nn.softmax(jnp.stack([log_evidence(fit[0], free[i]) for fit, i in zip(fits, pair, strict=True)]))
+    plausible = jnp.all(jnp.abs(fits[1][0].theta - start) <= FAR * sizes)
+    odds = jnp.where(plausible, odds, jnp.array([1.0, 0.0]))
 
     def divided(both: Float[Array, " c"]) -> Float[Array, " c"]:
         return jnp.where(other == chosen.taken, both, both.at[pair].set(jnp.sum(both[pair]) * odds))

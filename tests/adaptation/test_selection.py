@@ -64,23 +64,23 @@ def test_a_change_is_believed_if_the_evidence_is_strong_and_the_source_does_not_
     assert erring.naive[1] > STRONG * erring.naive[0]  # it would be believed of an exact source
 
 
-@pytest.mark.parametrize(("square", "wins"), [(1.0, True), (3.0, False), (np.nan, False)])
-def test_a_wind_replaces_the_force_that_it_was_mistaken_for_if_its_own_fit_is_better(square, wins):
+@pytest.mark.parametrize(("square", "moved"), [(1.0, 2.9), (3.0, 0.0), (np.nan, 0.0), (1.0, 3.1)])
+def test_a_wind_replaces_the_force_that_it_was_mistaken_for_if_its_own_fit_is_better_and_plausible(square, moved):
     larger = extended(hj.rigid_body(hj.IRIS, terms=Terms(drag=(0.5, 0.4, 0.2))), 13)
     candidates, start = [*free_parameters(larger)], ravel_parameters(larger)[0]
     force, wind, p = candidates.index("force"), candidates.index("wind"), len(start)
     assert rivals(candidates)[[force, wind, 0]].tolist() == [wind, force, 0]
     equations = NormalEquations(jnp.zeros((10, p, p)), jnp.zeros((10, p)), jnp.full(10, 2.0))
     fit = Fit(start, equations, jnp.ones(()), jnp.ones(p, bool), 1, 0)
-    other = fit._replace(equations=equations._replace(square=jnp.full(10, square)))
+    other = fit._replace(theta=start + moved, equations=equations._replace(square=jnp.full(10, square)))
     equal = jnp.full(len(candidates), 1 / len(candidates))
     chosen = Posterior(start, equal, equal, jnp.array(force), jnp.ones(p))
     given = chosen, jnp.array(wind), Unchanged(jnp.zeros(p), jnp.zeros(())), jnp.ones(p)
     (found,), now = better(larger, fit, ((fit,), (other,)), *given)
-    assert (now.taken, found.equations.square[0]) == ((wind, square) if wins else (force, 2.0))
+    assert (now.taken, found.equations.square[0]) == ((wind, 1.0) if moved == 2.9 else (force, 2.0))
     np.testing.assert_allclose(now.probability.sum(), 1, rtol=1e-5)
     odds = now.probability[wind] / now.probability[force]
-    np.testing.assert_allclose(odds, np.nan_to_num(np.exp(5 * (2 - square))), rtol=1e-4)
+    np.testing.assert_allclose(odds, np.nan_to_num(np.exp(5 * (2 - square))) * (moved < 3), rtol=1e-4)
 
 
 def test_left_out_blocks_confirm_a_change_of_all_and_not_of_two():
