@@ -192,8 +192,7 @@ def _judge(
     air = np.isin(groups_of(names_of(larger)), ("wind", "updraft"))
     nothing = nothing._replace(apparent=jnp.where(air, 0.0, nothing.apparent))
     found = evidence.posterior(around, every, start, free, sizes, nothing.apparent)
-    rows = jnp.stack([jnp.zeros(len(start), bool), jnp.asarray(free)[found.taken]])
-    return found, nothing, selection.without_others(every, rows[1], start).astype(sizes.dtype), rows
+    return found, nothing, *evidence.to_fit(larger, every, found.taken)
 
 
 @jit_by_size(UNOPTIMISED)

@@ -19,7 +19,7 @@ from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.runtime import UNOPTIMISED, jit_by_size
 
 STRONG = 20.0  # odds of a change over no change that are strong evidence (Kass and Raftery 1995)
-FAR = 3.0  # plausible sizes: a larger change imitates something else
+FAR = 3.0  # times its plausible size: a parameter that changes by more probably imitates another change
 
 
 class Posterior(NamedTuple):
@@ -47,14 +47,18 @@ def posterior(around: Fit, every: Fit, start, free, sizes, apparent: Float[Array
 
 @jit_by_size(UNOPTIMISED)
 def rival(larger, every: Fit, chosen: Posterior) -> tuple[Int[Array, ""], Float[Array, " p"], Bool[Array, "2 p"]]:
-    """Return the change that the chosen one may be mistaken for, see `rivals`, where to begin its fit, and what to fit.
+    """Return the change that the chosen one may be mistaken for, see `rivals`, and what `to_fit`.
 
     A wind acts almost like a force near the fit that all changes are compared around, but not far from it.
     """
-    start, (names, free) = ravel_parameters(larger)[0], zip(*free_parameters(larger).items(), strict=True)
-    other = jnp.asarray(rivals(names))[chosen.taken]
-    rows = jnp.stack([jnp.zeros(len(start), bool), jnp.stack(free)[other]])
-    return other, without_others(every, rows[1], start).astype(start.dtype), rows
+    other = jnp.asarray(rivals([*free_parameters(larger)]))[chosen.taken]
+    return other, *to_fit(larger, every, other)
+
+
+def to_fit(larger, every: Fit, index: Int[Array, ""]) -> tuple[Float[Array, " p"], Bool[Array, "2 p"]]:
+    """Return by how much to move the parameters before a candidate is fitted, and which are free: none, and its own."""
+    start, free = ravel_parameters(larger)[0], jnp.stack([*free_parameters(larger).values()])[index]
+    return without_others(every, free, start).astype(start.dtype), jnp.stack([jnp.zeros_like(free), free])
 
 
 @jit_by_size(UNOPTIMISED)

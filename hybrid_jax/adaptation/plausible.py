@@ -183,7 +183,7 @@ def rivals(candidates: Sequence[str]) -> Int[np.ndarray, " c"]:
 
     It is the candidate's own if there is none. To first order the two are alike.
     """
-    others = [one.replace("wind", "force") if "wind" in one else one.replace("force", "wind") for one in candidates]
-    return np.array(
-        [candidates.index(other if other in candidates else one) for one, other in zip(candidates, others, strict=True)]
-    )
+    swapped = {
+        one: one.replace("wind", "force") if "wind" in one else one.replace("force", "wind") for one in candidates
+    }
+    return np.array([candidates.index(other if other in candidates else one) for one, other in swapped.items()])
