@@ -25,7 +25,7 @@ from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of,
 from hybrid_jax.dynamics.rigid_body import uncorrected
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import NAMED, compare_steps
-from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, sandwich
+from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
@@ -41,7 +41,6 @@ FEWEST = 10  # windows without outliers that are enough; with fewer, all windows
 HELD_OUT = 5  # the last of so many equal parts of the windows is held out for validation
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; check dt and all units"
-NOT_FITTED = "no parameter was fitted"
 NO_MOTION = "field: its training windows are unknown, so its network may err by 20% of its effect; pass learned_from="
 FEW = "windows: {} are too few to determine {} parameters; undetermined parameters keep the source's values"
 BY_NETWORK = "the network's effect is comparable to that of a plausible change; hj.pool of several sources helps"
@@ -239,14 +238,11 @@ def _parameters(
     units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
     before = values_of(source, d)
     found = {name: Parameter(one, unit=units[name], before=before.get(name, np.nan)) for name, one in values.items()}
-    free, absorbed, vague = np.ones(len(values), bool), np.zeros(len(values)), np.zeros(len(values), bool)
+    free, (kept, vague), absorbed = np.ones(len(values), bool), np.zeros((2, len(values)), bool), np.zeros(len(values))
     if choice is not None:
         places = [choice.parameters.index(name) for name in values]
         free = np.asarray(choice.free)[choice.taken][places]
-        absorbed = np.where(free, np.asarray(choice.absorbed)[places], 0.0)
-        vague = np.asarray(choice.vague)[places]
-    if without is None and not free.any():
-        without = NOT_FITTED
+        kept, absorbed, vague = (np.asarray(one)[places] for one in (choice.kept, choice.absorbed, choice.vague))
     if without is None and len(windows) <= free.sum():
         without = FEW.format(len(windows), free.sum())
     if without is not None:
@@ -258,9 +254,7 @@ def _parameters(
         covariance = np.asarray(covariance_of(field, windows, solver=settings.solver, scale=scale, cluster=cluster))
         inherited, of_source = np.zeros_like(covariance), np.inf
     else:
-        unseen = free & (np.asarray(choice.equations.score) == 0).all(axis=0)[places]
-        covariance = np.asarray(sandwich(choice.equations, int(free.sum()), cluster))[np.ix_(places, places)]
-        covariance = covariance + np.diag(np.where(unseen, np.inf, 0.0))
+        covariance = choice.covariance(cluster)[np.ix_(places, places)]
         inherited, of_source = np.asarray(choice.inherited)[np.ix_(places, places)], float(choice.degrees)
     # `absorbed` is not estimated from a sample of errors, so its degrees are infinite (GUM, G.4.3).
     parts = np.stack([np.diag(covariance), np.diag(inherited), absorbed])
@@ -275,10 +269,10 @@ def _parameters(
     scaled, moved = "efficiency" in np.array(groups)[free], dict[str, float]()
     for i, name in enumerate(values):
         value, low, high = jax.device_get(tuple(bounds[name]))
-        if free[i]:
+        if free[i] or kept[i]:
             _, *ends = jax.device_get(tuple(apart[name]))
             least, most = (float(end - before[name]) for end in ends)
-            if not least <= 0 <= most:
+            if free[i] and not least <= 0 <= most:
                 moved[name] = float(abs(value - before[name]) / max(most - least, TINY))
             reason = BY_NETWORK if vague[i] else BY_ROTORS if scaled and groups[i] in THETA else None
             bound = {"effective": reason} if reason else {"low": float(low), "high": float(high)}

@@ -16,7 +16,7 @@ from hybrid_jax.adaptation import anchored, evidence, selection
 from hybrid_jax.adaptation.evidence import Posterior
 from hybrid_jax.adaptation.expectation import errors_of_units, no_higher, parts_of_flights
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
-from hybrid_jax.adaptation.plausible import Plausible, extended, free_parameters, groups_of, names_of
+from hybrid_jax.adaptation.plausible import Plausible, extended, free_parameters, groups_of, kept_parameters, names_of
 from hybrid_jax.adaptation.results import NETWORK, Choice
 from hybrid_jax.adaptation.selection import Fit, Unchanged
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -250,7 +250,7 @@ def _conclude(field, larger, train: Trajectories, outcome, blocks, sizes) -> Sol
     theta = chosen.theta.at[taken].set(found.theta)
     probability, rejected = chosen.probability, chosen.naive > chosen.naive[taken]
     fitted = free[taken] & found.seen
-    equations = masked(found.equations, fitted)
+    kept = jnp.asarray(kept_parameters(larger))[taken]
     alone, of_source, degrees = jnp.array(False), jnp.diag(nothing.apparent), jnp.inf
     if source is not None:
         own, alone, distinct = source
@@ -258,6 +258,7 @@ def _conclude(field, larger, train: Trajectories, outcome, blocks, sizes) -> Sol
         of_source = jnp.where(alone, refitted, of_source)
         degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
     inherited = selection.spread(found.equations, fitted, of_source)
+    inherited = inherited + jnp.diag(jnp.where(kept, jnp.diagonal(of_source), 0.0))
     if step is not None:
         removed = anchored.weights_of(larger)[0] - anchored.weights_of(field)[0]  # all, if physics replaced it
         better = step.odds > evidence.STRONG
@@ -268,12 +269,16 @@ def _conclude(field, larger, train: Trajectories, outcome, blocks, sizes) -> Sol
         names, taken = (*names, NETWORK), jnp.where(better, len(names), taken)
     absorbed = jnp.zeros_like(start)
     if score is not None:
-        taken_over = anchored.taken_by_network(equations, jnp.where(fitted, score, 0.0), blocks)
-        absorbed = jnp.where(alone, absorbed, taken_over)
+
+        def taken_over(free: Bool[Array, " p"]) -> Float[Array, " p"]:
+            return anchored.taken_by_network(masked(found.equations, free), jnp.where(free, score, 0.0), blocks)
+
+        of_fitted, of_kept = jax.lax.map(taken_over, jnp.stack([fitted, fitted | kept & found.seen]))
+        absorbed = jnp.where(~alone, jnp.where(kept, of_kept, of_fitted), absorbed)
     # Only rigid bodies: other systems' sizes are relative to the source's value and depend on the parametrisation.
     vague = jnp.sqrt(absorbed) > VAGUE * (sizes if "drag" in groups_of(names_of(larger)) else jnp.inf)
-    first = names, probability, rejected, taken, alone, (*names_of(larger),), free, theta, equations, change, ends
-    choice = Choice(*first, inherited, jnp.asarray(degrees), absorbed, vague)
+    first = names, probability, rejected, taken, alone, (*names_of(larger),), free, kept, theta
+    choice = Choice(*first, found.equations, change, ends, inherited, jnp.asarray(degrees), absorbed, vague)
     adapted = candidate(extended(field, train.x0.shape[1]), choice, taken)
     status = jnp.where(jnp.any(found.seen), found.status, Status.STALLED)  # no parameter has an effect
     finite = (status == Status.OK) | ~jnp.isinf(ends).any()

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -176,6 +176,15 @@ def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
             pairs = zip(names, group, strict=True)
             found[name] = np.array([each in fitted and own.split("[")[0] not in lost for own, each in pairs])
     return found
+
+
+def kept_parameters(field: AbstractVectorField) -> Bool[np.ndarray, "c p"]:
+    """Return which of θ_p each candidate keeps though it could be fitted; see `free_parameters`."""
+    names = names_of(field)
+    theta = np.isin(groups_of(names), THETA)
+    lost = [{other for each in CANDIDATES[one] for other in CONFOUNDED.get(each, ())} for one in free_parameters(field)]
+    confounded = np.array([[name.split("[")[0] in own for name in names] for own in lost])
+    return theta & ~confounded & ~np.stack([*free_parameters(field).values()])
 
 
 def rivals(candidates: Sequence[str]) -> Int[np.ndarray, " c"]:

@@ -12,9 +12,10 @@ from jaxtyping import Array, Bool, Float, Int
 from hybrid_jax.adaptation.evidence import STRONG
 from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of, longest_chain
 from hybrid_jax.adaptation.plausible import CANDIDATES, WORDS
-from hybrid_jax.adaptation.selection import blocks_of
+from hybrid_jax.adaptation.selection import blocks_of, variance_if_free
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.estimation.normal_equations import NormalEquations
+from hybrid_jax.estimation.normal_equations import NormalEquations, masked
+from hybrid_jax.estimation.uncertainty import sandwich
 from hybrid_jax.io.files import json_value
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
@@ -37,8 +38,9 @@ class Choice(NamedTuple):
     alone: Bool[Array, ""]  # whether physics without the network replaced the source
     parameters: tuple[str, ...]  # names of the parameters
     free: Bool[Array, "c p"]  # which parameters each candidate fitted
+    kept: Bool[Array, " p"]  # which of θ_p the chosen one kept, see `kept_parameters`
     theta: Float[Array, "c p"]  # in the physics' own parametrisation, to first order unless chosen
-    equations: NormalEquations  # of each window at the chosen parameters
+    equations: NormalEquations  # of each window, for all parameters, at the chosen ones
     change: Float[Array, "c w"] | None  # of the network's weights; None without a trainable network
     ends: Float[Array, "b 2 d"]  # errors of left-out blocks or flights, see `errors_at_ends`
     inherited: Float[Array, "p p"]  # covariance due to errors of the parameters that the source keeps
@@ -46,6 +48,17 @@ class Choice(NamedTuple):
     absorbed: Float[Array, " p"]  # variance of what the network may have absorbed, see `taken_by_network`
     vague: Bool[Array, " p"]  # rigid bodies only: whether that is a large part of a plausible change
     usual: Float[Array, "r 2 d"] | None = None  # the source's errors on parts of its own flights, if these are known
+
+    def covariance(self, cluster: int) -> Float[np.ndarray, "p p"]:
+        """Return the covariance of the fitted parameters and, for kept ones, their `variance_if_free`.
+
+        It is infinite for parameters that the windows do not determine; for `cluster` see `covariance_of`.
+        """
+        fitted = np.asarray(self.free)[self.taken]
+        unseen = fitted & (np.asarray(self.equations.score) == 0).all(axis=0)
+        found = sandwich(masked(self.equations, fitted), fitted.sum(), cluster)
+        away = variance_if_free(self.equations, fitted | self.kept, cluster)
+        return np.asarray(found) + np.diag(np.where(unseen, np.inf, np.where(self.kept, away, 0.0)))
 
     def expected(
         self, windows: Trajectories, space: StateSpace, flights: Int[np.ndarray, " n"] | None = None
@@ -64,7 +77,8 @@ class Parameter:
     """A physical parameter and its confidence interval.
 
     Attributes:
-        value: the estimate, in `unit`.
+        value: the estimate, in `unit`. If no change of the parameter was found, it is the source's value, and the
+            interval says what the windows do not exclude.
         low: lower end of the interval in `unit`: NaN without a valid one, −∞ or 0 if the parameter is not identifiable.
         high: upper end in `unit`: NaN without a valid interval, ∞ if the parameter is not identifiable.
         unit: the unit, for example "kg m²"; None if unknown.
@@ -204,16 +218,15 @@ class Adaptation:
             if self.changed:
                 yield f"Significantly different from the source: {', '.join(self.changed)}."
             effective = [name for name, one in self.parameters.items() if one.effective]
-            same = [name for name, one in self.parameters.items() if one.value == one.before]
-            kept = [name for name in same if not self.parameters[name].has_interval and name not in effective]
+            kept = [name for name, one in self.parameters.items() if one.value == one.before]
             if kept and self.chosen is not None:
-                names = "all parameters" if len(kept) == len(self.parameters) else ", ".join(kept)
-                yield f"Kept as before: {names}. If these may have changed, hj.excitation plans an experiment for them."
+                yield f"Kept as before: {'all parameters' if len(kept) == len(self.parameters) else ', '.join(kept)}."
             for reason in dict.fromkeys(self.parameters[name].effective for name in effective):
                 names = ", ".join(name for name in effective if self.parameters[name].effective == reason)
                 yield f"Effective, so without an interval: {names}: {reason}."
             if unseen := [name for name, one in self.parameters.items() if one.high == np.inf]:
                 yield f"Warning: these windows do not determine {', '.join(unseen)}: other values fit them as well."
+                yield "If these may have changed, hj.excitation plans an experiment that determines them."
         yield f"Constant disturbance: {'none' if self.disturbance is None else 'see parameters'}."
         if self.parameters and self.without_intervals is not None:
             yield f"No intervals: {self.without_intervals}."

@@ -12,6 +12,7 @@ from hybrid_jax.estimation import normal_equations
 from hybrid_jax.estimation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters, rounding
 from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, masked
 from hybrid_jax.estimation.starts import Starts, from_starts, smoothed
+from hybrid_jax.estimation.uncertainty import sandwich
 from hybrid_jax.trajectories import RANGE, Trajectories
 
 BLOCKS = 10
@@ -122,6 +123,21 @@ def spread(equations: NormalEquations, free: Bool[Array, " p"], of_source: Float
     effect = jnp.where(free | ~known, 0.0, fitted @ gram)
     found = effect @ jnp.where(known & known[:, None], of_source, 0.0) @ effect.T
     return found + jnp.diag(jnp.maximum(-jnp.diagonal(found), 0.0))  # rounding
+
+
+def variance_if_free(equations: NormalEquations, free: Bool[np.ndarray, " p"], cluster: int) -> Float[np.ndarray, " p"]:
+    """Return each parameter's variance if these were fitted as well, and the square of the step that it would take.
+
+    It is how far the windows let a parameter be from where it was kept: infinite if they do not determine it.
+    """
+    seen = (np.asarray(equations.score) != 0).any(axis=0)
+    equations = masked(equations, free)
+    gram, score = (np.asarray(part, float).sum(axis=0) for part in equations[:2])
+    unit = 1 / np.sqrt(np.maximum(np.diagonal(gram), TINY))
+    least = normal_equations.RANK * len(gram) * np.finfo(equations.gram.dtype).eps
+    step = unit * (np.linalg.pinv(unit[:, None] * gram * unit, least, hermitian=True) @ (unit * score))
+    variance = np.diagonal(sandwich(equations, free.sum(), cluster))
+    return np.where(free & ~seen, np.inf, variance + step**2)
 
 
 def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Trajectories) -> Float[Array, "2"]:
