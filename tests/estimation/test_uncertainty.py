@@ -212,3 +212,14 @@ def test_values_that_repeat_are_evaluated_once(distinct):
     poisoned = np.where(np.arange(7)[:, None] < -(-distinct // 3) * 3, repeated, np.nan)
     found = jax.jit(lambda many: in_chunks(norms, poisoned, 3, many))(jnp.array(distinct))
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), found, norms(repeated))
+
+
+def test_the_variance_of_clusters_is_that_of_leaving_each_out():
+    """Of a linear model, fitted anew without each of four clusters of different sizes."""
+    windows, design = pushes(35, noise=0.1)
+    of = np.arange(35) // 10
+    field = hj.fit_least_squares(Push(np.zeros(2, np.float32)), windows).field
+    data = np.asarray(windows.x).reshape(35, -1)
+    refits = [np.linalg.lstsq(design[of != g].reshape(-1, 2), data[of != g].ravel())[0] for g in range(4)]
+    expected = 3 * np.cov(np.array(refits).T, ddof=0)
+    np.testing.assert_allclose(hj.covariance_of(field, windows, cluster=10), expected, rtol=1e-3)
