@@ -114,13 +114,13 @@ def adapted(world: World, change: str, known: Sources, config: CoverageConfig, s
 
 
 def _compared(pooled: Parameter | None, own: Sequence[Parameter], true: float) -> dict[str, Any]:
-    """Whether pooled and single intervals contain the truth; error and half-width in %; None if not fitted."""
+    """Whether pooled and single intervals contain the truth; error and half-width in %; None without finite ones."""
     columns = ("inside", "error", "half_width", "alone", "effective")
     if pooled is None:
         return dict.fromkeys(columns)
-    alone = [one.low <= true <= one.high for one in own if one.has_interval]
+    alone = [one.low <= true <= one.high for one in own if np.isfinite(one.high)]
     inside, half = bool(pooled.low <= true <= pooled.high), 100 * (pooled.high - pooled.low) / (2 * true)
-    inside, half = (inside, half) if pooled.has_interval else (None, None)
+    inside, half = (inside, half) if np.isfinite(pooled.high) else (None, None)
     numbers = inside, 100 * (pooled.value / true - 1), half
     effective = sum(one.effective is not None for one in own)
     return dict(zip(columns, (*numbers, float(np.mean(alone)) if alone else None, effective), strict=True))

@@ -146,7 +146,7 @@ def of_intervals():
     high = lines("docs/results/intervals.md")["Hummingbird, gusty wind"][1]
     yield "explanation/failures", f"{small}, and 95 % intervals of one source contain the true value in {high} % of"
     claims = json.loads((REFERENCE / "worlds/report.json").read_text())["claims"]
-    harm, *said = (claim["measured"] for claim in claims)
+    harm, *said, sources, kept = (claim["measured"] for claim in claims)
     harms = [[*map(float, re.findall(r"([\d.]+), worst ([\d.]+)$", case)[0])] for case in harm.split("; ")]
     sound = [mean <= MEAN and worst <= EACH for mean, worst in harms]
     yield "explanation/failures", f"no harm in {sum(sound)} of {len(sound)} cases"
@@ -158,8 +158,15 @@ def of_intervals():
     shares = sorted(re.findall(r": ([\d.]+)%", said[1]), key=float)
     for page in ("results/intervals", "explanation/uncertainty"):
         yield page, f"contained the errors in {shares[0]} to {shares[-1]} % of the cases"
+    worst = max(re.findall(r" ([\d.]+)%", sources), key=float)
+    yield "results/intervals", f"at most {worst} % from the vehicles'"
+    cases, shares = zip(*re.findall(r"(\d+) of \d+ sources: ([\d.]+)%", kept), strict=True)
+    yield "results/intervals", f"{min(map(float, shares)):.0f} % of {sum(map(int, cases))} intervals of kept parameters"
+    hover = committed("worlds").where(flight="hover", method="auto")
+    infinite = [row[f"{name}_kept_inside"] is None for row in hover for name in ("Ix", "Iy")]
+    yield "results/intervals", f"after a hover {sum(infinite)} of {len(infinite)} of Ix and Iy were infinite"
     page = (REFERENCE / "worlds/report.md").read_text()
-    other = dict(re.findall(r"^\| Humm.*? \| hj.adapt \| (\w+) .* \| (\S+ \| \S+) \|$", page, re.MULTILINE))
+    other = dict(re.findall(r"^\| Humm.*? hj.adapt \| usual flight \| (\w+) .* \| (\S+ \| \S+) \|$", page, re.M))
     errors, widths = zip(*(other[name].split(" | ") for name in ("Ix", "Iy", "k")), strict=True)
     yield "results/intervals", "±{} % (Ix), ±{} % (Iy) and ±{} % (k) wide".format(*widths)
     yield "results/intervals", "with errors of only {}, {} and {} %".format(*errors)

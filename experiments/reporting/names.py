@@ -39,6 +39,8 @@ LABELS = {
     "nothing": "no change",
     "moving": "usual flight",
     "near_ground": "near the ground",
+    "short": "three seconds",
+    "noisy": "three times the noise",
     "outliers": "usual flight with outliers",
     "iris": "Iris (our simulator)",
     "hummingbird": "Hummingbird (RotorPy)",

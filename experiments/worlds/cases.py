@@ -18,7 +18,7 @@ from experiments.runner.options import Count, Several
 from experiments.runner.stages import Found, Stages, rows_of
 from experiments.worlds.flights import LEARNING, WORLDS, trained, usual_flights
 from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
-from experiments.worlds.methods import AUTO, METHODS, Task
+from experiments.worlds.methods import AUTO, METHODS, NOT_ADAPTED, Task
 from experiments.worlds.world import CHANGES, MADE_FOR, NOTHING, USUAL, World, logged
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import lane
@@ -153,7 +153,8 @@ def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
                 task = Task(world, field, own.splits["train"], windows, noise, many)
                 tags: dict[str, Any] = {"world": world.name, "change": change, "flight": flight}
                 tags |= {"draw": draw, "seed": seed}
-                methods = METHODS if compare and draw == 0 and seed < COMPARED else (AUTO,)
+                methods = (AUTO, NOT_ADAPTED) if change == NOTHING and flight == USUAL and draw == 0 else (AUTO,)
+                methods = METHODS if compare and draw == 0 and seed < COMPARED else methods
                 rows += [tags | row_of(name, task, change, test) for name in methods]
         # Errors on flights of another kind are not those to expect.
         return [row if flight == USUAL else row | dict.fromkeys(EXPECTED) for row in rows], {}

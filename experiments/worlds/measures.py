@@ -29,7 +29,8 @@ def error_of(field: hj.AbstractVectorField, test: hj.Trajectories):
 def parameters_of(world: World, change: str, found: Mapping[str, Parameter]) -> dict[str, Any]:
     """Return error, half-width and coverage of the 95 % interval for each of θ_p; None without a true value.
 
-    A weak rotor has no k of its own, and since the model's mass is fixed, another mass changes θ_p.
+    A weak rotor has no k of its own, and since the model's mass is fixed, another mass changes θ_p. The interval of a
+    parameter that keeps the source's value counts separately, as it says what the flight does not exclude.
     """
     vehicle, truth = world.changed(change), nominal(world.changed(change))
     other_mass = vehicle.mass != world.vehicle.mass
@@ -38,11 +39,14 @@ def parameters_of(world: World, change: str, found: Mapping[str, Parameter]) -> 
         known = name in found and not other_mass and (name, change) != ("k", "weak_rotor")
         one = found[name] if known else Parameter(np.nan)
         bounded = known and one.has_interval and np.isfinite(one.high)
+        inside = bool(one.low <= truth[name] <= one.high) if bounded else None
+        kept = one.value == one.before
         row |= {
             f"{name}_error": one.value / truth[name] - 1 if known else None,
             f"{name}_half_width": (one.high - one.low) / (2 * truth[name]) if bounded else None,
             f"{name}_effective": known and one.effective is not None,
-            f"{name}_inside": bool(one.low <= truth[name] <= one.high) if bounded else None,
+            f"{name}_inside": None if kept else inside,
+            f"{name}_kept_inside": inside if kept else None,
         }
     return row
 

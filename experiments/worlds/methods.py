@@ -83,10 +83,10 @@ def _of(result: Adaptation) -> Model:
     return Model(result.field, result.parameters, result)
 
 
-AUTO, SOURCE = "auto", "source"
+AUTO, NOT_ADAPTED = "auto", "source"
 METHODS: dict[str, Callable[[Task], Model]] = {
     AUTO: partial(adapted, AUTO),
-    SOURCE: partial(adapted, SOURCE),
+    NOT_ADAPTED: partial(adapted, NOT_ADAPTED),
     "fine_tune_paper": as_in_the_paper,
     "fine_tune": partial(adapted, FineTune()),
     "l2_sp": partial(adapted, FineTune(l2_sp=1e-2)),

@@ -18,12 +18,11 @@ from experiments.worlds.world import BURST, Reference, logged
 from hybrid_jax.adaptation.results import Parameter
 from hybrid_jax.vehicle import IRIS
 
-FLAPPING = 1e-5  # which no vehicle of RotorPy has
-
 
 @pytest.mark.parametrize(("module", "constants"), [("hummingbird", HUMMINGBIRD), ("crazyflie", CRAZYFLIE)])
 def test_the_derivative_and_the_controller_are_those_of_rotorpy(module, constants):
-    params = pytest.importorskip(f"rotorpy.vehicles.{module}_params").quad_params | {"k_flap": FLAPPING}
+    flapping = 1e-5  # which no vehicle of RotorPy has
+    params = pytest.importorskip(f"rotorpy.vehicles.{module}_params").quad_params | {"k_flap": flapping}
     from rotorpy.controllers.quadrotor_control import SE3Control
     from rotorpy.vehicles.multirotor import Multirotor
 
@@ -39,7 +38,7 @@ def test_the_derivative_and_the_controller_are_those_of_rotorpy(module, constant
         asked = pilot.update(0.0, state, wanted)["cmd_motor_speeds"]
         with jax.enable_x64(True):
             ours, now = jnp.concatenate([x, q, v, rates]), Reference(*map(jnp.asarray, wanted.values()))
-            found, lagging = derivative(constants._replace(flapping=FLAPPING), ours, speeds, command, wind)
+            found, lagging = derivative(constants._replace(flapping=flapping), ours, speeds, command, wind)
             own = decide(constants, ours, now)
         np.testing.assert_allclose(found, packed[[0, 1, 2, 9, 6, 7, 8, 3, 4, 5, 10, 11, 12]], rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(lagging, packed[16:], rtol=1e-10)
@@ -60,13 +59,15 @@ def test_a_log_has_sampled_or_averaged_speeds_and_wild_samples():
     assert away[:, BURST].mean() > 20 * away[:, : BURST.start - 1].mean()
 
 
-def rows(inside=19.0, expected=0.8, sources=40, **ratios):
+def rows(inside=19.0, expected=0.8, sources=40, own=0.04, kept=20, **ratios):
     """Some cases in one world: an error over the source's, and intervals that hold in so many of twenty draws."""
     tags = {"world": "iris", "flight": "moving", "method": "auto", "chosen": "theta", "made_for": True}
-    found = []
+    first = {"change": "nothing", "draw": 0, "seed": 0, "method": "source"}
+    found = [tags | first | {f"{name}_error": -own for name in ("Ix", "Iy", "k")}]
     for change, ratio in ratios.items():
         for draw, seed in np.ndindex(20, sources):
             theta = {f"{name}_inside": draw + seed / sources < inside for name in ("Ix", "Iy", "k")}
+            theta |= {f"{name}_kept_inside": draw < kept for name in ("Ix", "Iy", "k")}
             row = {"change": change, "draw": draw, "seed": seed, "ratio": ratio if draw else 2 * ratio}
             found.append(tags | theta | row | dict.fromkeys(EXPECTED, expected + 0.1 * (-1) ** seed))
     return Results(found, ("world", "change", "flight", "draw", "seed", "method"))
@@ -81,10 +82,12 @@ def rows(inside=19.0, expected=0.8, sources=40, **ratios):
         ({"inside": 19.97}, ["W2"], []),  # all but those of one adaptation
         ({"inside": 17}, ["W2"], []),
         ({"inside": 20}, [], ["W2"]),  # are those of a source alike?
-        ({"sources": 1}, [], ["W2", "W3"]),
+        ({"sources": 1}, [], ["W2", "W3", "W5"]),
         ({"expected": 0.5}, ["W3"], []),
         ({"expected": 0.95}, ["W3"], []),
         ({"expected": 0.9}, [], ["W3"]),
+        ({"own": 0.06}, ["W4"], []),
+        ({"kept": 15}, ["W5"], []),
     ],
 )
 def test_each_claim_fails_where_it_should(change, fails, undecided):
