@@ -212,7 +212,7 @@ class OneFlight(Config):
     """Draws of target trajectories; each seed's source adapts to one at a time."""
     validation: Count | Literal["own"] = "own"
     """own: only the N target trajectories. Or the number of validation trajectories, as in the source."""
-    noise: float = 1.0
+    noise: NotNegative = 1.0
     """White noise on the states of all flights but the test flights; 1 is typical of motion capture and a gyroscope."""
     changes: Several[Change] = CHANGED
     """Changes of the vehicle."""
