@@ -56,7 +56,7 @@ class Choice(NamedTuple):
         """
         fitted = np.asarray(self.free)[self.taken]
         unseen = fitted & (np.asarray(self.equations.score) == 0).all(axis=0)
-        found = sandwich(masked(self.equations, fitted), fitted.sum(), cluster)
+        found = sandwich(masked(self.equations, fitted), int(fitted.sum()), cluster)
         away = variance_if_free(self.equations, fitted | self.kept, cluster)
         return np.asarray(found) + np.diag(np.where(unseen, np.inf, np.where(self.kept, away, 0.0)))
 

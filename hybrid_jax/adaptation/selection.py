@@ -136,7 +136,7 @@ def variance_if_free(equations: NormalEquations, free: Bool[np.ndarray, " p"], c
     unit = 1 / np.sqrt(np.maximum(np.diagonal(gram), TINY))
     least = normal_equations.RANK * len(gram) * np.finfo(equations.gram.dtype).eps
     step = unit * (np.linalg.pinv(unit[:, None] * gram * unit, least, hermitian=True) @ (unit * score))
-    variance = np.diagonal(sandwich(equations, free.sum(), cluster))
+    variance = np.diagonal(sandwich(equations, int(free.sum()), cluster))
     return np.where(free & ~seen, np.inf, variance + step**2)
 
 

@@ -116,7 +116,7 @@ def _covariance(equations: NormalEquations, p: Int[Array, ""] | int, cluster: in
     return found + jnp.diag(jnp.where(identified, 0.0, jnp.inf))
 
 
-def sandwich(equations: NormalEquations, fitted: Int[Array, ""] | int, cluster: int = 1) -> Float[Array, "p p"]:
+def sandwich(equations: NormalEquations, fitted: int, cluster: int = 1) -> Float[Array, "p p"]:
     """Compute H⁻¹ M H⁻¹ of `covariance_of` from equations in which all but `fitted` parameters are `masked`."""
     return _covariance(equations, fitted, cluster, len(equations.score))
 
