@@ -46,7 +46,7 @@ def against_oracle(part, world="iris"):
     return {case: online / oracle for case, (online, oracle) in means.items()}
 
 
-TUNED, WORDS = ("fine_tune", "source"), {0: "none", 1: "one", 4: "four"}
+TUNED, WORDS = ("fine_tune", "source"), {0: "none", 1: "one", 4: "four", 6: "six"}
 
 
 def of_changes():

@@ -171,5 +171,9 @@ def _draw_errors(axes: Axes, groups: Mapping[str, Results]) -> None:
                 each, mean = np.sqrt(errors), np.sqrt(errors.mean())
                 axes.plot([each.min(), each.max()], [y, y], color=colour, lw=4, alpha=0.25, solid_capstyle="round")
                 axes.plot(mean, y, marker, ms=6, color=colour, ls="", label="" if y else label)
-                up = "bottom" if side > 0 else "top"
-                note(axes, f"{mean:.2g}", (mean, y), (0, 5 * side), ha=ha, va=up, color=colour)
+                style = {"va": "bottom" if side > 0 else "top", "color": colour}
+                if np.isfinite(mean):
+                    note(axes, f"{mean:.2g}", (mean, y), (0, 5 * side), ha=ha, **style)
+                else:
+                    words = f"{np.sum(~np.isfinite(each))} of {len(each)} diverge"
+                    note(axes, words, (1, y), (0, 5 * side), xycoords=axes.get_yaxis_transform(), ha="right", **style)
