@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -133,6 +134,19 @@ def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectori
     x0, u, x, dt = trajectories.x0, trajectories.u, trajectories.x, trajectories.dt
     head = Trajectories(x0, u[..., :at, :], x[..., :at, :], dt)
     return head, Trajectories(x[..., at - 1, :], u[..., at:, :], x[..., at:, :], dt)
+
+
+def pair_inputs(windows: Trajectories) -> Trajectories:
+    """Return windows with the inputs (2m) of each interval and of the next, without each window's last interval.
+
+    Args:
+        windows: windows of at least two intervals, whose inputs are samples at the start of each; see
+            `dynamics.SampledRotors`. ValueError if they have only one.
+    """
+    if windows.horizon < 2:
+        raise ValueError("windows must have two intervals or more, so that there is a next input, got one")
+    x, u = windows.x[..., :-1, :], windows.u
+    return replace(windows, u=np.concatenate([u[..., :-1, :], u[..., 1:, :]], axis=-1), x=x)
 
 
 def windows_of(

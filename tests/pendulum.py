@@ -28,6 +28,21 @@ class Pendulum(AbstractVectorField):
         return jnp.stack([rate, u[0] - GRAVITY / jnp.exp(self.log_length) * jnp.sin(angle) - self.damping * rate])
 
 
+class Damped(Pendulum):
+    """The pendulum, with an unknown damping [1/s]."""
+
+    damping: Float[Array, ""]
+
+
+class Biased(eqx.Module):
+    """A sensor of the angle, with an unknown bias [rad]."""
+
+    bias: Float[Array, ""]
+
+    def __call__(self, x, u):
+        return x[0] + self.bias
+
+
 @portable
 class Whirling(Pendulum):
     """The pendulum, with an angle that is the same after a turn."""

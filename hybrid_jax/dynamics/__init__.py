@@ -1,6 +1,6 @@
 """Vector fields ẋ = f(x, u): the physics of a multirotor, grids, hybrids, disturbances and hidden states."""
 
-from hybrid_jax.dynamics.actuators import Actuated, Actuator, actuated, rotor_speeds
+from hybrid_jax.dynamics.actuators import Actuated, Actuator, SampledRotors, actuated, rotor_speeds
 from hybrid_jax.dynamics.base import AbstractEstimator, AbstractVectorField, HoldState, trainable
 from hybrid_jax.dynamics.composition import Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, with_disturbance
@@ -15,5 +15,5 @@ __all__ = ["AbstractVectorField", "Frozen", "FrozenRates", "HoldState", "Hybrid"
 __all__ += ["Actuated", "Actuator", "Diffusion", "Grid", "actuated", "check_grid", "diffusion", "rotor_speeds"]
 __all__ += ["AbstractEstimator", "ConstantDisturbance", "DisturbanceModel", "with_disturbance"]
 __all__ += ["RigidBody", "Terms", "VehicleModel", "load_vehicle_model", "rigid_body"]
-__all__ += ["Lag", "LinearDynamics", "Oscillator", "RandomWalk", "with_hidden"]
+__all__ += ["Lag", "LinearDynamics", "Oscillator", "RandomWalk", "SampledRotors", "with_hidden"]
 __all__ += ["StateSpaceModel"]

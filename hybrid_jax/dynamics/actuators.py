@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.checks import Numbers
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
+from hybrid_jax.dynamics.hidden import AbstractHidden
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
 from hybrid_jax.state_space import Quantity
 from hybrid_jax.vehicle import STATE_SIZE, as_tuple, require_numbers
@@ -29,6 +30,7 @@ UNITS = {"time_constant": "s", "time_constants": "s", "delay": "s"}
 EXCLUSIVE = {"curve": ("mass", "k", "k_rotors"), "time_constants": ("time_constant",)}
 SLOWEST_SHARE = 1e-3  # of the speed of hover; without this limit, the root of a thrust has no slope at zero
 QUICKEST = 1e-3  # s, shortest time constant that is learned
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)  # of a mean over an interval, good to 1e-4 if τ > Δ/10
 
 
 @dataclass(frozen=True)
@@ -207,6 +209,38 @@ def actuated(body: RigidBody, actuator: Actuator, learn: tuple[str, ...] = ()) -
     check_actuator_names(learn, actuator, tuple(body.deviations))
     shapes = {"curve": (len(actuator.curve),), "time_constants": (2,)}
     return Actuated(body, {name: jnp.zeros(shapes.get(name, ())) for name in learn}, actuator)
+
+
+class SampledRotors(AbstractHidden):
+    """Rotor speeds between two samples, for `with_hidden`: each lags behind a command that is held in between.
+
+        w(t) = w₀ + (w₁ − w₀) (1 − e^{−t/τ}) / (1 − e^{−Δ/τ}),   0 ≤ t ≤ Δ
+
+    The inputs (2n,) are the speeds w₀ of the n rotors at the start of an interval and w₁ at its end [rad/s], see
+    `trajectories.pair_inputs`. The field receives the root mean square of w (n,), because thrust is proportional to w².
+    It has no states.
+
+    Attributes:
+        log_time_constant: ln τ, with τ in seconds.
+        dt: the duration Δ of an interval [s].
+    """
+
+    log_time_constant: Float[Array, ""]
+    dt: float = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        return 0
+
+    def derivative(self, z, x, u):
+        return jnp.zeros(0)
+
+    def inputs(self, z, u):
+        start, end = jnp.split(jnp.asarray(u), 2)
+        ratio = self.dt / jnp.exp(self.log_time_constant)
+        passed = jnp.expm1(-ratio * (NODES + 1) / 2) / jnp.expm1(-ratio)
+        square = WEIGHTS / 2 @ (start + passed[:, None] * (end - start)) ** 2
+        return jnp.sqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny))  # a root has no slope at zero
 
 
 def check_actuator_names(learn: tuple[str, ...], actuator: Actuator, of_body: tuple[str, ...] = ()) -> None:

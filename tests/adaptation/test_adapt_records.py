@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy
+from pendulum import Biased, Damped
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation.records import _candidates, _chosen, _more
@@ -15,24 +16,8 @@ from hybrid_jax.adaptation.records import _candidates, _chosen, _more
 NOISE, SECONDS = 0.01, 8.0
 
 
-class Pendulum(hj.AbstractVectorField):
-    log_length: jax.Array
-    damping: jax.Array
-
-    def __call__(self, x, u):
-        pull = 9.81 / jnp.exp(self.log_length) * jnp.sin(x[0])
-        return jnp.stack([x[1], u[0] - pull - self.damping * x[1]])
-
-
-class Encoder(eqx.Module):
-    bias: jax.Array
-
-    def __call__(self, x, u):
-        return x[0] + self.bias
-
-
 def model(length, damping, bias, spread):
-    field, sensor = Pendulum(jnp.log(jnp.array(length)), jnp.array(damping)), Encoder(jnp.array(bias))
+    field, sensor = Damped(jnp.log(jnp.array(length)), jnp.array(damping)), Biased(jnp.array(bias))
     return hj.StateSpaceModel(field, ("push",), {"angle": sensor}, (0.0, 0.0), spread)
 
 

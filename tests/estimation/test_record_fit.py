@@ -8,22 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pendulum import Damped
 from surface import refusal
 
 import hybrid_jax as hj
+from hybrid_jax.dynamics.actuators import SampledRotors
 from hybrid_jax.dynamics.hidden import Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
 from hybrid_jax.estimation.elimination import undetermined
 from hybrid_jax.records import Record, on_grid
+from hybrid_jax.trajectories import pair_inputs, windows_of
 
 NOISE = 0.01
-
-
-class Damped(hj.AbstractVectorField):
-    log_length: jax.Array
-    damping: jax.Array
-
-    def __call__(self, x, u):
-        return jnp.stack([x[1], u[0] - 9.81 / jnp.exp(self.log_length) * jnp.sin(x[0]) - self.damping * x[1]])
 
 
 def pendulum(length=0.8, damping=0.3):
@@ -39,9 +34,8 @@ def record(field, start, length=8.0, samples=80, seed=0, drop=(), noise=NOISE, i
     random = np.random.default_rng(seed)
     t = np.arange(0.0, length, interval)
     torque = t, 2 * random.normal(size=len(t))
-    times = np.sort(random.uniform(0, length, samples))
+    times = np.array([0.0, *np.sort(random.uniform(0, length, samples))])
     times = times[~((times > drop[0]) & (times < drop[1]))] if drop else times
-    times = np.concatenate([[0.0], times])
     model = hj.StateSpaceModel(field, ("torque",), {"angle": angle}, start, np.zeros(len(start)))
     y = hj.simulate(model, Record.of("r", torque=torque, angle=(times, 0 * times)), dt=0.01)[0]["angle"][:, 0]
     return Record.of(f"run {seed}", torque=torque, angle=(times, y + noise * random.normal(size=len(times))))
@@ -237,6 +231,18 @@ def test_a_stiff_system_is_fitted_with_an_implicit_solver():
     data = Record.of("r", y=(t, y + 1e-3 * np.random.default_rng(0).normal(size=len(t))))
     fit = hj.fit_records(model(1.2, (0.5, 0.5)), [data], dt=0.1, solver=solver)
     assert float(fit.intervals["log_rate"].value) == pytest.approx(np.log(0.7), abs=3e-3)
+
+
+@pytest.mark.parametrize("lag", [0.004, 0.05])
+def test_the_lag_of_rotors_is_found_from_samples_also_if_some_stand_still(lag):
+    t, speeds, states = np.linspace(0, 0.01, 1001)[:, None], [np.zeros(2)], [np.zeros(2)]
+    for command in [np.zeros(2)] * 3 + [*np.random.default_rng(0).uniform(0, 10, (200, 2))]:
+        path = command + (speeds[-1] - command) * np.exp(-t / lag)
+        speeds, states = [*speeds, path[-1]], [*states, states[-1] + np.trapezoid(path**2, t, axis=0)]
+    windows = pair_inputs(windows_of(np.array(states), np.array(speeds[:-1]), 0.01, steps=10))
+    field = with_hidden(lambda x, u: u**2, SampledRotors(jnp.log(0.015), 0.01))
+    found = hj.fit_least_squares(field, windows).field.parts[0]
+    assert float(jnp.exp(found.log_time_constant)) == pytest.approx(lag, rel=1e-3)
 
 
 def test_linear_dynamics_are_an_oscillator():

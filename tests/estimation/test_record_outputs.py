@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pendulum import Biased
 from surface import refusal
 from test_record_fit import NOISE, angle, model_of, pendulum, record, records
 
@@ -14,13 +15,6 @@ import hybrid_jax as hj
 from hybrid_jax import StateSpaceModel, fit_records, predict, simulate
 from hybrid_jax.estimation.record_search import check_rates
 from hybrid_jax.records import Record, Signal
-
-
-class Biased(eqx.Module):
-    bias: jax.Array
-
-    def __call__(self, x, u):
-        return x[0] + self.bias
 
 
 def test_a_sensor_has_an_interval_and_the_names_of_intervals_are_those_of_priors():
