@@ -1,8 +1,7 @@
 """Write committed reports anew from their report.json: python -m experiments.redraw
 
-It takes those in docs/reference, or in the folders that you give. A report is
-a function of its record, so that neither its words nor its pictures can be
-older than the program: a test makes all of them and compares.
+It takes those in docs/reference, or in the folders that you give. A report is a function of its record, so that neither
+its words nor its pictures can be older than the program: a test makes all of them and compares.
 """
 
 import sys
@@ -23,18 +22,10 @@ from experiments.worlds import __main__ as worlds
 
 REFERENCE = Path(__file__).parents[1] / "docs/reference"
 REPORTS: Mapping[str, Callable[[Mapping[str, Any]], Report]] = {
-    "ablation": ablation.report,
-    "changes": changes.report,
-    "closed_loop": closed_loop.report,
-    "comparison": comparison.report,
-    "coverage": coverage.report,
-    "excitation": excitation.report,
-    "external_force": outcome.report,
-    "online": online.report,
-    "param_shift": outcome.report,
-    "reaction_diffusion": reaction_diffusion.report,
-    "real_flight": real_flight.report,
-    "worlds": worlds.report,
+    **{"ablation": ablation.report, "changes": changes.report, "closed_loop": closed_loop.report},
+    **{"comparison": comparison.report, "coverage": coverage.report, "excitation": excitation.report},
+    **{"external_force": outcome.report, "online": online.report, "param_shift": outcome.report},
+    **{"reaction_diffusion": reaction_diffusion.report, "real_flight": real_flight.report, "worlds": worlds.report},
 }
 
 

@@ -58,9 +58,11 @@ def in_each_world(
     stages.publish(name, config, Results(rows, tags), report)
 
 
-def usual_flights(world: World, change: str, flights: int, seconds: float, key: PRNGKeyArray) -> Flown:
+def usual_flights(
+    world: World, change: str, flights: int, seconds: float, key: PRNGKeyArray, kind: str = USUAL
+) -> Flown:
     """Fly without a crash: the pilot of some vehicles turns over now and then."""
-    flown = world.fly(change, USUAL, round(SPARE * flights), seconds, key)
+    flown = world.fly(change, kind, round(SPARE * flights), seconds, key)
     kept = np.flatnonzero(~gone_wrong(flown.states))[:flights]
     return Flown(*(part[kept] for part in flown))
 

@@ -44,6 +44,7 @@ class Kind(NamedTuple):
 
 KINDS = {
     "moving": Kind(2.0, 0.15, 0.8, 4.0, 0.8),
+    "lively": Kind(1.2, 1.0, 2.0, 4.0, 0.1),
     "hover": Kind(0.03, 0.2, 0.6, 2.0, 0.01),
     "near_ground": Kind(0.05, 0.05, 0.12, 0.3, 0.1),
 }
