@@ -1,7 +1,7 @@
 """The result of an adaptation, and its report."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from dataclasses import field as attribute
 from typing import Any, NamedTuple
@@ -216,16 +216,16 @@ class Adaptation:
                 change = ", change {:.3g} to {:.3g}".format(*one.change) if np.isfinite(one.change).all() else ""
                 yield f"  {name:<{width}}  {one}{before}{change}"
             if self.changed:
-                yield f"Significantly different from the source: {', '.join(self.changed)}."
+                yield f"Significantly different from the source: {_listed(self.changed)}."
             effective = [name for name, one in self.parameters.items() if one.effective]
             kept = [name for name, one in self.parameters.items() if one.value == one.before]
             if kept and self.chosen is not None:
-                yield f"Kept as before: {'all parameters' if len(kept) == len(self.parameters) else ', '.join(kept)}."
+                yield f"Kept as before: {'all parameters' if len(kept) == len(self.parameters) else _listed(kept)}."
             for reason in dict.fromkeys(self.parameters[name].effective for name in effective):
-                names = ", ".join(name for name in effective if self.parameters[name].effective == reason)
+                names = _listed([name for name in effective if self.parameters[name].effective == reason])
                 yield f"Effective, so without an interval: {names}: {reason}."
             if unseen := [name for name, one in self.parameters.items() if one.high == np.inf]:
-                yield f"Warning: these windows do not determine {', '.join(unseen)}: other values fit them as well."
+                yield f"Warning: these windows do not determine {_listed(unseen)}: other values fit them as well."
                 yield "If these may have changed, hj.excitation plans an experiment that determines them."
         yield f"Constant disturbance: {'none' if self.disturbance is None else 'see parameters'}."
         if self.parameters and self.without_intervals is not None:
@@ -243,3 +243,13 @@ def _in_words(candidate: str) -> str:
         return "new weights of the network"
     *first, last = (WORDS[each] for each in CANDIDATES[candidate] or ["source"])
     return f"{', '.join(first)} and {last}" if first else last
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Join names of parameters; of an array's, if they are more than two, give only the number."""
+    arrays: dict[str, list[str]] = {}
+    for name in names:
+        arrays.setdefault(name.partition("[")[0], []).append(name)
+    return ", ".join(
+        f"{array} ({len(own)} numbers)" if len(own) > 2 else ", ".join(own) for array, own in arrays.items()
+    )
