@@ -30,7 +30,7 @@ UNITS = {"time_constant": "s", "time_constants": "s", "delay": "s"}
 EXCLUSIVE = {"curve": ("mass", "k", "k_rotors"), "time_constants": ("time_constant",)}
 SLOWEST_SHARE = 1e-3  # of the speed of hover; without this limit, the root of a thrust has no slope at zero
 QUICKEST = 1e-3  # s, shortest time constant that is learned
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)  # of a mean over an interval, good to 1e-4 if τ > Δ/10
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)  # on [-1, 1]; the mean over an interval is good to 1e-4 if τ > Δ/10
 
 
 @dataclass(frozen=True)
@@ -237,9 +237,10 @@ class SampledRotors(AbstractHidden):
 
     def inputs(self, z, u):
         start, end = jnp.split(jnp.asarray(u), 2)
+        shares, weights = (jnp.asarray(each, start.dtype) for each in ((NODES + 1) / 2, WEIGHTS / 2))
         ratio = self.dt / jnp.exp(self.log_time_constant)
-        passed = jnp.expm1(-ratio * (NODES + 1) / 2) / jnp.expm1(-ratio)
-        square = WEIGHTS / 2 @ (start + passed[:, None] * (end - start)) ** 2
+        passed = jnp.expm1(-ratio * shares) / jnp.expm1(-ratio)
+        square = weights @ (start + passed[:, None] * (end - start)) ** 2
         return jnp.sqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny))  # a root has no slope at zero
 
 
