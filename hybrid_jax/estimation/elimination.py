@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax.batches import solve
-from hybrid_jax.estimation.levenberg_marquardt import begin, in_python, minimise, move_of_equations
+from hybrid_jax.estimation.levenberg_marquardt import DAMPING, begin, in_python, minimise, move_of_equations
 from hybrid_jax.estimation.normal_equations import RANK, NormalEquations, inverse, inverses
 from hybrid_jax.status import Status
 
@@ -84,15 +84,20 @@ def descend(
     most: Float[np.ndarray, " p"] | float = np.inf,
     max_steps: int = 50,
     tolerance: float = 1e-6,
+    damping: float = DAMPING,
+    cost: Callable[[Any, Any], Any] | None = None,
 ) -> End:
     """Minimise the cost over θ and the pieces' own unknowns, by Levenberg–Marquardt.
 
     Parameters that are not `free`, or with information of at most `least` after elimination, do not change.
-    No step changes a parameter by more than `most`.
+    No step changes a parameter by more than `most`. If `cost` is given, because it is cheaper, equations are only
+    computed where it is lower.
     """
     moves = jnp.ones(len(theta), bool) if free is None else jnp.asarray(free)
 
-    def evaluate(point, _):
+    def evaluate(point, state):
+        if cost is not None and not (value := cost(*point)) < state.cost:
+            return value, state.best
         found = equations(*point)
         return jnp.sum(found.square), (point, found)
 
@@ -102,7 +107,7 @@ def descend(
         return (theta + step, own + change), expected, 0.0
 
     point, nothing = (theta, own), NormalEquations(*3 * (jnp.zeros(()),))
-    end = minimise(evaluate, aim, begin(point, (point, nothing)), max_steps, tolerance, in_python)
+    end = minimise(evaluate, aim, begin(point, (point, nothing), damping), max_steps, tolerance, in_python)
     (theta, own), found = end.best
     return End(theta, own, found, int(end.steps), Status(int(end.status)))
 

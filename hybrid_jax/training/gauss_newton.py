@@ -1,7 +1,7 @@
 """Damped Gauss–Newton for all parameters of a field, network and physics, to a precision that Adam does not reach.
 
-A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the column norms of J, in double precision:
-squaring J in float32 would lose the least sensitive directions.
+The search is `elimination.descend`, as for records: a step solves min ‖J δ + r‖² + μ ‖D δ‖², with D the column norms of
+J, in double precision. Squaring J in float32 would lose the least sensitive directions.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,8 @@ from hybrid_jax.dynamics.base import AbstractVectorField, as_field, parts_of, ra
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import compare_steps
-from hybrid_jax.estimation.levenberg_marquardt import State, begin, in_python, minimise, move_of_equations
+from hybrid_jax.estimation.elimination import descend
+from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.runtime import entry
@@ -178,35 +179,34 @@ class _Problem(eqx.Module):
 
 
 def _descend(problem: _Problem, windows: Trajectories, max_steps: int) -> GaussNewtonFit:
-    def evaluate(theta, state: State):
-        loss = problem.loss(theta, windows)
-        if not loss < state.cost:  # then the equations there are not needed
-            return loss, state.best
-        return loss, (theta, *_normal_equations(problem, theta, windows))
+    start, wide = ravel_learned(problem.source)[0], jax.config.read("jax_enable_x64")
 
-    def aim(best, damping):
-        theta, gram, score = best
-        with jax.enable_x64(True):
-            move, expected = (np.asarray(part) for part in _move(gram, score, float(damping)))
-        return theta + jnp.asarray(move, theta.dtype), jnp.asarray(expected, damping.dtype), 0.0
+    def rounded(theta):  # to the precision of the field's programs
+        return jnp.asarray(np.asarray(theta), start.dtype)
 
-    theta = ravel_learned(problem.source)[0]
-    nothing = theta, np.zeros((theta.size, theta.size)), np.zeros(theta.size)
-    end = minimise(evaluate, aim, begin(theta, nothing, FIRST), max_steps, SLOW, in_python)
-    return GaussNewtonFit(problem.field(end.best[0]), float(end.cost), int(end.steps), Status(int(end.status)))
+    def cost(theta, own):
+        with jax.enable_x64(wide):
+            return np.asarray(problem.loss(rounded(theta), windows), float)
 
+    def equations(theta, own):
+        with jax.enable_x64(wide):
+            found = _normal_equations(problem, rounded(theta), windows)
+        return NormalEquations(*map(jnp.asarray, found))
 
-_move = jax.jit(move_of_equations)
+    with jax.enable_x64(True):
+        options = {"max_steps": max_steps, "tolerance": SLOW, "damping": FIRST, "cost": cost}
+        end = descend(equations, jnp.asarray(start, float), jnp.zeros((1, 0)), **options)
+    return GaussNewtonFit(problem.field(rounded(end.theta)), float(cost(end.theta, end.own)), end.steps, end.status)
 
 
 def _normal_equations(
     problem: _Problem, theta, windows: Trajectories
-) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-    gram, score = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
+) -> tuple[Float[np.ndarray, "1 p p"], Float[np.ndarray, "1 p"], Float[np.ndarray, " 1"]]:
+    gram, score, square = np.zeros((theta.size, theta.size)), np.zeros(theta.size), 0.0
     for index in range(len(windows)):
         columns, r = (np.asarray(part, float) for part in problem.linearised(theta, windows[index]))
-        gram, score = gram + columns @ columns.T, score + columns @ r
-    return gram / len(windows), score / len(windows)
+        gram, score, square = gram + columns @ columns.T, score + columns @ r, square + r @ r
+    return gram[None] / len(windows), score[None] / len(windows), np.array([square / len(windows)])
 
 
 def with_sensitivities(
