@@ -12,7 +12,7 @@ from rich.console import Console
 from experiments.flying.images import picture
 from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
-from experiments.runner.options import CountFromZero, Named, check_rules
+from experiments.runner.options import CountFromZero, Named
 from experiments.runner.progress import Line
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.files import digest
@@ -54,9 +54,6 @@ class Options:
     """Windows of 0.2 s: 10 steps of past and the 10 to predict."""
     picture: Path | None = None
     """Also render the vehicle to this PNG (needs the system package libosmesa6 or libegl1)."""
-
-    def __post_init__(self):
-        check_rules("--", self)
 
     def splits(self) -> dict[str, SplitSpec]:
         steps = {"train": 10, "validation": 10, "test": 100, "test_with_past": 20}

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from experiments import interruptible
 from experiments.runner.cache import source_digest
-from experiments.runner.options import COMMON, Run
+from experiments.runner.options import COMMON, Run, check_rules
 from experiments.runner.run_record import recorded
 from hybrid_jax import checks
 from hybrid_jax.cli import answering
@@ -95,7 +95,9 @@ def call(
     """Read the options, a dataclass with the command's description, and run a command. Errors as in `run`."""
     interruptible()
     with exit_codes(name, name, "interrupted, nothing was written"):
-        command(parsed(kind, _program(name), arguments))
+        options = parsed(kind, _program(name), arguments)
+        check_rules("--", options)
+        command(options)
 
 
 def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> Run:
