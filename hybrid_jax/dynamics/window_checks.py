@@ -18,6 +18,7 @@ from hybrid_jax.trajectories import Trajectories, check, last_measured
 ALIKE, FAR = 0.9, 3.0  # correlation of changes and integrated rates; factor beyond which their units differ
 TINY = 1e-12  # added to the size of a change
 SOME, FASTEST = 200, 8  # windows, and samples of them, whose rates are compared
+MANY = 100  # states: more are those of a grid, where thousands of pairs are alike and all have one unit
 
 
 def check_windows(
@@ -59,7 +60,7 @@ def turns(path: Float[np.ndarray, "n t k"], turn: float = 2 * np.pi) -> Int[np.n
 
 def _warn_of_units(field: AbstractVectorField, space: StateSpace, windows: Trajectories, name: str) -> None:
     """Warn about a state that is the rate of another one in the physics, but has another unit in the windows."""
-    if any(map(checks.is_traced, jax.tree.leaves((field, windows)))):
+    if windows.x.shape[-1] > MANY or any(map(checks.is_traced, jax.tree.leaves((field, windows)))):
         return
     windows = jax.tree.map(np.asarray, windows[:: -(-len(windows) // SOME)])
     path = np.concatenate([windows.x0[:, None], windows.x], axis=1).astype(float)
