@@ -62,7 +62,7 @@ class ChangesConfig(OneFlight):
 
 
 PRESETS = {
-    # At a constant rate the network keeps the noise of its last minibatches.
+    # With noise before the change, sources that learn at the paper's constant rate have larger errors.
     "paper": ChangesConfig(rates=Rates(pretraining=1e-3, decay=(0.3, 0.1))),
     "quick": preset_like(ChangesConfig, replace(QUICK, **ONE_FLIGHT, draws=4)),
     "smoke": preset_like(
