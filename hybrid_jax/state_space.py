@@ -264,12 +264,16 @@ class StateSpace:
             one.check(name, x, part)
 
     def features(self, x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
-        """Return, by name, the quantities that decide how alike samples are; by default each number of x and of u."""
-        known = self.padded(x.shape[1]).quantities
-        # Two quantities may have equal labels, for example "left" of an angle and of its rate.
-        names = [one.name + f" {each}" * (one.size > 1) for one in known for each in one.labels or range(one.size)]
-        names += [f"u[{i}]" for i in range(u.shape[1])]
-        return dict(zip(names, (*x.T, *u.T), strict=True))
+        """Return, by name, the quantities that decide how alike samples are; by default each number of x and of u.
+
+        All numbers of a `uniform` quantity are samples of one.
+        """
+        found = {}
+        for part, one in self.padded(x.shape[1]).parts:
+            # Two quantities may have equal labels, for example "left" of an angle and of its rate.
+            names = [one.name + f" {each}" * (one.size > 1) for each in one.labels or range(one.size)]
+            found |= {one.name: x[:, part].ravel()} if one.uniform else dict(zip(names, x[:, part].T, strict=True))
+        return found | {f"u[{i}]": column for i, column in enumerate(u.T)}
 
     def _curved(self) -> Iterator[tuple[slice, Quantity]]:
         return ((part, one) for part, one in self.parts if not one.is_vector)

@@ -66,6 +66,7 @@ def test_further_numbers_and_features_have_names_of_their_own_and_a_field_inside
     wheels = StateSpace((Angle("angle", 2, labels=("left", "right")), Quantity("rate", 2, labels=("left", "right"))))
     found = wheels.features(np.arange(20.0).reshape(5, 4), np.zeros((5, 1)))
     assert [*found] == ["angle left", "angle right", "rate left", "rate right", "u[0]"]
+    assert {*map(len, hj.Grid((12,), 1.0, 2).state_space.features(x := np.zeros((5, 24)), x[:, :0]).values())} == {60}
     body = rigid_body(hj.IRIS)
     for field in (hj.Hybrid(body, pendulum()), hj.Frozen(body), lambda x, u: x):
         assert (state_space(field) is RIGID_BODY_SPACE) == hasattr(field, "state_space")

@@ -148,16 +148,18 @@ def shares_outside(field: AbstractVectorField, known: Trajectories, asked: Traje
     """
     space, t = state_space(field, known.x0.shape[-1]), min(known.horizon, asked.horizon)
 
-    def features(windows: Trajectories) -> Array:
+    def features(windows: Trajectories) -> list[Array]:
         x: Any = jnp.asarray(windows.x)[:, :t].reshape(-1, windows.x.shape[-1])
-        return jnp.stack([*space.features(x, 0 * x[:, :1]).values()])
+        found = [*space.features(x, 0 * x[:, :1]).values()]
+        return [jnp.stack([each for each in found if len(each) == size]) for size in sorted({*map(len, found)})]
 
     def share(inside: Array, other: Array) -> Float[Array, ""]:
         low, high = jnp.nanquantile(inside, jnp.asarray(RANGE), axis=1, keepdims=True)
         return jnp.max(jnp.mean((other < low) | (other > high), axis=1))
 
-    of_known, of_asked = features(known), features(asked)
-    return jnp.stack([share(of_known, of_asked), share(of_asked, of_known)])
+    pair = features(known), features(asked)
+    shares = [[share(*each) for each in zip(*both, strict=True)] for both in (pair, pair[::-1])]
+    return jnp.max(jnp.asarray(shares), axis=1)
 
 
 def blocks_of(
