@@ -25,7 +25,8 @@ class Quantity:
         labels: a short name of each entry, for example ("vx", "vy", "vz"); empty to use their indices. ValueError for
             another number of them.
         scale: the norm of a typical small difference of the quantity, in its unit.
-        uniform: whether its numbers are one quantity at many points, so that a constant disturbance is one number.
+        uniform: whether its numbers are one quantity at many points, so that a constant disturbance is one number, and
+            an expected error is that at one point.
     """
 
     name: str

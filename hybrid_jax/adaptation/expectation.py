@@ -101,7 +101,8 @@ def expected_errors(
         return float(rmse), float(rmse * np.exp(-away)), float(rmse * np.exp(away))
 
     horizons = range(2 if seconds[1] > seconds[0] else 1)
-    return {f"{seconds[i]:g} s": {one.name: around(part, one.scale, i) for part, one in space.parts} for i in horizons}
+    parts = [(one.name, part, one.scale / (one.size if one.uniform else 1) ** 0.5) for part, one in space.parts]
+    return {f"{seconds[i]:g} s": {name: around(*which, i) for name, *which in parts} for i in horizons}
 
 
 def lines_of(expected: Expected, units: Mapping[str, str]) -> list[str]:
