@@ -5,33 +5,23 @@ its words nor its pictures can be older than the program: a test makes all of th
 """
 
 import sys
-from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
-from typing import Any
 
-from experiments import ablation, changes, comparison, coverage
-from experiments.closed_loop import __main__ as closed_loop
-from experiments.excitation import __main__ as excitation
-from experiments.online import __main__ as online
-from experiments.paper import outcome
-from experiments.reaction_diffusion import __main__ as reaction_diffusion
-from experiments.real_flight import report as real_flight
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import JSON_NAME, PAGE_NAME, Report, lines_of, markdown_page, read_record, to_json
-from experiments.worlds import __main__ as worlds
 
 REFERENCE = Path(__file__).parents[1] / "docs/reference"
-REPORTS: Mapping[str, Callable[[Mapping[str, Any]], Report]] = {
-    **{"ablation": ablation.report, "changes": changes.report, "closed_loop": closed_loop.report},
-    **{"comparison": comparison.report, "coverage": coverage.report, "excitation": excitation.report},
-    **{"external_force": outcome.report, "online": online.report, "param_shift": outcome.report},
-    **{"reaction_diffusion": reaction_diffusion.report, "real_flight": real_flight.report, "worlds": worlds.report},
-}
+# Modules with the `report` of an experiment, if it is not in the one that you run.
+ELSEWHERE = {"param_shift": "paper.outcome", "external_force": "paper.outcome", "real_flight": "real_flight.report"}
 
 
 def report_of(folder: Path) -> Report:
     record = read_record(folder)
-    return REPORTS[record["experiment"]](record)
+    module = import_module(f"experiments.{ELSEWHERE.get(record['experiment'], record['experiment'])}")
+    if hasattr(module, "__path__"):  # a package
+        module = import_module(f"{module.__name__}.__main__")
+    return module.report(record)
 
 
 def written(folder: Path, report: Report) -> dict[str, str]:
