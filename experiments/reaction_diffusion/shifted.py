@@ -15,6 +15,7 @@ from experiments.reaction_diffusion.systems import COARSE, A, B, K, fitzhugh_nag
 from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, NO_PHYSICS, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Row
 from experiments.runner.stages import Found, Kept, rows_of
+from hybrid_jax.adaptation import Adaptation
 from hybrid_jax.trajectories import concatenate
 
 PART, AUTO = "shifted", "auto"
@@ -40,15 +41,21 @@ def learned(field, data: hj.Trajectories, steps: int) -> hj.AbstractVectorField:
     return hj.fit_gauss_newton(field, pieces(data, EVERY), max_steps=steps, solver=COARSE).field
 
 
-def by_parameters(field, data: hj.Trajectories, method: str) -> tuple[hj.AbstractVectorField, str | None]:
-    """Adapt by a method that does not train the network, or may; also return the choice of `auto`."""
-    # The same number of windows for every N, as they are dear. Each trajectory's begin a window later than those of the
-    # one before it: of eight trajectories they would all be beginnings, which say little of what comes after.
+def by_parameters(field, data: hj.Trajectories, learned_from: hj.Trajectories, method: str) -> Adaptation:
+    """Adapt by a method that does not train the network, or may."""
+    settings, learned_from = hj.Settings(solver=COARSE), selected(learned_from)
+    with warnings.catch_warnings(action="ignore"):  # the step is coarse for speed
+        return hj.adapt(field, selected(data), method=method, settings=settings, learned_from=learned_from)
+
+
+def selected(data: hj.Trajectories) -> hj.Trajectories:
+    """Return equally many windows for each number of trajectories, as they are dear.
+
+    Each trajectory's begin a window later than those of the one before it: of eight trajectories they would all be
+    beginnings, which say little of what comes after.
+    """
     every, each = WINDOW * len(data), range(len(data))
-    windows = concatenate([pieces(data[i : i + 1], every, WINDOW, WINDOW * i) for i in each])
-    with warnings.catch_warnings(action="ignore"):  # the step is coarse for speed, and all errors count as changes
-        result = hj.adapt(field, windows, method=method, settings=hj.Settings(solver=COARSE))
-    return result.field, result.chosen
+    return concatenate([pieces(data[i : i + 1], every, WINDOW, WINDOW * i) for i in each])
 
 
 def study(config: Config, kept: Kept) -> list[Row]:
@@ -58,15 +65,14 @@ def study(config: Config, kept: Kept) -> list[Row]:
     of_source = {(row["shift"], row["model"], row["seed"]): row["mse"] for row in rows}
     jobs = {}
     for seed, shift, model, n in product(range(config.seeds), config.shifts, MODELS, config.sizes):
-        known = trained[model, seed], of_source[shift, model, seed]
-        jobs[f"{shift}, {model}, N = {n}, seed {seed}"] = partial(adapted, config, *known, shift, model, n, seed)
+        source = trained[model, seed], of_source[shift, model, seed]
+        jobs[f"{shift}, {model}, N = {n}, seed {seed}"] = partial(adapted, config, *source, shift, model, n, seed)
     return rows + rows_of(kept(PART, jobs))
 
 
 def sources(config: Config, kept: Kept) -> dict[tuple[str, int], hj.AbstractVectorField]:
     def train(model: str, seed: int) -> Found:
-        data = reacting(fitzhugh_nagumo(plane(config.points)), SOURCES, (SOURCE, seed))
-        return [], {"weights": weights(learned(untrained(model, config, seed), data, config.steps))}
+        return [], {"weights": weights(learned(untrained(model, config, seed), known(config, seed), config.steps))}
 
     each = list(product(MODELS, range(config.seeds)))
     found = kept(f"{PART} source", {f"{model}, seed {seed}": partial(train, model, seed) for model, seed in each})
@@ -85,6 +91,12 @@ def before(config: Config, trained, shift: str) -> list[Row]:
 
 
 @cache
+def known(config: Config, seed: int) -> hj.Trajectories:
+    """Return what a source learns from."""
+    return reacting(fitzhugh_nagumo(plane(config.points)), SOURCES, (SOURCE, seed))
+
+
+@cache
 def tested(config: Config, shift: str) -> hj.Trajectories:
     return reacting(fitzhugh_nagumo(plane(config.points), *SHIFTS[shift]), -(-config.n_test // SHARE), (TEST, 0))
 
@@ -96,15 +108,15 @@ def targets(config: Config, shift: str, seed: int) -> hj.Trajectories:
 
 def adapted(config: Config, source, error_before: float, shift: str, model: str, n: int, seed: int) -> Found:
     """Return the rows of a source adapted to N trajectories by each method."""
-    data, test = targets(config, shift, seed)[:n], tested(config, shift)
-    chosen = dict[str, str | None]()
+    data, test, chosen = targets(config, shift, seed)[:n], tested(config, shift), dict[str, str | None]()
     fields = {
         FINE_TUNED: learned(source, data, min(TUNING, config.steps)),
         TARGET_ONLY: learned(untrained(model, config, seed), data, min(SCRATCH, config.steps)),
     }
     if model == HYBRID:
-        fields[LEAST_SQUARES], _ = by_parameters(source, data, "theta_least_squares")
-        fields[AUTO], chosen[AUTO] = by_parameters(source, data, "auto")
+        adapt = partial(by_parameters, source, data, known(config, seed))
+        fields[LEAST_SQUARES], found = adapt("theta_least_squares").field, adapt(AUTO)
+        fields[AUTO], chosen[AUTO] = found.field, found.chosen
     errors = {mode: error(field, test, COARSE) for mode, field in fields.items()}
     return [
         _tags(shift, model, seed)
