@@ -65,9 +65,10 @@ class Config(Run):
     units: Count = 12
     """Hidden units of the hybrids that are adapted."""
     starts: Count = 3
-    """Random networks to start with; the one with the least training loss after ten steps is continued."""
+    """Random networks to start with; that with the least training loss after ten steps is continued, for Gray–Scott
+    after twenty."""
     steps: Annotated[Count, Named(name="iterations")] = 35
-    """Gauss–Newton steps on single intervals, the first ten included."""
+    """Gauss–Newton steps on single intervals, the first ten included; for Gray–Scott at most four times as many."""
     polish: Count = 8
     """Gauss–Newton steps on whole trajectories."""
 

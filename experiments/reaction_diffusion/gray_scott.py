@@ -4,6 +4,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import numpy as np
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import Config
@@ -21,19 +22,21 @@ NEW = tuple((f, k) for f in (0.033, 0.036) for k in (0.059, 0.061))
 GUESS = (0.0345, 0.060)  # F and k in all environments at the start
 TRAIN, ADAPT, TEST = 30, 31, 32  # first numbers of the seeds of data
 EVERY = 3  # intervals between the windows that are trained on
-# Whether F and k are held at the guess, and most Gauss–Newton steps: at first they would stand for the reaction that
-# the network does not yet know, and come back slowly.
-STAGES = ((True, 20), (False, 35))
+# Most Gauss–Newton steps with F and k held at the guess, of each start, and then with both free, of the best. Free at
+# first, they would stand for the reaction that the network does not yet know, and come back slowly.
+HELD, FREE = 20, 140
 UNITS = 16  # of the network, at most --hidden
 SHARE = 3  # test trajectories of an environment: --n-test over this
 SCALING = ChannelScaling((0.6, 0.15), (0.3, 0.15), (0.02,))
 
 
 def trained(start: Any, data: hj.Trajectories, steps: int, held: bool) -> Found:
-    """Return the weights after Gauss–Newton; `held`: for the network only."""
+    """Return the weights after Gauss–Newton, and the loss; `held`: for the network only."""
     field = hj.Hybrid(hj.Frozen(start.physics), start.residual) if held else start
-    found: Any = hj.fit_gauss_newton(field, data, max_steps=steps, solver=SCOTT_COARSE).field
-    return [], {"weights": weights(hj.Hybrid(start.physics, found.residual) if held else found)}
+    fit = hj.fit_gauss_newton(field, data, max_steps=steps, solver=SCOTT_COARSE)
+    found: Any = fit.field
+    loss = np.nan_to_num(fit.loss, nan=np.inf)
+    return [], {"weights": weights(hj.Hybrid(start.physics, found.residual) if held else found), "loss": loss}
 
 
 def source_model(config: Config, kept: Kept) -> Any:
@@ -42,16 +45,21 @@ def source_model(config: Config, kept: Kept) -> Any:
     physics = gray_scott([GUESS] * len(TRAINED_IN), False, config.points)
     data = concatenate([pieces(part, EVERY) for part in parts])
     hj.check_grid(physics.grid, data, diffusivity=(D_U, D_V), substeps=SCOTT_COARSE.substeps)
-    size = {"outputs": 1, "hidden": min(UNITS, config.hidden)}
-    network = hj.residual_network(2, 0, jax.random.key(0), **size, activation="tanh", norm="none", scaling=SCALING)
+    starts = [untrained(physics, min(UNITS, config.hidden), seed) for seed in range(config.starts)]
+    name, most = f"{PART} source in {len(data)} windows", min(HELD, config.steps)
+    jobs = {f"start {seed}": partial(trained, start, data, most, True) for seed, start in enumerate(starts)}
+    found = [arrays for _, arrays in kept(f"{name}, F and k held", jobs).values()]
+    best = with_weights(starts[0], min(found, key=lambda arrays: arrays["loss"])["weights"])
+    job = {name: partial(trained, best, data, min(FREE, 4 * config.steps), False)}
+    return with_weights(best, kept(f"{name}, F and k free", job)[name][1]["weights"])
+
+
+def untrained(physics: Any, hidden: int, seed: int) -> Any:
+    size = {"outputs": 1, "hidden": hidden}
+    network = hj.residual_network(2, 0, jax.random.key(seed), **size, activation="tanh", norm="none", scaling=SCALING)
     # Zero at first, or 40 s of a wrong reaction hide the right one.
     rate: Any = zero_output(network)
-    source: Any = hj.Hybrid(physics, Conversion(GridNetwork(rate, physics.grid)))
-    for held, most in STAGES:
-        name = f"source in {len(data)} windows, F and k {'held' if held else 'free'}"
-        train = partial(trained, source, data, min(most, config.steps), held)
-        source = with_weights(source, kept(f"{PART} {name}", {name: train})[name][1]["weights"])
-    return source
+    return hj.Hybrid(physics, Conversion(GridNetwork(rate, physics.grid)))
 
 
 def study(config: Config, kept: Kept) -> list[Row]:
