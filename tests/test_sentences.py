@@ -9,11 +9,11 @@ from smoke import ROOT
 from test_numbers import DOCS, PAPER, REFERENCE, committed, fitted_of_coverage, lines
 
 import hybrid_jax as hj
+from experiments.changes.verdicts import EACH, MEAN
 from experiments.online.results import error
 from experiments.paper.outcome import FLOOR
 from experiments.paper.regret import AUTO, ERRORS, NEAR, of_each_case, over, regret
 from experiments.reporting.tables import measured
-from experiments.worlds.verdicts import EACH, MEAN
 from hybrid_jax import trajectories
 from hybrid_jax.cli import export
 from hybrid_jax.control import Controller
@@ -145,7 +145,7 @@ def of_intervals():
     yield "results/intervals", f"k is {small}"
     high = lines("docs/results/intervals.md")["Hummingbird, gusty wind"][1]
     yield "explanation/failures", f"{small}, and 95 % intervals of one source contain the true value in {high} % of"
-    claims = json.loads((REFERENCE / "worlds/report.json").read_text())["claims"]
+    claims = json.loads((REFERENCE / "changes/harm/report.json").read_text())["claims"]
     harm, *said, sources, kept = (claim["measured"] for claim in claims)
     harms = [[*map(float, re.findall(r"([\d.]+), worst ([\d.]+)$", case)[0])] for case in harm.split("; ")]
     sound = [mean <= MEAN and worst <= EACH for mean, worst in harms]
@@ -162,10 +162,10 @@ def of_intervals():
     yield "results/intervals", f"at most {worst} % from the vehicles'"
     cases, shares = zip(*re.findall(r"(\d+) of \d+ sources: ([\d.]+)%", kept), strict=True)
     yield "results/intervals", f"{min(map(float, shares)):.0f} % of {sum(map(int, cases))} intervals of kept parameters"
-    hover = committed("worlds").where(flight="hover", method="auto")
+    hover = committed("changes/harm").where(flight="hover", method="auto")
     infinite = [row[f"{name}_kept_inside"] is None for row in hover for name in ("Ix", "Iy")]
     yield "results/intervals", f"after a hover {sum(infinite)} of {len(infinite)} of Ix and Iy were infinite"
-    page = (REFERENCE / "worlds/report.md").read_text()
+    page = (REFERENCE / "changes/harm/report.md").read_text()
     other = dict(re.findall(r"^\| Humm.*? hj.adapt \| usual flight \| (\w+) .* \| (\S+ \| \S+) \|$", page, re.M))
     errors, widths = zip(*(other[name].split(" | ") for name in ("Ix", "Iy", "k")), strict=True)
     yield "results/intervals", "±{} % (Ix), ±{} % (Iy) and ±{} % (k) wide".format(*widths)

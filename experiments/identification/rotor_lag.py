@@ -14,8 +14,7 @@ import hybrid_jax as hj
 from experiments.reporting.tables import Table, print_table
 from experiments.runner import command
 from experiments.runner.options import Count, CountFromZero, Positive, Several
-from experiments.worlds.flights import WORLDS, usual_flights
-from experiments.worlds.methods import PHYSICS
+from experiments.worlds.flights import PHYSICS, WORLDS, usual_flights
 from experiments.worlds.world import DT, Flown, logged
 from hybrid_jax import metrics
 from hybrid_jax.dynamics import SampledRotors

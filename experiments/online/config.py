@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
 from experiments.flying.scenario import Reference, hardware
+from experiments.paper.config import WorldName
 from experiments.runner.options import Named, NotNegative, Positive, Run, Several
-from experiments.worlds.cases import WORLDS, WorldName
+from experiments.worlds.flights import WORLDS
 from experiments.worlds.rotorpy import RotorPy
 from experiments.worlds.world import DT
 from hybrid_jax.control import Controller, Hardware

@@ -8,7 +8,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from experiments.flying import plant
 from experiments.flying.changes import LOST_THRUST, weak_rotor
-from experiments.worlds.cases import WORLDS, usual_flights
+from experiments.worlds.flights import WORLDS, usual_flights
 from experiments.worlds.iris import domain_of
 from experiments.worlds.rotorpy import Constants, RotorPy, advance, derivative
 from experiments.worlds.world import DT, NOTHING

@@ -19,7 +19,6 @@ from experiments.reporting.report import Report
 from experiments.reporting.results import Results, Row
 from experiments.runner.stages import Stages, stages_of
 from experiments.worlds.iris import Iris, domain_of
-from experiments.worlds.methods import PHYSICS
 from experiments.worlds.rotorpy import ROTORPY
 from experiments.worlds.world import DT, NOTHING, USUAL, Flown, World, logged
 from hybrid_jax.adaptation import LeastSquares
@@ -34,6 +33,8 @@ from hybrid_jax.trajectories import Trajectories
 
 WORLDS: dict[str, World] = {world.name: world for world in (Iris(), *ROTORPY)}
 LEARNING = 20.0  # s, of a flight
+# Learned without a network.
+PHYSICS = "Ix", "Iy", "Iz", "k", "drag", "aerodynamic_moment", "rate_damping", "translational_lift", "rotor_drag"
 SPARE = 1.5  # times as many flights are flown as are needed
 
 

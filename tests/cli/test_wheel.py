@@ -15,7 +15,7 @@ from smoke import ROOT
 from writers import MAP
 
 from experiments.real_flight.simulated import vehicle_toml
-from experiments.worlds.cases import WORLDS
+from experiments.worlds.flights import WORLDS
 from hybrid_jax import IRIS, load, load_vehicle, rigid_body, rollout, save
 from hybrid_jax.cli.command import VERBS
 from hybrid_jax.flights import FlightLog

@@ -164,8 +164,8 @@ def test_the_command_line_is_explained_or_refused_in_one_line(name, arguments, c
     assert len(said.err.splitlines()) == (code != 0)
 
 
-PACKAGES = ("closed_loop", "excitation", "online", "reaction_diffusion", "real_flight", "worlds")
-NAMES = "ablation changes closed_loop comparison coverage excitation external_force online param_shift worlds"
+PACKAGES = ("changes", "closed_loop", "excitation", "online", "reaction_diffusion", "real_flight")
+NAMES = "ablation changes closed_loop comparison coverage excitation external_force online param_shift changes.harm"
 
 
 @pytest.mark.parametrize("name", [*NAMES.split(), "reaction_diffusion", "real_flight", "make_flights"])

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
+from experiments.changes.measures import EXPECTED, parameters_of
+from experiments.changes.verdicts import CLAIMS
 from experiments.reaction_diffusion.models import pieces
 from experiments.reaction_diffusion.systems import COARSE, DT, FINE, fitzhugh_nagumo, plane, reacting, trajectories
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
-from experiments.worlds.cases import WORLDS
-from experiments.worlds.measures import EXPECTED, parameters_of
+from experiments.worlds.flights import WORLDS
 from experiments.worlds.rotorpy import CRAZYFLIE, HUMMINGBIRD, decide, derivative
-from experiments.worlds.verdicts import CLAIMS
 from experiments.worlds.world import BURST, Reference, logged
 from hybrid_jax.adaptation.results import Parameter
 from hybrid_jax.vehicle import IRIS

@@ -196,7 +196,7 @@ def _share_inside(choice: Choice, windows: Trajectories, flown: np.ndarray) -> f
 
 
 ABOUT = "One flight of ten seconds after a change of the vehicle: which method is chosen, and is it the right one?"
-ABOUT += " experiments.worlds asks it without a change, from a hover, and after changes that no candidate expresses."
+ABOUT += " After no change, from a hover, and after changes that no candidate expresses: experiments.changes.harm."
 main = partial(command.run, NAME, ABOUT, partial(in_each_world, NAME, TAGS, of_world, report), presets=PRESETS)
 
 if __name__ == "__main__":

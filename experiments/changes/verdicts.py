@@ -7,14 +7,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from experiments.changes.measures import EXPECTED as HORIZONS
+from experiments.changes.methods import AUTO, NOT_ADAPTED
 from experiments.reporting.claims import Claim, Part, Undecided, all_of, every
 from experiments.reporting.names import label
 from experiments.reporting.plots import METHODS, STYLE, legend_below, name_lines, subplots, tick_errors
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Estimate, mean_interval, share_interval
 from experiments.reporting.tables import EMPTY, Table, tabulate
-from experiments.worlds.measures import EXPECTED as HORIZONS
-from experiments.worlds.methods import AUTO, NOT_ADAPTED
 from experiments.worlds.world import NOTHING
 from hybrid_jax.dynamics.rigid_body import LEARNED
 

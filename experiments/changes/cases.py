@@ -11,15 +11,15 @@ import tyro
 from jaxtyping import PRNGKeyArray
 
 import hybrid_jax as hj
+from experiments.changes.measures import EXPECTED, error_of, expected_inside, parameters_of
+from experiments.changes.methods import AUTO, METHODS, NOT_ADAPTED, Task
 from experiments.paper.config import OneFlight, WorldName
 from experiments.reporting.results import Row
 from experiments.runner.cache import identity_of
 from experiments.runner.options import Count, Several
 from experiments.runner.stages import Found, Stages, rows_of
 from experiments.worlds.flights import LEARNING, WORLDS, trained, usual_flights
-from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
-from experiments.worlds.methods import AUTO, METHODS, NOT_ADAPTED, Task
-from experiments.worlds.world import CHANGES, MADE_FOR, NOTHING, USUAL, World, logged
+from experiments.worlds.world import CHANGES, MADE_FOR, NOT_MADE_FOR, NOTHING, USUAL, World, logged
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import lane
 
@@ -55,10 +55,10 @@ FLIGHTS: dict[str, Manner] = {
 
 
 @dataclass(frozen=True)
-class WorldsConfig(OneFlight):
+class HarmConfig(OneFlight):
     """Adapt to a usual flight after each change, and to other flights, for example a hover, after none."""
 
-    changes: Several[ChangeName] = CHANGES
+    changes: Several[ChangeName] = (*NOT_MADE_FOR, "reaction_torque", "external_force", "parameter_shift")
     """Which changes of the vehicle."""
     worlds: Several[WorldName] = ("iris", "hummingbird", "crazyflie")
     """Simulated vehicles. iris: our own simulator. hummingbird, crazyflie: vehicles of RotorPy."""
@@ -73,7 +73,7 @@ class WorldsConfig(OneFlight):
     sizes: Annotated[tuple[int, ...], tyro.conf.Suppress] = (100,)
     pool: Annotated[int | None, tyro.conf.Suppress] = None
     draw: Annotated[Literal["random", "contiguous"], tyro.conf.Suppress] = "contiguous"
-    rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
+    rivals: tuple[ChangeName, ...] = ("parameter_shift", "reaction_torque")
     """Changes after which other methods are compared with `hj.adapt`, on the first flight of six sources."""
 
     def cases(self) -> Iterator[tuple[ChangeName, FlightName]]:
@@ -83,12 +83,12 @@ class WorldsConfig(OneFlight):
                     yield change, flight
 
 
-def key_of(world: World, config: WorldsConfig, purpose: int, draw: int = 0) -> PRNGKeyArray:
+def key_of(world: World, config: HarmConfig, purpose: int, draw: int = 0) -> PRNGKeyArray:
     key = jax.random.fold_in(jax.random.key(config.data_seed), [*WORLDS].index(world.name))
     return jax.random.fold_in(jax.random.fold_in(key, purpose), draw)
 
 
-def source_flights(world: World, config: WorldsConfig, seed: int) -> Dataset:
+def source_flights(world: World, config: HarmConfig, seed: int) -> Dataset:
     """Fly a source's training and validation flights: each seed has its own, as intervals concern their errors too."""
     numbers = {"train": config.source_train, "validation": config.validating()}
     each = round(LEARNING / STEPS * 100)
@@ -101,7 +101,7 @@ def source_flights(world: World, config: WorldsConfig, seed: int) -> Dataset:
     return Dataset(splits, {"config": {"domain": world.name}})
 
 
-def flown_after(world: World, change: str, flight: str, number: int, config: WorldsConfig) -> hj.Trajectories:
+def flown_after(world: World, change: str, flight: str, number: int, config: HarmConfig) -> hj.Trajectories:
     kind, seconds, noise, burst = FLIGHTS[flight]
     flown = world.fly(change, kind, 1, seconds, key_of(world, config, TARGET, number))
     key, averaged = key_of(world, config, NOISE, 1 + number), config.rotor_speeds == "averaged"
@@ -115,7 +115,7 @@ class Tests(NamedTuple):
     logged: list[hj.Trajectories]
 
 
-def tests_after(world: World, change: str, config: WorldsConfig, seed: int) -> Tests:
+def tests_after(world: World, change: str, config: HarmConfig, seed: int) -> Tests:
     key, averaged = key_of(world, config, TEST, seed), config.rotor_speeds == "averaged"
     flown = usual_flights(world, change, config.n_test, TESTING, key)
     noisy = logged(flown, key, LONG, noise=config.noise, averaged=averaged)
@@ -124,7 +124,7 @@ def tests_after(world: World, change: str, config: WorldsConfig, seed: int) -> T
     return Tests(logged(flown, key, LONG, noise=0.0, averaged=averaged), others)
 
 
-def many_after(world: World, change: str, config: WorldsConfig) -> tuple[hj.Trajectories, hj.Trajectories]:
+def many_after(world: World, change: str, config: HarmConfig) -> tuple[hj.Trajectories, hj.Trajectories]:
     """Return windows of many flights for training, and others for early stopping, without noise."""
     flown = usual_flights(world, change, MANY + 1, LEARNING, key_of(world, config, TRAINING))
     averaged = config.rotor_speeds == "averaged"
@@ -133,7 +133,7 @@ def many_after(world: World, change: str, config: WorldsConfig) -> tuple[hj.Traj
     return windows[:first], windows[first:]
 
 
-def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
+def adapted(world: World, config: HarmConfig, stages: Stages) -> list[Row]:
     """Return a world's rows: for each case, source, draw and method the change of the error on usual flights.
 
     Each source has flights of its own, to adapt to and to test on as well, so that sources are independent cases.

@@ -10,11 +10,10 @@ import jax.numpy as jnp
 
 import hybrid_jax as hj
 from experiments.paper.conditions import sensor_noise
+from experiments.worlds.flights import PHYSICS
 from experiments.worlds.world import DT, World
 from hybrid_jax.adaptation import Adaptation, FineTune, Method, Parameter
 
-# Learned without a network.
-PHYSICS = "Ix", "Iy", "Iz", "k", "drag", "aerodynamic_moment", "rate_damping", "translational_lift", "rotor_drag"
 CHANGING = 1.0  # m/s² and rad/s²: the filter's prior of a disturbance
 
 

@@ -1,0 +1,1 @@
+"""Changes of a vehicle: which method adapts to them, and whether adaptation ever does harm."""
