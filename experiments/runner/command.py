@@ -26,7 +26,7 @@ from hybrid_jax.sweep import hosts
 Options = TypeVar("Options")
 # Of the full experiment on two cores, as the stages of the report in docs/reference took together.
 MINUTES = {"param_shift": 35, "external_force": 35, "changes": 160, "ablation": 160, "closed_loop": 90, "excitation": 9}
-MINUTES |= {"online": 42, "reaction_diffusion": 29}
+MINUTES |= {"online": 42, "reaction_diffusion": 54}
 
 
 def run(
