@@ -36,7 +36,7 @@ def test_the_interval_holds_another_flight_s_error_in_four_of_five_cases(skewed)
     assert 0.7 <= np.mean(held) <= 0.9
 
 
-def test_the_value_is_the_rmse_over_all_blocks():
+def test_the_value_is_the_rmse_over_all_blocks_and_points_of_a_grid():
     squares = np.random.default_rng(0).gamma(2.0, size=(7, 2, 3))
     found = expected_errors(squares, (0.1, 1.0), StateSpace().padded(3))
     assert [*found] == ["0.1 s", "1 s"]
@@ -44,7 +44,7 @@ def test_the_value_is_the_rmse_over_all_blocks():
         for i, (value, low, high) in enumerate(errors.values()):
             assert value == pytest.approx(np.sqrt(squares[:, horizon, i].mean()))
             assert low < value < high
-    ((value, low, high),) = expected_errors(np.ones((1, 2, 1)), (0.1, 0.1), LINE)["0.1 s"].values()
+    value, low, high = expected_errors(np.ones((1, 2, 4)), (1.0, 1.0), hj.Grid((4,)).state_space)["1 s"]["component 0"]
     assert (value, low, high) == (1.0, 0.0, np.inf)  # one block bounds nothing
 
 
