@@ -14,7 +14,7 @@ from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.anchored import has_network
 from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
-from hybrid_jax.adaptation.outliers import outliers
+from hybrid_jax.adaptation.outliers import without_outliers
 from hybrid_jax.adaptation.plausible import THETA, groups_of, values_of
 from hybrid_jax.adaptation.pooling import satterthwaite
 from hybrid_jax.adaptation.results import Adaptation, Choice, Parameter
@@ -37,7 +37,6 @@ from hybrid_jax.status import Status
 from hybrid_jax.training.objective import UNSCALED, Settings, TrajectoryLoss, scaled_loss
 from hybrid_jax.trajectories import Trajectories, check_like, concatenate, features_of, overflows, shares_outside
 
-FEWEST = 10  # windows without outliers that are enough; with fewer, all windows are used
 HELD_OUT = 5  # the last of so many equal parts of the windows is held out for validation
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; check dt and all units"
@@ -123,11 +122,10 @@ def adapt(
         checks.warn(OVERLAP)
     keep_programs("adapt", windows.x.shape)
     with solver_errors(solver):
-        given, errors = len(windows), np.asarray(errors_in(windows, field, compact(solver)))
-    good = ~outliers(errors, windows)
-    if good.sum() < max(FEWEST, given / 2):
-        good[:] = True
-    windows, errors = (windows, errors) if good.all() else (windows[good], errors[good])
+        errors = np.asarray(errors_in(windows, field, compact(solver)))
+    not_measured = float(np.isnan(windows.x).mean())
+    windows, good, set_aside = without_outliers(windows, errors)
+    errors = errors if good.all() else errors[good]
     flights = None if flights is None or len(set(flights[good])) < 2 else flights[good]
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
     if validation is not None:
@@ -171,8 +169,8 @@ def adapt(
         steps=int(solution.steps),
         status=status,
         level=level,
-        set_aside=(given - len(windows)) * windows.horizon,
-        not_measured=float(np.isnan(windows.x).mean()),
+        set_aside=set_aside,
+        not_measured=not_measured,
         outside=shares_outside(*ranges) if ranges else {},
         **choice,
         **_parameters(field, adapted, train, settings, level, without, solution.choice),

@@ -130,7 +130,7 @@ class Adaptation:
             distribution; None without intervals.
         absorbed: the part of each variance due to what the network may have taken; None without intervals.
         changed: parameters that differ significantly from the source's, the most significant first.
-        set_aside: number of samples in windows with outliers, which were not used.
+        set_aside: number of samples with outliers, which count as not measured, or whose window begins with one.
         not_measured: share of the states of the windows, 0 to 1, that are NaN, which counts as not measured.
         candidates: "auto" only: probability of each change by name, 0 to 1; the network's is relative to `chosen`.
         chosen: "auto" only: name of the chosen candidate.
@@ -179,7 +179,7 @@ class Adaptation:
         after = f" after {self.steps} steps" if self.steps else ""
         yield f"Adapted to {self.windows} windows by {self.method}: {self.status.message}{after}."
         if self.set_aside:
-            yield f"Set aside: {self.set_aside} samples, in windows with outliers."
+            yield f"Set aside: {self.set_aside} samples with outliers."
         if self.not_measured:
             yield f"Not measured: {self.not_measured:.1%} of the states, which are NaN; they count as no error."
         yield f"Mean squared prediction error: {self.mse_before:.3g} before, {self.mse_after:.3g} after."
