@@ -33,6 +33,7 @@ from .dynamics import (
 )
 from .estimation import (
     covariance_of,
+    estimate_windows,
     fit_disturbance,
     fit_least_squares,
     fit_records,
@@ -65,5 +66,5 @@ __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridg
 __all__ += ["Excitation", "FlightBounds", "InputBounds", "excitation"]
 __all__ += ["ExtendedKalmanFilter", "Hypothesis", "OnlineAdaptation"]
 __all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]
-__all__ += ["Record", "StateSpaceModel", "fit_records", "predict", "simulate", "with_hidden"]
+__all__ += ["Record", "StateSpaceModel", "estimate_windows", "fit_records", "predict", "simulate", "with_hidden"]
 __all__ += ["adapt_records", "fit_disturbance", "observe"]

@@ -60,7 +60,7 @@ def learned(physics: hj.AbstractVectorField, flown: Flown, prior, key, options: 
     levels = 1.0, 1.0, 0.0
     windows = [logged(one, own, SHORT, noise=n) for one, own, n in zip(split, keys, levels, strict=True)]
     fitted = hj.fit_records(model, records(logged(split[0], keys[0], LONG)), dt=DT, prior=prior)
-    field = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), fitted.model.field)
+    field = fitted.model.field
     network = hj.residual_network(STATE_SIZE, windows[0].u.shape[-1], jax.random.key(1), norm="none")
     hybrid = hj.Hybrid(field, zero_output(network))
     rates, settings = hj.rates_by_group(hybrid, {"residual": 1e-3}), Settings(objective=scaled_loss(field, windows[0]))

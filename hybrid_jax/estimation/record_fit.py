@@ -38,7 +38,8 @@ class RecordFit(eqx.Module):
     """The result of `fit_records`.
 
     Attributes:
-        model: the model with the fitted numbers and the noise; it starts like the first record.
+        model: the model with the fitted numbers, in double precision if JAX has it enabled, and the noise; it starts
+            like the first record.
         starts: the state at the start of each record (r, d).
         starts_error: the standard error of `starts` (r, d); three rotation angles [rad] for an attitude.
         ends: the state at the end of each record (r, d).
@@ -180,7 +181,7 @@ def fit_records(
         sizes = {k: v.tolist() for k, v in search.weighted(errors, robust, known).problem.scale.items()}
         own = {"outputs": {**given.outputs, **found.model.outputs}, "angles": given.angles}
         fitted = dataclasses.replace(found.model, noise={**given.noise, **sizes}, **own)
-        found = dataclasses.replace(found, model=fitted)
+    found = dataclasses.replace(found, model=in_double(fitted))
     warn_of_steps(found.discretisation, f"a smaller dt, or substeps={2 * substeps}")
     if found.status != Status.OK:
         checks.warn(f"records: the fit {found.status.message}; check all units and the model")

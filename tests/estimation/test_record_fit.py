@@ -106,6 +106,20 @@ def test_what_follows_is_predicted_from_what_was_seen(fitted):
     assert np.sqrt(np.mean((y["angle"] - seen) ** 2)) < 2 * NOISE
 
 
+def test_windows_begin_at_states_estimated_from_the_samples_around_them():
+    seen = records()[0].signals
+    data = Record("r", {"torque": seen["torque"], "x[0]": seen["angle"]})
+    model = hj.StateSpaceModel(pendulum(), ("torque",), None, (0.5, 0.0), (np.inf,) * 2, noise={"x[0]": NOISE})
+    windows = hj.estimate_windows(model, [data], dt=0.02, steps=40, around=0.5)
+    places = 25 + 40 * np.arange(len(windows))[:, None] + np.arange(41)
+    x0, *x = np.moveaxis(hj.simulate(model, data, dt=0.02)[1][places], 1, 0)
+    assert (np.std(windows.x0 - x0, axis=0) < (NOISE, 0.06)).all()
+    errors = windows.x - np.stack(x, axis=1)
+    assert (np.nanstd(errors), np.isnan(errors[..., 1]).all()) == (pytest.approx(NOISE, rel=0.2), True)
+    for wrong, around, said in ((model, 5, "all are shorter than 10 s"), (model_of(pendulum()), 1, "is a function of")):
+        refusal(lambda w=wrong, a=around: hj.estimate_windows(w, [data], dt=0.02, steps=40, around=a), said)
+
+
 @pytest.mark.parametrize("size", [3.0, 30.0])  # the first round must not follow a large one
 def test_a_burst_of_outliers_is_set_aside(size):
     torque, signal = (records()[0].signals[name] for name in ("torque", "angle"))
@@ -174,23 +188,18 @@ def oscillator():
     return Oscillator(jnp.log(5.0), jnp.array(-2.0), jnp.array([0.0, 0.0, 3.0]), jnp.array([4.0]), (1,))
 
 
-@pytest.mark.parametrize(
-    ("part", "extra", "at", "truth"),
-    [
-        (Lag(jnp.log(jnp.array([0.2])), (0,)), 1, lambda part: part.log_time_constant, np.log(0.2)),
-        (Lag(jnp.log(jnp.array([0.2])), (0,), 3), 3, lambda part: part.log_time_constant, np.log(0.2)),
-        (oscillator(), 2, lambda part: part.log_frequency, np.log(5.0)),
-    ],
-    ids=["lag", "delay", "oscillator"],
-)
-def test_a_hidden_part_is_found(part, extra, at, truth):
-    true = with_hidden(pendulum(), part)
+HIDDEN = [(Lag(jnp.log(jnp.array([0.2])), (0,), order), order, "log_time_constant") for order in (1, 3)]
+
+
+@pytest.mark.parametrize(("part", "extra", "name"), [*HIDDEN, (oscillator(), 2, "log_frequency")])
+def test_a_hidden_part_is_found(part, extra, name):
+    true, truth = with_hidden(pendulum(), part), getattr(part, name)
     data = [record(true, (0.5, 0.0, *(0.0,) * extra), seed=4, samples=200, noise=1e-3)]
-    start = eqx.tree_at(lambda field: at(field.parts[0]), true, at(part) + 0.2)
+    start = eqx.tree_at(lambda field: getattr(field.parts[0], name), true, truth + 0.2)
     frozen = eqx.tree_at(lambda field: field.field, start, hj.Frozen(pendulum()))
     model = model_of(frozen, 2 + extra, (np.inf,) * 2 + (1.0,) * extra, noise={"angle": 1e-2})
     fit = hj.fit_records(model, data, dt=0.02)
-    assert np.asarray(at(fit.model.field.parts[0])) == pytest.approx(truth, abs=0.05)
+    assert np.asarray(getattr(fit.model.field.parts[0], name)) == pytest.approx(np.asarray(truth), abs=0.05)
 
 
 class Decay(hj.AbstractVectorField):
