@@ -196,9 +196,10 @@ def _changed(source: RecordFit, fit: RecordFit, chosen: str, moves: Bool[np.ndar
     """
     found = fit.covariance * more * more[:, None]
     covariance = np.where(moves | moves[:, None], found, source.covariance)
-    values = intervals_of(fit.model, covariance, level)
-    apart = intervals_of(fit.model, found + source.covariance * more * more[:, None], level)
-    before = intervals_of(source.model, source.covariance, level)
+    both = found + source.covariance * more * more[:, None]
+    cases = (fit.model, covariance), (fit.model, both), (source.model, source.covariance)
+    with jax.enable_x64(True):
+        values, apart, before = (intervals_of(in_double(model), own, level) for model, own in cases)
     names = learned_numbers.learned_names(fit.model)
     moved = [name for name, move in zip(names, moves, strict=True) if move and name in values]
     changes = {name: Interval(*(end - before[name].value for end in apart[name])) for name in moved}
