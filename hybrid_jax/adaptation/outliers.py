@@ -12,7 +12,7 @@ ORDER = 3  # of the differences, which are small for a smooth model error
 FAR = 8.0  # robust standard deviations, which none of a million normal errors reaches
 DEVIATION = 1.4826  # the standard deviation of normal errors over their median size
 ROUGH = 0.3  # of the largest error: an error with smaller differences is smooth
-PIECE = 64  # samples in which outliers are searched together
+PIECE = 32  # samples in which outliers are searched together
 FEW = 6  # times as many differences as outliers of a piece, which are hardly explained by so few if all are wrong
 FEWEST = 10  # windows that are enough; if fewer are left, all are used
 MANY = "windows: {} of {} begin with an outlier, or have many; that is too many to leave out, so all samples are used"
@@ -58,8 +58,10 @@ def outliers(errors: Float[np.ndarray, "n t d"], windows: Trajectories) -> Bool[
         usual = DEVIATION * np.array([np.median(each) if each.size else np.inf for each in known]) + rounding
         limit = np.maximum(FAR * usual, motion)
         for piece in np.array_split(np.arange(path.shape[1]), -(-path.shape[1] // PIECE)):
-            for i in np.flatnonzero((np.nan_to_num(rough[:, piece[:-ORDER]]).max(axis=1) > limit).any(axis=-1)):
-                found[i, piece] = _searched(path[i, piece], limit[i])
+            far = np.nan_to_num(rough[:, piece[:-ORDER]]).max(axis=1) > limit
+            for i in np.flatnonzero(far.any(axis=-1)):
+                at = piece[:, None], np.flatnonzero(far[i])
+                found[i][at] = _searched(path[i][at], limit[i, far[i]])
     return found
 
 
@@ -71,7 +73,7 @@ def _searched(path: Float[np.ndarray, "t d"], limit: Float[np.ndarray, " d"]) ->
     columns = np.where(np.isfinite(rest)[..., None], np.diff(np.eye(t), ORDER, axis=0), 0)
     rest = np.where(np.isfinite(rest), rest, 0)
     wild = np.abs(rest).max(axis=-1) > np.maximum(limit, ROUGH * np.abs(np.nan_to_num(path)).max(axis=0))
-    for _ in range(len(rest.T) // FEW):
+    for _ in range(len(rest.T) // FEW if wild.any() else 0):
         length = np.sqrt(np.sum(columns**2, axis=1))
         unit = np.where(length[:, None] > 1e-6, columns / length[:, None], 0)
         most = np.argmax(np.abs(np.einsum("dkt,dk->dt", unit, rest)), axis=-1)
