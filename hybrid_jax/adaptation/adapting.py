@@ -79,8 +79,9 @@ def adapt(
         field: a trained `Hybrid`, or any other field.
         windows: windows of the changed system, in order of time and without overlap. You need more windows than
             parameters. If they follow each other, for example in one flight, intervals allow for errors that are
-            correlated within a fifth of the windows. NaN in x means "not measured" and counts as no error; x0 and u
-            must be finite. You may pass a list with the windows of each flight: `expected` then counts flights.
+            correlated within a fifth of the windows. NaN in x means "not measured" and counts as no error, as do
+            outliers; x0 and u must be finite. You may pass a list with the windows of each flight: `expected` then
+            counts flights.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` to write your own.
         validation: windows for early stopping and penalties; you should take them from another flight. By default the
             last fifth of `windows` is held out if the method needs validation.
