@@ -24,6 +24,9 @@ from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories
 
+NEAR = 0.25, 0.5, 1.0  # shares of a piece whose samples count, one after the other
+ROUNDING = 1e-6  # of a sample's time, in intervals
+
 
 @entry
 def estimate_windows(
@@ -106,9 +109,10 @@ def _part(record: Gridded, first: int, steps: int) -> Gridded:
     y, index, share = {}, {}, {}
     for name, values in record.y.items():
         at = record.index[name] + record.share[name] - first
-        inside = (at >= 0) & (at <= steps)
-        index[name] = np.minimum(at[inside].astype(int), steps - 1)
-        y[name], share[name] = values[inside], at[inside] - index[name]
+        inside = (at > -ROUNDING) & (at < steps + ROUNDING)
+        at = np.clip(at[inside], 0, steps)
+        index[name] = np.minimum(at.astype(int), steps - 1)
+        y[name], share[name] = values[inside], at - index[name]
     return Gridded(record.start, record.u[first : first + steps], y, index, share)
 
 
@@ -121,9 +125,17 @@ def _guess(model: StateSpaceModel, record: Gridded) -> Float[np.ndarray, " d"]:
 
 
 def _estimated(problem: Problem, guess: Float[np.ndarray, "n d"], pieces: list[Gridded]):
-    """Return the end of the search for the pieces' initial states, and the states along them (n, t + 1, d)."""
-    search = _search(problem, guess, pieces)
-    end = search.descend(search.theta, search.still)
+    """Return the end of the search for the pieces' initial states, and the states along them (n, t + 1, d).
+
+    At first only samples near the start count: from a poor guess, predictions of later ones are too far off.
+    """
+    for share in NEAR:
+        search = _search(problem, guess, pieces)
+        segments, last = search.segments, share * len(pieces[0].u)
+        near = {name: each & (segments.index[name] < last) for name, each in segments.there.items()}
+        search = search._replace(segments=segments._replace(there=near))
+        end = search.descend(search.theta, search.still)
+        guess = np.asarray(search.nodes(end.own)[0])[:, 0]
     return end, np.asarray(search.predicted(end.theta, end.own).states)[:, 0]
 
 
