@@ -30,10 +30,11 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
         relative = [part - one for part, one in zip(v, wind, strict=True)]
         air = [dot(column, relative) for column in zip(*attitude, strict=True)]
     force = _specific_force(constants, air, torque)
-    if is_present(constants["rotor_drag"]):
-        of_rotors, moment = _rotor_drag(vehicle, constants, air, omega, u)
-        force = [one + part / constants["mass"][0] for one, part in zip(force, of_rotors, strict=True)]
-        torque = [one + part for one, part in zip(torque, moment, strict=True)]
+    for name, at_hubs in (("rotor_drag", _rotor_drag), ("translational_lift", _translational_lift)):
+        if is_present(constants[name]):
+            of_rotors, moment = at_hubs(vehicle, constants, air, omega, u)
+            force = [one + part / constants["mass"][0] for one, part in zip(force, of_rotors, strict=True)]
+            torque = [one + part for one, part in zip(torque, moment, strict=True)]
     faster = _velocity_error(constants, velocity, force)
     turning = rotation.derivative(q, omega)
     if is_present(moment := constants["aerodynamic_moment"]):
@@ -84,15 +85,13 @@ def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
 
 
 def _specific_force(constants: Constants, air, torque):
-    """Return the specific force without thrust [m/s², body]: drag, lift, and a cable that torque balances."""
+    """Return the specific force without thrust [m/s², body]: drag, and a cable that torque balances."""
     drag, pull, (mass,) = constants["drag"], constants["cable_pull"], constants["mass"]
     x, y, z = 0.0, 0.0, 0.0
     if is_present(drag):
         x, y, z = (-(factor / mass) * part for factor, part in zip(drag, air, strict=True))
     if is_present(added := constants["added_drag"]):
         x, y, z = (one - factor * part for one, factor, part in zip((x, y, z), added, air, strict=True))
-    if is_present(lift := constants["translational_lift"]):
-        z = z + lift[0] / mass * dot(air[:2], air[:2])
     if is_present(pull):
         x, y = x + pull[0] / mass * torque[1], y - pull[1] / mass * torque[0]
     return [x, y, z]
@@ -101,14 +100,27 @@ def _specific_force(constants: Constants, air, torque):
 def _rotor_drag(vehicle: Vehicle, constants: Constants, air, omega: Rows, u: Rows):
     """Return the force [N] and torque [N m] of the rotors' drag −u_i H (Rᵀv + ω × r_i), at each hub r_i."""
     (hx, hy, hz), (vx, vy, vz), (wx, wy, wz) = constants["rotor_drag"], air, omega
-    centre = constants["centre_of_mass"]
-    xs, ys = ([place[i] - centre[i] for place in vehicle.rotor_positions] for i in range(2))
+    xs, ys = _hubs(vehicle, constants)
     total, x, y = sum(u[1:], u[0]), dot(xs, u), dot(ys, u)  # moments of the rotors' speeds
     xx, yy, xy = (dot([a * b for a, b in zip(*pair, strict=True)], u) for pair in ((xs, xs), (ys, ys), (xs, ys)))
     across, along = vx * y - wz * yy, vy * x + wz * xx
     inflow = vz * y + wx * yy - wy * xy, vz * x + wx * xy - wy * xx
     force = [-hx * (total * vx - wz * y), -hy * (total * vy + wz * x), -hz * (total * vz + wx * y - wy * x)]
     return force, [-hz * inflow[0], hz * inflow[1], hx * across - hy * along]
+
+
+def _translational_lift(vehicle: Vehicle, constants: Constants, air, omega: Rows, u: Rows):
+    """Return the force [N] and torque [N m] of L/n times the squared speed along x and y of each of n hubs."""
+    xs, ys = _hubs(vehicle, constants)
+    share = constants["translational_lift"][0] / vehicle.rotors
+    squares = [(air[0] - omega[2] * y) ** 2 + (air[1] + omega[2] * x) ** 2 for x, y in zip(xs, ys, strict=True)]
+    return [0.0, 0.0, share * sum(squares[1:], squares[0])], [share * dot(ys, squares), -share * dot(xs, squares), 0.0]
+
+
+def _hubs(vehicle: Vehicle, constants: Constants):
+    """Return the x and the y of each rotor from the centre of mass [m]."""
+    centre = constants["centre_of_mass"]
+    return ([place[i] - centre[i] for place in vehicle.rotor_positions] for i in range(2))
 
 
 def _velocity_error(constants: Constants, velocity, force):

@@ -54,16 +54,16 @@ class RigidBody(AbstractVectorField):
     """A rigid body carried by its rotors, with further `Terms`; x (13) and u are as in `hybrid_jax.vehicle`.
 
         ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
-        m f = C (τ_y, −τ_x, 0) − D Rᵀv − m c Rᵀv + L (v_x² + v_y²) e_z + Σ d_i,   E = diag(1, 1, 0)
-        d_i = −u_i H (Rᵀv + ω × r_i), which also adds the torque Σ r_i × d_i
+        m f = C (τ_y, −τ_x, 0) − D Rᵀv − m c Rᵀv + Σ d_i,   E = diag(1, 1, 0)
+        d_i = −u_i H v_i + L/n ‖E v_i‖² e_z,   v_i = Rᵀv + ω × r_i, which also adds the torque Σ r_i × d_i
 
     T and τ are thrust and torque of the rotors about the centre of mass. A rotor's thrust is k_i u_i², with the same or
     different k_i, and G scales the torque where the speeds do not determine it. For rotor drag D, the moment A and the
     damping B see Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag
     for accurate tracking of high-speed trajectories", 2018 (A has the other sign there). C is a cable that pulls at 1/C
     below the centre of mass. The state lacks the load's position, but the torque that balances its moment reveals it.
-    L is the translational lift of rotors that fly across their axis at the speed (v_x² + v_y²)^½ of Rᵀv, and H the drag
-    of each rotor at its hub r_i, which grows with its speed u_i; near hover it acts like D = Σ u_i H and a damping. See
+    The hub r_i of each of n rotors moves at v_i. L/n is its translational lift, for its speed ‖E v_i‖ across its axis,
+    and H its drag, which grows with its speed u_i; near hover it acts like D = Σ u_i H and a damping. See
     Svacha, Mohta and Kumar, "Improving quadrotor trajectory tracking by compensating for aerodynamic effects", 2017.
 
     S and λ describe a state estimator that assumes that all force but gravity is along the body's z axis, and corrects

@@ -40,7 +40,7 @@ class Terms:
         rate_damping: B about x, y and z [N m s].
         velocity_gain: S, the ratio of the position's derivative to the logged velocity.
         velocity_lag: λ, time constant of the estimated velocity for forces across the thrust [s].
-        translational_lift: L, force along z over the squared speed along x and y [N s²/m²].
+        translational_lift: L, force of all rotors along z over the squared speed of their hubs along x and y [N s²/m²].
         rotor_drag: H of each rotor along x, y and z, at its hub, per its speed [N s²/m].
         motor_time_constant: lag of the rotors behind logged motor values [s]; applied to logs, not by the field.
     """

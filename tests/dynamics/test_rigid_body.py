@@ -39,11 +39,11 @@ def newton_euler(x, u, vehicle, terms, k):
     attitude = np.eye(3) + 2 * w * skew + 2 * skew @ skew
     velocity, rates = attitude.T @ x[VELOCITY], x[BODY_RATES]
     force, torque, of_drag = -np.diag(terms.drag) @ velocity, np.zeros(3), np.zeros(3)
-    force[2] += terms.translational_lift * (velocity[0] ** 2 + velocity[1] ** 2)
     for place, sign, speed, one in zip(vehicle.rotor_positions, vehicle.spin, u, k, strict=True):
         hub = np.array([*(np.array(place) - terms.centre_of_mass), 0.0])
         own = np.array([0, 0, one * speed**2])
-        drag = -speed * np.array(terms.rotor_drag) * (velocity + np.cross(rates, hub))
+        air, lift = velocity + np.cross(rates, hub), terms.translational_lift / len(u)
+        drag = [0, 0, lift * (air[:2] @ air[:2])] - speed * np.array(terms.rotor_drag) * air
         force, torque, of_drag = force + own + drag, torque + np.cross(hub, own), of_drag + np.cross(hub, drag)
         torque[2] += sign * vehicle.torque_coefficient * speed**2
     inertia = np.diag(vehicle.inertia)
