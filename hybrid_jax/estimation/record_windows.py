@@ -65,9 +65,11 @@ def estimate_windows(
             are too short, no sample determines an initial state, or an argument is out of range.
     """
     records = checks.list_of("records", records, Record)
+    checks.instance("model", model, StateSpaceModel)
     checks.count("steps", steps)
-    checks.positive("dt", dt, "a positive number of seconds")
-    if not around >= dt:
+    for name, seconds in (("dt", dt), ("around", around)):
+        checks.positive(name, seconds, "a positive number of seconds")
+    if around < dt:
         raise ValueError(f"around must be at least dt = {dt:.3g} s, got {checks.short_repr(around)}")
     model, half = _with_states(model, records), round(around / dt)
     records = completed(records, tuple(model.outputs), model.angles)
