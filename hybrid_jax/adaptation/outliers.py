@@ -73,7 +73,9 @@ def _searched(path: Float[np.ndarray, "t d"], limit: Float[np.ndarray, " d"]) ->
     columns = np.where(np.isfinite(rest)[..., None], np.diff(np.eye(t), ORDER, axis=0), 0)
     rest = np.where(np.isfinite(rest), rest, 0)
     wild = np.abs(rest).max(axis=-1) > np.maximum(limit, ROUGH * np.abs(np.nan_to_num(path)).max(axis=0))
-    for _ in range(len(rest.T) // FEW if wild.any() else 0):
+    if not wild.any():
+        return found.T
+    for _ in range(len(rest.T) // FEW):
         length = np.sqrt(np.sum(columns**2, axis=1))
         unit = np.where(length[:, None] > 1e-6, columns / length[:, None], 0)
         most = np.argmax(np.abs(np.einsum("dkt,dk->dt", unit, rest)), axis=-1)

@@ -74,10 +74,10 @@ def estimate_windows(
     model, half = _with_states(model, records), round(around / dt)
     records = completed(records, tuple(model.outputs), model.angles)
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
-    least = half + max(steps, half)
-    places = [(each, i) for each in gridded for i in range(half, len(each.u) - least + half + 1, steps)]
+    after = max(steps, half)
+    places = [(each, i) for each in gridded for i in range(half, len(each.u) - after + 1, steps)]
     if not places:
-        raise ValueError(f"records: all are shorter than {least * dt:.3g} s; lower `steps` or `around`")
+        raise ValueError(f"records: all are shorter than {(half + after) * dt:.3g} s; lower `steps` or `around`")
     dtype = jnp.zeros(()).dtype
     with jax.enable_x64(True), solver_errors(solver), np.errstate(over="ignore", invalid="ignore"):
         model = in_double(eqx.tree_at(lambda model: model.field, model, Frozen(model.field)))
@@ -85,12 +85,12 @@ def estimate_windows(
         problem = Problem(model, scale, robust, dt, RK4() if solver is None else solver, substeps)
         near = [_part(each, i - half, 2 * half) for each, i in places]
         end, states = _estimated(problem, np.stack([_guess(model, each) for each in near]), near)
-        after = [_part(each, i, steps) for each, i in places]
-        x = _measured(problem, states[:, half], after)
+        windows = [_part(each, i, steps) for each, i in places]
+        x = _measured(problem, states[:, half], windows)
     if end.status != Status.OK:
         checks.warn(f"records: the search for initial states {end.status.message}; check all units and the model")
     kept = _determined(model, end) & ~np.isnan(x).all(axis=(1, 2))
-    u = np.stack([each.u for each in after])
+    u = np.stack([each.u for each in windows])
     return Trajectories(*(part[kept].astype(dtype) for part in (states[:, half], u, x)), dt=dt)
 
 
@@ -122,7 +122,8 @@ def _guess(model: StateSpaceModel, record: Gridded) -> Float[np.ndarray, " d"]:
     """Return the first measured states, and the model's start in place of others."""
     x = np.array(model.start)
     for name, values in record.y.items():
-        x[slice(*model.outputs[name].part)] = values[0] if len(values) else x[slice(*model.outputs[name].part)]
+        if len(values):
+            x[slice(*model.outputs[name].part)] = values[0]
     return x
 
 
@@ -131,13 +132,15 @@ def _estimated(problem: Problem, guess: Float[np.ndarray, "n d"], pieces: list[G
 
     At first only samples near the start count: from a poor guess, predictions of later ones are too far off.
     """
+    search = _search(problem, guess, pieces)
+    segments, own = search.segments, search.still
     for share in NEAR:
-        search = _search(problem, guess, pieces)
-        segments, last = search.segments, share * len(pieces[0].u)
+        last = share * len(pieces[0].u)
         near = {name: each & (segments.index[name] < last) for name, each in segments.there.items()}
-        search = search._replace(segments=segments._replace(there=near))
+        centres = search.nodes(own)[0]
+        search = search._replace(centres=centres, segments=segments._replace(there=near))
         end = search.descend(search.theta, search.still)
-        guess = np.asarray(search.nodes(end.own)[0])[:, 0]
+        own = end.own
     return end, np.asarray(search.predicted(end.theta, end.own).states)[:, 0]
 
 
