@@ -3,6 +3,7 @@
 import gc
 import os
 import signal
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -27,7 +28,7 @@ from experiments.runner.stages import Stage, Stages, rows_of
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.io.files import named_leaves
 from hybrid_jax.sweep.lanes import lane, stack
-from hybrid_jax.sweep.training import evaluate, sweep
+from hybrid_jax.sweep.training import PROGRAMS, _block, evaluate, sweep
 from hybrid_jax.training.fitting import make_run_config, start
 from hybrid_jax.training.objective import Settings
 
@@ -205,3 +206,11 @@ def test_memory_is_flat_after_the_warm_up():
     code = f"{paths}; from test_stages import soak; print(*soak([10, 15]))"
     warm, last = map(int, script("-c", code).split())
     assert last < 1.05 * warm, f"{warm / 2**20:.0f} MiB, then {last / 2**20:.0f} MiB"
+
+
+def test_programs_of_old_shapes_are_freed():
+    """Otherwise each shape would leave a compiled program behind."""
+    settings = Settings(batch_size=7)
+    kept = [weakref.ref(_block(settings, (), 1, 2, (shape,))) for shape in range(PROGRAMS + 1)]
+    gc.collect()  # a map and its compiled function refer to each other
+    assert [map_() is None for map_ in kept] == [True] + [False] * PROGRAMS
