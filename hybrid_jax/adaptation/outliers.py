@@ -13,7 +13,7 @@ FAR = 8.0  # robust standard deviations, which none of a million normal errors r
 DEVIATION = 1.4826  # the standard deviation of normal errors over their median size
 ROUGH = 0.3  # of the largest error: an error with smaller differences is smooth
 PIECE = 32  # samples in which outliers are searched together
-FEW = 6  # times as many differences as outliers of a piece, which are hardly explained by so few if all are wrong
+FEW = 6  # differences for each outlier of a piece; with fewer, a few outliers could explain a piece that is all wrong
 FEWEST = 10  # windows that are enough; if fewer are left, all are used
 MANY = "windows: {} of {} begin with an outlier, or have many; that is too many to leave out, so all samples are used"
 
@@ -40,9 +40,10 @@ def without_outliers(
 def outliers(errors: Float[np.ndarray, "n t d"], windows: Trajectories) -> Bool[np.ndarray, "n t+1 d"]:
     """Return which numbers in x0 and x are outliers; errors are measured minus predicted.
 
-    Successive errors are smooth but for noise. Where their differences are much larger than usual (Hampel 1974), nearly
-    as large as the errors, and larger than those of the predicted states, so that no motion explains them, the numbers
-    without which they are not are found one by one. A piece that needs too many of them is an outlier as a whole.
+    Successive errors are smooth but for noise. An outlier makes their differences much larger than usual (Hampel 1974),
+    nearly as large as the errors, and larger than those of the predicted states, so that no motion explains them. There
+    numbers are taken out one by one, each time the one that explains most, until the other differences are usual. If
+    too many would have to go, all numbers of the piece are outliers.
     """
     path = np.pad(np.asarray(errors, float), ((0, 0), (1, 0), (0, 0)))
     found = np.zeros(path.shape, bool)

@@ -44,8 +44,8 @@ def estimate_windows(
     """Return windows for `fit` and `adapt`, whose initial states are estimated from the samples around them.
 
     The model predicts the samples from `around` seconds before to `around` seconds after the start of a window, by
-    least squares. Constant errors of the model before and after then hardly change the state between them. A sample is
-    moved to the nearest edge of an interval by the model. States that were not measured are NaN in x.
+    least squares. If the model has a constant error, its effects before and after the start nearly cancel. The model
+    also moves each sample to the nearest edge of an interval. States that were not measured are NaN in x.
 
     Args:
         model: the model with known numbers, and the noise of every output, for example that of `fit_records`. Its
