@@ -20,7 +20,7 @@ TAGS = "world", "change", "flight", "draw", "seed", "method"
 MANY = replace(BOTH_ENDS, **ONE_FLIGHT, preset="paper", seeds=12, draws=3, n_test=HarmConfig.n_test)
 ONE = replace(SMOKE, **ONE_FLIGHT, n_test=1)
 PRESETS = {
-    "paper": preset_like(HarmConfig, MANY, data_seed=31),  # flights that were not seen when rules were chosen
+    "paper": preset_like(HarmConfig, MANY, data_seed=33),  # flights that were not seen when rules were chosen
     "quick": preset_like(HarmConfig, MANY, preset="quick", seeds=1, draws=4, worlds=("iris", "hummingbird")),
     "smoke": preset_like(HarmConfig, ONE, worlds=("hummingbird",), changes=(NOTHING,), learn_from=("short",)),
 }

@@ -2,10 +2,8 @@
 
 from dataclasses import dataclass
 from functools import partial
-from operator import itemgetter
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,10 +17,10 @@ from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, extended, free_parameters, groups_of, kept_parameters, names_of
 from hybrid_jax.adaptation.results import NETWORK, Choice
 from hybrid_jax.adaptation.selection import Fit, Unchanged
+from hybrid_jax.adaptation.source import OfSource, fit_pair, judge_source
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import Scale, ravel_parameters
 from hybrid_jax.estimation.normal_equations import masked
-from hybrid_jax.estimation.uncertainty import sandwich_with_prior
 from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import FASTEST_COMPILE, UNOPTIMISED, jit_by_size
 from hybrid_jax.status import Status
@@ -92,12 +90,10 @@ class Auto(Method):
         shares = None if learned_from is None else _shares(field, learned_from, train)
         known = None if traced or flights is not None else learned_from  # several flights need no others
         if learned_from is not None:
-            distinct, learned_from = jnp.array(min(len(learned_from), len(train))), selection.alike(learned_from, train)
-            own = _fits(larger, still, learned_from, both, *options, distinct)[0]
-            rival = None if physics is None else _fits(physics, still, learned_from, both, *options, distinct)[:2]
-            larger, source = _replace(self, larger, own, rival, distinct, sizes)
+            larger, source = judge_source(larger, physics, learned_from, train, options, self.blocks, self.networks)
+            learned_from = selection.alike(learned_from, train)
         options = *options, jnp.array(len(train))
-        (found, every, starts), fitted = first, _ = _fits(larger, still, train, both, *options), None
+        (found, every, starts), fitted = first, _ = fit_pair(larger, still, train, both, *options), None
         for _ in range(ROUNDS):
             if network:  # even if physics replaced the source: the effect is the difference of the two models
                 effect = anchored.network_effect(whole, train, starts, solver, scale)
@@ -105,12 +101,12 @@ class Auto(Method):
             chosen, nothing, move, rows = _judge(larger, found, every, *given, sizes)
             if traced or fitted is None or not np.array_equal(rows, fitted):
                 options = chosen.sizes, *options[1:]
-                (_, found, starts), fitted = _fits(larger, move, train, rows, *options), rows
+                (_, found, starts), fitted = fit_pair(larger, move, train, rows, *options), rows
                 if not traced and int(found.status) == Status.DIVERGED:
-                    _, found, starts = _fits(larger, still, train, rows, *options)
+                    _, found, starts = fit_pair(larger, still, train, rows, *options)
         rival, move, rows = evidence.rival(larger, every, chosen)
         if traced or int(rival) != int(chosen.taken):
-            fits = (found, starts), _fits(larger, move, train, rows, *options)[1:]
+            fits = (found, starts), fit_pair(larger, move, train, rows, *options)[1:]
             (found, starts), chosen = evidence.better(larger, every, fits, chosen, rival, nothing, sizes)
         units = selection.blocks_of(len(train), self.blocks, flights)
         weights = anchored.weights_of(larger)[0].size if network else 0
@@ -142,42 +138,11 @@ class Auto(Method):
 _shares = jit_by_size(UNOPTIMISED)(selection.shares_outside)
 
 
-class OfSource(NamedTuple):
-    """The fit to `distinct` windows of the source's own motion, and whether physics `alone` replaced the source."""
-
-    own: Fit
-    alone: Bool[Array, ""]
-    distinct: Int[Array, ""]
-
-
 @jit_by_size(UNOPTIMISED)
 def _begin(method: Auto, field, train: Trajectories):
     larger = extended(field, train.x0.shape[1])
     physics = anchored.without_network(larger) if anchored.has_network(larger) else None
     return larger, physics, method.plausible.sizes(larger, train)
-
-
-@jit_by_size(FASTEST_COMPILE)
-def _fits(field, move, windows: Trajectories, free, *options) -> tuple[Fit, Fit, Any]:
-    """Fit no parameters and the free ones, from parameters moved by `move`, at which the starts are smoothed too."""
-    start, unravel = ravel_parameters(field)
-    found, starts = selection.fit_each(unravel((start + move).astype(start.dtype)), windows, free, *options, moved=move)
-    return (*(jax.tree.map(itemgetter(row), found) for row in (0, 1)), starts)
-
-
-@jit_by_size(UNOPTIMISED)
-def _replace(method: Auto, larger, own: Fit, rival: tuple[Fit, Fit] | None, distinct, sizes) -> tuple[Any, OfSource]:
-    """Replace the source by its physics, refitted if that is better, if they predict its own motion better."""
-    if rival is None:
-        return larger, OfSource(own, jnp.array(False), distinct)
-    start, unravel = ravel_parameters(anchored.without_network(larger))
-    blocks = selection.blocks_of(len(own.equations.score), method.blocks)
-    left_out = selection.left_out_thetas(rival[1], jnp.ones(len(start), bool), sizes, start, blocks)
-    again = selection.surely_lower(rival[1], rival[0], left_out, blocks)
-    physics, left_out = _where(again, rival[1], rival[0]), jnp.where(again, left_out, start)
-    alone = selection.surely_lower(physics, own, left_out, blocks) & method.networks
-    larger, own = (_where(alone, *pair) for pair in ((unravel(physics.theta), larger), (physics, own)))
-    return larger, OfSource(own, alone, distinct)
 
 
 @jit_by_size(UNOPTIMISED)
@@ -253,10 +218,8 @@ def _conclude(field, larger, train: Trajectories, outcome, blocks, sizes) -> Sol
     kept = jnp.asarray(kept_parameters(larger))[taken]
     alone, of_source, degrees = jnp.array(False), jnp.diag(nothing.apparent), jnp.inf
     if source is not None:
-        own, alone, distinct = source
-        refitted = sandwich_with_prior(own.equations, len(start), distinct, own.noise / jnp.square(sizes))
-        of_source = jnp.where(alone, refitted, of_source)
-        degrees = jnp.maximum(distinct - jnp.where(alone, len(start), 1), 1.0)
+        _, alone, covariance, degrees = source
+        of_source = jnp.where(alone, covariance, of_source)
     inherited = selection.spread(found.equations, fitted, of_source)
     inherited = inherited + jnp.diag(jnp.where(kept, jnp.diagonal(of_source), 0.0))
     if step is not None:
@@ -283,11 +246,6 @@ def _conclude(field, larger, train: Trajectories, outcome, blocks, sizes) -> Sol
     status = jnp.where(jnp.any(found.seen), found.status, Status.STALLED)  # no parameter has an effect
     finite = (status == Status.OK) | ~jnp.isinf(ends).any()
     return Solution(adapted, found.steps, jnp.where(finite, status, Status.DIVERGED), choice)
-
-
-def _where(which: Bool[Array, ""], one: Any, other: Any) -> Any:
-    arrays, rest = eqx.partition(other, eqx.is_array)
-    return eqx.combine(jax.tree.map(partial(jnp.where, which), eqx.filter(one, eqx.is_array), arrays), rest)
 
 
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:

@@ -107,9 +107,9 @@ def unchanged(
     return Unchanged(apparent / places + of_network.apparent, total / places + of_network.error)
 
 
-def alike(learned_from: Trajectories, windows: Trajectories) -> Trajectories:
-    """Repeat, select and shorten the source's windows to the shape of the others, so that one program fits both."""
-    n, m, t = len(windows), len(learned_from), windows.horizon
+def alike(learned_from: Trajectories, windows: Trajectories, n: int | None = None) -> Trajectories:
+    """Repeat, select and shorten the source's windows to n as long as the others, by default to as many as these."""
+    n, m, t = len(windows) if n is None else n, len(learned_from), windows.horizon
     places = np.arange(n) % m if m < n else np.linspace(0, m - 1, n).astype(int)
     own = Trajectories(learned_from.x0, learned_from.u[:, :t], learned_from.x[:, :t], learned_from.dt)
     return jax.tree.map(lambda leaf, other: jnp.asarray(leaf[places], jnp.result_type(other)), own, windows)

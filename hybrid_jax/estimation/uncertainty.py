@@ -123,15 +123,16 @@ def sandwich(equations: NormalEquations, fitted: int, cluster: int = 1) -> Float
 
 def sandwich_with_prior(
     equations: NormalEquations, fitted: int, distinct: Int[Array, ""], precision: Float[Array, " p"]
-) -> Float[Array, "p p"]:
+) -> tuple[Float[Array, "p p"], Float[Array, " p"]]:
     """Compute `sandwich` with a prior, if only the first `distinct` windows are independent and the others repeat them.
 
-    The precision is over the variance of an error. It holds directions that the windows hardly determine.
+    The precision is over the variance of an error. It holds directions that the windows hardly determine. Also return
+    the step to the least error.
     """
     of = jnp.arange(len(equations.score)) % distinct
     score = jax.ops.segment_sum(equations.score, of, len(equations.score))
     half = score @ inverse(jnp.sum(equations.gram, axis=0) + jnp.diag(precision)).matrix
-    return distinct / jnp.maximum(distinct - fitted, 1) * half.T @ half
+    return distinct / jnp.maximum(distinct - fitted, 1) * half.T @ half, -jnp.sum(half, axis=0)
 
 
 @entry

@@ -93,6 +93,24 @@ def test_physics_that_needs_no_network_takes_the_sources_place():
     assert "Physics without the network predicts" in found.report()
 
 
+def test_errors_of_parameters_that_physics_inherits_come_from_ten_times_as_many_windows():
+    """Its distance from the least error of these counts as well."""
+    known, new = (flown(pendulum(0.7), count, noise=0.05, seed=1) for count in (400, 40))
+    network = jax.tree.map(lambda leaf: 10 * leaf, hybrid().residual)
+
+    def variance(away: float, count: int) -> float:
+        larger, physics, sizes = auto._begin(auto.Auto(), hj.Hybrid(pendulum(0.7 * np.exp(away)), network), new)
+        options = sizes, None, None, 100
+        _, found = auto.judge_source(larger, physics, known[:count], new, options, blocks=10, networks=True)
+        assert (bool(found.alone), found.degrees) == (True, count - len(sizes))
+        return float(found.covariance[0, 0])
+
+    least = float(hj.fit_least_squares(pendulum(0.7), known).field.log_length) - np.log(0.7)
+    small, large = variance(least, 400), variance(least, 40)
+    assert small == pytest.approx(large / 10, rel=0.4)
+    assert variance(least + 0.01, 400) - small == pytest.approx(1e-4, rel=0.2)
+
+
 def test_candidates_of_a_rigid_body_fit_what_their_names_say():
     def fitted(field):
         names = np.array([*named_parameters(field)])
@@ -216,13 +234,13 @@ def test_a_stiff_system_is_adapted_to_the_same_rate_from_near_and_far():
 
 
 def test_a_fit_that_diverges_from_the_first_estimate_begins_again_at_the_source(monkeypatch):
-    fits = auto._fits
+    fits = auto.fit_pair
 
     def diverging(field, move, *options):
         nothing, found, starts = fits(field, move, *options)
         return nothing, found._replace(status=Status.DIVERGED if np.any(move) else found.status), starts
 
-    monkeypatch.setattr(auto, "_fits", diverging)
+    monkeypatch.setattr(auto, "fit_pair", diverging)
     assert adapt(pendulum(0.7), flown(pendulum())).converged
 
 
