@@ -150,7 +150,7 @@ def of_intervals():
     harms = [[*map(float, re.findall(r"([\d.]+), worst ([\d.]+)$", case)[0])] for case in harm.split("; ")]
     sound = [mean <= MEAN and worst <= EACH for mean, worst in harms]
     yield "explanation/failures", f"no harm in {sum(sound)} of {len(sound)} cases"
-    yield "explanation/failures", f"up to {max(worst for _, worst in harms):g} times as large in single flights"
+    yield "explanation/failures", f"at most {max(worst for _, worst in harms):g} times the source's in any single flight"
     shares = re.findall(r"(\d+) of \d+ sources: ([\d.]+)%", said[0])
     texts = "intervals of an Iris contained", "of the Hummingbird", "of a Crazyflie"
     for text, (cases, share) in zip(texts, shares, strict=True):

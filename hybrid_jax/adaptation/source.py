@@ -1,5 +1,6 @@
 """Whether physics replaces the source, and how exactly its own motion determines the parameters that are inherited."""
 
+from collections.abc import Callable
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -55,23 +56,25 @@ def judge_source(
         return larger, OfSource(own, jnp.array(False), zero, jnp.maximum(distinct - 1.0, 1.0))
     rival = fit_pair(physics, nothing, part, both, *options, distinct)[:2]
     larger, source, again = _replace(larger, own, rival, distinct, sizes, blocks, networks)
-    traced = any(map(checks.is_traced, jax.tree.leaves((physics, windows))))
+    traced = any(map(checks.is_traced, jax.tree.leaves((physics, known, windows))))
     if not traced and (again or not source.alone):
         return larger, source
+    many = selection.alike(known, windows, n * min(-(-len(known) // n), MANY))
+    found = _linearised(physics, many, n, options, distinct, jax.lax.map if traced else _one_by_one)
+    return larger, _inherited(source, again, found, jnp.array(min(len(known), len(many))), sizes)
 
-    def linearised(some: Trajectories) -> Fit:
-        return fit_pair(physics, nothing, some, both & False, *options, distinct)[0]
 
-    count = min(-(-len(known) // n), MANY)
-    parts = jax.tree.map(
-        lambda leaf: leaf.reshape(count, n, *leaf.shape[1:]), selection.alike(known, windows, count * n)
-    )
-    if traced:
-        found = jax.lax.map(linearised, parts)
-    else:  # the program exists already
-        each = [linearised(jax.tree.map(itemgetter(i), parts)) for i in range(count)]
-        found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
-    return larger, _inherited(source, again, found, jnp.array(min(len(known), count * n)), sizes)
+def _linearised(physics, many: Trajectories, n: int, options: tuple, distinct: Int[Array, ""], over: Callable) -> Fit:
+    """Return the errors of `many` windows and their Jacobians, n at a time, for which the program exists already."""
+    nothing = np.zeros(options[0].shape, options[0].dtype)
+    neither = np.zeros((2, *nothing.shape), bool)
+    parts = jax.tree.map(lambda leaf: leaf.reshape(-1, n, *leaf.shape[1:]), many)
+    return over(lambda some: fit_pair(physics, nothing, some, neither, *options, distinct)[0], parts)
+
+
+def _one_by_one(function: Callable, parts: Any) -> Any:
+    each = [function(jax.tree.map(itemgetter(i), parts)) for i in range(len(jax.tree.leaves(parts)[0]))]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
 @jit_by_size(UNOPTIMISED)
