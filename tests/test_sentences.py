@@ -136,11 +136,12 @@ def of_intervals():
     steady, gusty, steady_abroad, gusty_abroad = (f"{min(each):.1f} to {max(each):.1f} times" for each in wide.values())
     yield "results/intervals", f"Iris' pooled intervals are {steady} as wide as needed, and {gusty} in gusts"
     yield "results/intervals", f"The Hummingbird's are {steady_abroad} as wide, and {gusty_abroad} in gusts"
-    abroad = fitted_of_coverage().where(world="hummingbird", parameter="k")
-    worst = abroad.where(domain="parameter_shift", noise="none")
-    yield "results/intervals", f"The {100 * np.mean(worst['inside']):.0f} % are those of the Hummingbird's k without"
-    yield "results/intervals", f"it is wrong by {np.mean(worst.numbers('error')):.1f} %."
-    gusts = [np.mean(own.numbers("error")) for own in abroad.where(domain="gusty_wind").group("noise").values()]
+    abroad = fitted_of_coverage().where(world="hummingbird")
+    worst = min(abroad.group("domain", "noise", "parameter").values(), key=lambda own: np.mean(own["inside"]))
+    yield "results/intervals", f"{100 * np.mean(worst['inside']):.0f} % are those of the Hummingbird's {worst[0]['parameter']} in"
+    yield "results/intervals", f"it is {-np.mean(worst.numbers('error')):.1f} % too small in the mean."
+    gusts = abroad.where(domain="gusty_wind", parameter="k").group("noise").values()
+    gusts = [np.mean(own.numbers("error")) for own in gusts]
     small = f"up to {-min(gusts):.0f} % too small in the mean"
     yield "results/intervals", f"k is {small}"
     high = lines("docs/results/intervals.md")["Hummingbird, gusty wind"][1]
