@@ -138,8 +138,9 @@ def of_intervals():
     yield "results/intervals", f"The Hummingbird's are {steady_abroad} as wide, and {gusty_abroad} in gusts"
     abroad = fitted_of_coverage().where(world="hummingbird")
     worst = min(abroad.group("domain", "noise", "parameter").values(), key=lambda own: np.mean(own["inside"]))
-    yield "results/intervals", f"{100 * np.mean(worst['inside']):.0f} % are those of the Hummingbird's {worst[0]['parameter']} in"
-    yield "results/intervals", f"it is {-np.mean(worst.numbers('error')):.1f} % too small in the mean."
+    name, least = worst[0]["parameter"], 100 * np.mean(worst["inside"])
+    yield "results/intervals", f"{least:.0f} % are those of the Hummingbird's {name} in"
+    yield "results/intervals", f"it is {-np.mean(worst.numbers('error')):.1f} % too small in the mean"
     gusts = abroad.where(domain="gusty_wind", parameter="k").group("noise").values()
     gusts = [np.mean(own.numbers("error")) for own in gusts]
     small = f"up to {-min(gusts):.0f} % too small in the mean"
@@ -151,7 +152,8 @@ def of_intervals():
     harms = [[*map(float, re.findall(r"([\d.]+), worst ([\d.]+)$", case)[0])] for case in harm.split("; ")]
     sound = [mean <= MEAN and worst <= EACH for mean, worst in harms]
     yield "explanation/failures", f"no harm in {sum(sound)} of {len(sound)} cases"
-    yield "explanation/failures", f"at most {max(worst for _, worst in harms):g} times the source's in any single flight"
+    highest = max(worst for _, worst in harms)
+    yield "explanation/failures", f"at most {highest:g} times the source's in any single flight"
     shares = re.findall(r"(\d+) of \d+ sources: ([\d.]+)%", said[0])
     texts = "intervals of an Iris contained", "of the Hummingbird", "of a Crazyflie"
     for text, (cases, share) in zip(texts, shares, strict=True):

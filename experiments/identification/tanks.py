@@ -13,7 +13,7 @@ import hybrid_jax as hj
 from experiments.identification.record import Benchmark, main
 
 FULL = 10.0  # V, at which the sensor saturates
-EDGE, LEVEL, WEIR, BEND = 0.03, 0.02, 0.1, 0.15  # widths of smooth corners [V]
+EDGE, LEVEL, WEIR = 0.03, 0.02, 0.1  # widths of smooth corners [V]
 
 
 def _positive(x, width):
@@ -74,7 +74,7 @@ def level(x, u, field: Tanks):
     """The sensor of the lower tank has play, two slopes, and saturates."""
     seen = x[1] - jnp.sum(x[2:])
     if field.bend is not None:
-        seen = seen + jnp.expm1(field.bend[1]) * _positive(seen - field.bend[0], BEND)
+        seen = seen + jnp.expm1(field.bend[1]) * _positive(seen - field.bend[0], EDGE)
     return FULL - _positive(FULL - seen, EDGE)
 
 
