@@ -57,7 +57,7 @@ class Tanks(hj.AbstractVectorField):
         if self.log_play is None:
             return flows
         # Without slip the difference changes as the level does; at the end of the play it stays (Bouc and Wen).
-        slip = jnp.where(flows[1] * x[2] > 0, jnp.minimum((x[2] / jnp.exp(self.log_play)) ** 4, 4.0), 0.0)
+        slip = jnp.where(flows[1] * x[2] > 0, jnp.minimum((x[2] / jnp.exp(self.log_play)) ** 4, 1.0), 0.0)
         return jnp.append(flows, flows[1] * (1 - slip))
 
 
