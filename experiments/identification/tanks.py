@@ -91,8 +91,9 @@ def candidate(*extra: str):
     return hj.StateSpaceModel(field, ("u",), {"y": level}, start[:d], spread[:d], noise={"y": 0.2}), prior
 
 
-def begun(u, y, model: hj.StateSpaceModel):
+def begun(u: float, y: float, model: hj.StateSpaceModel) -> tuple[float, ...]:
     """The hidden states at the start are the same in both records, and the lower level is that of the first reading."""
+    assert isinstance(model.field, Tanks)
     bend = model.field.bend
     below = y if bend is None else min(y, bend[0] + (y - bend[0]) / jnp.exp(bend[1]))
     return model.start[0], float(below) + sum(model.start[2:]), *model.start[2:]
