@@ -110,13 +110,16 @@ def test_a_prior_bounds_what_windows_do_not_tell_apart_and_repeated_windows_add_
     rng, size, windows, fitted = np.random.default_rng(0), 0.5, 400, 3
     design = rng.normal(size=(windows, 5, fitted))
     design[..., 2] = design[..., 1] + alike * design[..., 2]
-    equations = jax.vmap(equations_of)(jnp.asarray(design), 0.1 * rng.normal(size=(windows, 5)))
+    equations = jax.vmap(equations_of)(jnp.asarray(design), errors := 0.1 * rng.normal(size=(windows, 5)))
     of = partial(sandwich_with_prior, fitted=fitted, distinct=jnp.array(windows))
-    held = of(equations, precision=jnp.full(fitted, 0.01 / size**2))
+    held, step = of(equations, precision=jnp.full(fitted, 0.01 / size**2))
+    rows = design.reshape(-1, fitted)
+    ridge = -np.linalg.solve(rows.T @ rows + np.eye(fitted) * 0.01 / size**2, rows.T @ errors.ravel())
+    np.testing.assert_allclose(step, ridge, rtol=0.01)
     assert held[1, 1] + held[2, 2] - 2 * held[1, 2] < 2 * 1.2 * size**2 / 4
     np.testing.assert_allclose(held[0, 0], sandwich(equations, fitted)[0, 0], rtol=0.01)
     twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), equations)
-    np.testing.assert_allclose(of(twice, precision=jnp.full(fitted, 0.02 / size**2)), held, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(of(twice, precision=jnp.full(fitted, 0.02 / size**2))[0], held, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize(("level", "z"), [(0.6826895, 1.0), (0.95, Z)])
