@@ -108,7 +108,7 @@ def unchanged(
 
 
 def alike(learned_from: Trajectories, windows: Trajectories, n: int | None = None) -> Trajectories:
-    """Repeat, select and shorten the source's windows to n as long as the others, by default to as many as these."""
+    """Repeat, select and shorten the source's windows: n of the others' length, by default as many as these."""
     n, m, t = len(windows) if n is None else n, len(learned_from), windows.horizon
     places = np.arange(n) % m if m < n else np.linspace(0, m - 1, n).astype(int)
     own = Trajectories(learned_from.x0, learned_from.u[:, :t], learned_from.x[:, :t], learned_from.dt)

@@ -18,7 +18,7 @@ from hybrid_jax.estimation.uncertainty import sandwich_with_prior
 from hybrid_jax.runtime import FASTEST_COMPILE, UNOPTIMISED, jit_by_size
 from hybrid_jax.trajectories import Trajectories
 
-MANY = 10  # times as many windows as the new ones: more would make the source's errors small beside theirs anyway
+MANY = 10  # times as many windows as the new ones: then the source's errors are small beside the new ones'
 
 
 class OfSource(NamedTuple):
