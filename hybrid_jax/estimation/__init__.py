@@ -8,7 +8,7 @@ from hybrid_jax.estimation.disturbances import fit_disturbance, observe
 from hybrid_jax.estimation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.estimation.record_fit import RecordFit, fit_records
 from hybrid_jax.estimation.record_prediction import predict, simulate
-from hybrid_jax.estimation.record_windows import estimate_windows
+from hybrid_jax.estimation.record_windows import RecordWindows, estimate_windows
 from hybrid_jax.estimation.uncertainty import (
     DisturbanceSelection,
     Interval,
@@ -18,5 +18,14 @@ from hybrid_jax.estimation.uncertainty import (
 )
 
 __all__ = ["DisturbanceSelection", "Interval", "LeastSquaresFit", "covariance_of", "estimate_windows"]
-__all__ += ["RecordFit", "fit_disturbance", "fit_least_squares", "fit_records", "intervals", "observe", "predict"]
+__all__ += [
+    "RecordFit",
+    "RecordWindows",
+    "fit_disturbance",
+    "fit_least_squares",
+    "fit_records",
+    "intervals",
+    "observe",
+    "predict",
+]
 __all__ += ["select_disturbance", "simulate"]

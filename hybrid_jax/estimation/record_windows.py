@@ -1,4 +1,4 @@
-"""Make windows of records in which only some states were measured, to train or adapt networks."""
+"""Windows of records in which only some states were measured, to train networks by `fit`."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+import optax
+from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import in_double, ravel_learned
@@ -16,7 +17,7 @@ from hybrid_jax.estimation import shooting
 from hybrid_jax.estimation.discretisation import Solver
 from hybrid_jax.estimation.elimination import End, undetermined
 from hybrid_jax.estimation.record_search import Search
-from hybrid_jax.estimation.shooting import Problem
+from hybrid_jax.estimation.shooting import Problem, Segments
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import RK4
 from hybrid_jax.records import Between, Gridded, Record, completed, on_grid
@@ -26,6 +27,50 @@ from hybrid_jax.trajectories import Trajectories
 
 NEAR = 0.25, 0.5, 1.0  # shares of a piece whose samples count, one after the other
 ROUNDING = 1e-6  # of a sample's time, in intervals
+
+
+class RecordWindows(eqx.Module):
+    """n windows of records: an estimated initial state, the inputs, and the samples of outputs at times of their own.
+
+    Attributes:
+        states: the estimated initial states, the inputs, and the states that the model predicted in the windows.
+        segments: the samples.
+        noise: standard deviation of each output's errors, by name.
+        robust: errors beyond this many times the noise count linearly.
+    """
+
+    states: Trajectories
+    segments: Segments
+    noise: tuple[tuple[str, tuple[float, ...]], ...] = eqx.field(static=True)
+    robust: float = eqx.field(static=True, default=np.inf)
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def __getitem__(self, index) -> "RecordWindows":
+        """Return the windows at a slice or an array of indices, which may be traced."""
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def loss(self, model: StateSpaceModel, x: Float[Array, "n t d"]) -> Float[Array, ""]:
+        """Return the mean squared error of all samples, relative to the noise.
+
+        Args:
+            model: the model, whose outputs are compared.
+            x: its states at the ends of intervals.
+        """
+
+        def one(window: RecordWindows, x):
+            states, u = jnp.concatenate([window.states.x0[None], x]), jnp.asarray(window.states.u)
+            if window.segments.share is None:  # a sample at an edge belongs to the interval that begins there
+                u = jnp.concatenate([u[1:], u[-1:]])
+            return shooting.compared(model, states, u, window.segments, window.states.dt).errors
+
+        total, count, found = jnp.zeros(()), 0, jax.vmap(one)(self, x)
+        for name, sizes in self.noise:
+            errors = found[name] / jnp.array(sizes)
+            squared = jnp.square(errors) if np.isinf(self.robust) else 2 * optax.huber_loss(errors, delta=self.robust)
+            total, count = total + jnp.sum(squared), count + errors.shape[-1] * jnp.sum(self.segments.there[name])
+        return total / jnp.maximum(count, 1)
 
 
 @entry
@@ -40,29 +85,29 @@ def estimate_windows(
     robust: float = np.inf,
     solver: Solver = None,
     substeps: int = 1,
-) -> Trajectories:
-    """Return windows for `fit` and `adapt`, whose initial states are estimated from the samples around them.
+) -> RecordWindows:
+    """Return windows for `fit`, whose initial states are estimated from the samples around them.
 
     The model predicts the samples from `around` seconds before to `around` seconds after the start of a window, by
-    least squares. If the model has a constant error, its effects before and after the start nearly cancel. The model
-    also moves each sample to the nearest edge of an interval. States that were not measured are NaN in x.
+    least squares. If the model has a constant error, its effects before and after the start nearly cancel. `fit` then
+    trains a `StateSpaceModel` on the samples in the windows, at their own times; the initial states stay.
 
     Args:
-        model: the model with known numbers, and the noise of every output, for example that of `fit_records`. Its
-            outputs should be the states themselves, as they are by default.
+        model: the model with known numbers, and the noise of every output, for example that of `fit_records`. The
+            search for an initial state begins at `start`, and at the first sample of each output that is a state.
         records: one or more records. Windows in a gap, whose initial state no sample determines, are left out.
         dt: length of the intervals [s].
         steps: number of intervals in each window. Windows follow each other.
         around: time before and after the start of a window in which samples count [s]. With a longer one, noise
             matters less, and errors of the model more.
         between: how inputs act between their samples: "held", "linear" or "averaged", see `records.on_grid`.
-        robust: errors beyond this many times the noise count linearly.
+        robust: errors beyond this many times the noise count linearly, also in `fit`.
         solver: a solver of diffrax, by default `RK4`.
         substeps: number of solver steps in each interval.
 
     Raises:
-        ValueError: if an output is not a state or has no noise, a record lacks an input or all outputs, all records
-            are too short, no sample determines an initial state, or an argument is out of range.
+        ValueError: if an output has no noise, a record lacks an input or all outputs, all records are too short, no
+            sample determines an initial state, or an argument is out of range.
     """
     records = checks.list_of("records", records, Record)
     checks.instance("model", model, StateSpaceModel)
@@ -71,7 +116,7 @@ def estimate_windows(
         checks.positive(name, seconds, "a positive number of seconds")
     if around < dt:
         raise ValueError(f"around must be at least dt = {dt:.3g} s, got {checks.short_repr(around)}")
-    model, half = _with_states(model, records), round(around / dt)
+    model, half = _seen(model, records), round(around / dt)
     records = completed(records, tuple(model.outputs), model.angles)
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
     after = max(steps, half)
@@ -83,38 +128,56 @@ def estimate_windows(
         model = in_double(eqx.tree_at(lambda model: model.field, model, Frozen(model.field)))
         scale = {name: jnp.array(sizes) for name, sizes in model.noise.items()}
         problem = Problem(model, scale, robust, dt, RK4() if solver is None else solver, substeps)
-        near = [_part(each, i - half, 2 * half) for each, i in places]
+        near = [_part(model, each, i - half, 2 * half) for each, i in places]
         end, states = _estimated(problem, np.stack([_guess(model, each) for each in near]), near)
-        windows = [_part(each, i, steps) for each, i in places]
-        x = _measured(problem, states[:, half], windows)
+        windows = [_part(model, each, i, steps) for each, i in places]
+        own = _search(problem, states[:, half], windows)
+        x = np.asarray(own.predicted(own.theta, own.still).states)[:, 0, 1:]
     if end.status != Status.OK:
         checks.warn(f"records: the search for initial states {end.status.message}; check all units and the model")
-    kept = _determined(model, end) & ~np.isnan(x).all(axis=(1, 2))
-    u = np.stack([each.u for each in windows])
-    return Trajectories(*(part[kept].astype(dtype) for part in (states[:, half], u, x)), dt=dt)
+    kept = _determined(model, end) & np.any([there.any(axis=(1, 2)) for there in own.segments.there.values()], axis=0)
+    segments = _at_edges(jax.tree.map(lambda leaf: leaf[kept, 0], own.segments))
+    path, segments = jax.tree.map(
+        lambda leaf: leaf.astype(dtype) if leaf.dtype == float else leaf,
+        (Trajectories(states[kept, half], segments.u, x[kept], dt), segments),
+    )
+    return RecordWindows(path, segments, tuple(model.noise.items()), robust)
 
 
-def _with_states(model: StateSpaceModel, records: Sequence[Record]) -> StateSpaceModel:
-    """Return the model with the measured outputs only, which must be states."""
+def _seen(model: StateSpaceModel, records: Sequence[Record]) -> StateSpaceModel:
+    """Return the model with the measured outputs only, whose noise must be known."""
     seen = {name for each in records for name, signal in each.signals.items() if len(signal)}
     model = model.only([name for name in model.outputs if name in seen] or model.outputs)
-    for name, h in model.outputs.items():
-        if not isinstance(h, Measured):
-            raise ValueError(f"outputs: {name} is a function of the state, but windows have states; use fit_records")
-        if name not in model.noise:
-            raise ValueError(f"noise: {name} has none; the model that fit_records returns has it")
+    for name in model.outputs.keys() - model.noise.keys():
+        raise ValueError(f"noise: {name} has none; the model that fit_records returns has it")
     return model
 
 
-def _part(record: Gridded, first: int, steps: int) -> Gridded:
-    """Return some intervals of a record, with the samples from their start to their end."""
+def _at_edges(segments: Segments) -> Segments:
+    """Return segments that need no interpolation, if all samples are at the ends of intervals or at the start."""
+    assert segments.share is not None
+    index, there = dict(segments.index), dict(segments.there)
+    for name, share in segments.share.items():
+        near = np.round(share)
+        if np.abs(np.where(there[name], share - near, 0)).max(initial=0) > ROUNDING:
+            return segments
+        index[name] = index[name] + near.astype(int) - 1
+        there[name] = there[name] & (index[name] >= 0)  # at the start no prediction is compared
+    return segments._replace(index=index, there=there, share=None)
+
+
+def _part(model: StateSpaceModel, record: Gridded, first: int, steps: int) -> Gridded:
+    """Return some intervals of a record, with the samples from their start to their end.
+
+    A sample at the very end belongs to the next interval, whose input only the outputs that are states do not need.
+    """
     y, index, share = {}, {}, {}
     for name, values in record.y.items():
-        at = record.index[name] + record.share[name] - first
-        inside = (at > -ROUNDING) & (at < steps + ROUNDING)
-        at = np.clip(at[inside], 0, steps)
-        index[name] = np.minimum(at.astype(int), steps - 1)
-        y[name], share[name] = values[inside], at - index[name]
+        own = record.index[name] - first
+        at = own + record.share[name]
+        inside = (own >= 0) & (at < steps + ROUNDING if isinstance(model.outputs[name], Measured) else own < steps)
+        index[name] = np.minimum(own[inside], steps - 1)
+        y[name], share[name] = values[inside], np.minimum(at[inside] - index[name], 1.0)
     return Gridded(record.start, record.u[first : first + steps], y, index, share)
 
 
@@ -122,8 +185,8 @@ def _guess(model: StateSpaceModel, record: Gridded) -> Float[np.ndarray, " d"]:
     """Return the first measured states, and the model's start in place of others."""
     x = np.array(model.start)
     for name, values in record.y.items():
-        if len(values):
-            x[slice(*model.outputs[name].part)] = values[0]
+        if len(values) and isinstance(h := model.outputs[name], Measured):
+            x[slice(*h.part)] = values[0]
     return x
 
 
@@ -148,20 +211,6 @@ def _search(problem: Problem, centres: Float[np.ndarray, "n d"], pieces: list[Gr
     theta, free = np.asarray(ravel_learned(problem.model)[0]), np.full((1, problem.model.space.tangent_size), np.inf)
     segments = shooting.cut(pieces, len(pieces[0].u))
     return Search(problem, jnp.asarray(centres)[:, None], np.zeros(len(theta)), theta, segments, free)
-
-
-def _measured(problem: Problem, x0: Float[np.ndarray, "n d"], pieces: list[Gridded]) -> Float[np.ndarray, "n t d"]:
-    """Return the samples at the edges of intervals, NaN where there is none; the model moves them to the nearest."""
-    search, outputs = _search(problem, x0, pieces), problem.model.outputs
-    found, segments = search.predicted(search.theta, search.still), search.segments
-    x = np.full((len(x0), len(pieces[0].u), x0.shape[1]), np.nan)
-    for name, there in segments.there.items():
-        at = segments.index[name] + (1.0 if segments.share is None else segments.share[name])
-        window, segment, sample = np.nonzero(there & (at >= 0.5))
-        edge, part = np.round(at[window, segment, sample]).astype(int), slice(*outputs[name].part)
-        at_edge, errors = found.states[window, segment, edge, part], found.errors[name][window, segment, sample]
-        x[window, edge - 1, part] = jax.vmap(outputs[name].quantity.retract)(at_edge, -errors)
-    return x
 
 
 def _determined(model: StateSpaceModel, end: End) -> Bool[np.ndarray, " n"]:

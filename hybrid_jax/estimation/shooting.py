@@ -120,8 +120,12 @@ class Predicted(NamedTuple):
 
 def predicted(problem: Problem, model: Model, x0, segment: Segments) -> Predicted:
     segment = segment._replace(index=jax.tree.map(jnp.asarray, segment.index))
-    states, u = states_of(problem, model, x0, segment)
-    y, errors = outputs_of(model, states, u, segment, problem.dt), {}
+    return compared(model, *states_of(problem, model, x0, segment), segment, problem.dt)
+
+
+def compared(model: Model, states: Float[Array, "t d"], u: Float[Array, "i m"], segment: Segments, dt: float):
+    """Return the prediction of a segment whose states at the edges of intervals, and inputs, are known."""
+    y, errors = outputs_of(model, states, u, segment, dt), {}
     for name, each in y.items():
         error = jax.vmap(partial(model.error, name))(each, jnp.asarray(segment.y[name]))
         errors[name] = jnp.where(segment.there[name][:, None], error, 0.0)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,8 +17,10 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import check_batch_norm
+from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import compare_steps
+from hybrid_jax.estimation.record_windows import RecordWindows
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
@@ -26,7 +29,8 @@ from hybrid_jax.runtime import FAST_COMPILE, entry, jit_by_size, keep_programs
 from hybrid_jax.status import Status
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, FitState, Optimiser, RunConfig, make_run_config
-from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
+from hybrid_jax.training.objective import UNSCALED, Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
+from hybrid_jax.training.record_loss import RecordLoss
 from hybrid_jax.trajectories import Trajectories, check_like, overflows
 
 WEIGHT = 1e-3  # λ, where none is given
@@ -88,9 +92,9 @@ class FitInterrupted(KeyboardInterrupt):
 
 @entry
 def fit(
-    field: AbstractVectorField,
-    train: Trajectories,
-    validation: Trajectories,
+    field: Learner,
+    train: Trajectories | RecordWindows,
+    validation: Trajectories | RecordWindows,
     key: PRNGKeyArray,
     *,
     rates: PyTree = None,
@@ -108,8 +112,10 @@ def fit(
     network has no scaling of its inputs, it is computed from the training windows; see `with_scaling`.
 
     Args:
-        field: the initial field, or another module that the objective in `settings` can evaluate.
+        field: the initial field, a `StateSpaceModel` for windows of records, or another module that the objective in
+            `settings` can evaluate.
         train: the training windows. NaN in x means "not measured" and counts as no error; x0 and u must be finite.
+            If only some states are measured, use windows of `estimate_windows`.
         validation: windows that determine the best epoch and early stopping. They should be from other recordings.
         key: random key for shuffling minibatches.
         rates: learning rates of Adam, a tree prefix of the field: one number, by default 1e-2, or for example
@@ -131,7 +137,7 @@ def fit(
         FitInterrupted: if you press Ctrl-C; it has the result so far.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
-    keep_programs("fit", train.x.shape)
+    keep_programs("fit", (train.states if isinstance(train, RecordWindows) else train).x.shape)
     if rates is None:
         rates = RATE if optimiser is None else 1.0
     try:
@@ -146,13 +152,15 @@ def fit(
 
 
 def checked_arguments(
-    field: Learner, train: Trajectories, validation: Trajectories, key, settings: Settings | None, optimiser, weight
+    field: Learner, train, validation, key, settings: Settings | None, optimiser, weight
 ) -> tuple[PyTree, Shared, float]:
     """Check the arguments of `fit`; return the training data, what all stages share, and λ."""
     checks.not_traced("fit", field, train, validation, key)
     settings = Settings() if settings is None else settings
     checks.instance("settings", settings, Settings)
     windows = {"train": train, "validation": validation}
+    if isinstance(train, RecordWindows) and settings.objective is UNSCALED:
+        settings = replace(settings, objective=RecordLoss())
     windows = {n: check_windows(field, w, n, True) if isinstance(w, Trajectories) else w for n, w in windows.items()}
     data, validated_on = (settings.objective.prepare(w, name) for name, w in windows.items())
     _check_field(field, windows, settings)
@@ -168,7 +176,8 @@ def checked_arguments(
         except TypeError as error:
             text = "optimiser must need nothing but gradients and parameters"
             raise ValueError(f"{text}: {checks.first_line(error)}") from error
-    if weight is not None and settings.regulariser is None and isinstance(settings.objective, TrajectoryLoss):
+    known = isinstance(settings.objective, TrajectoryLoss | RecordLoss)
+    if weight is not None and settings.regulariser is None and known:
         remedy = "leave it out, or use one of hybrid_jax.training.loss.REGULARISERS"
         given = checks.short_repr(weight)
         raise ValueError(f"regulariser_weight is {given} but settings.regulariser is None; {remedy}")
@@ -176,10 +185,12 @@ def checked_arguments(
     return data, shared, WEIGHT if weight is None else weight
 
 
-def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settings) -> None:
+def _check_field(field: Learner, data: dict[str, Any], settings: Settings) -> None:
     """Reject a field that learns nothing, and windows that do not match it; other learners check their own windows."""
     if isinstance(settings.objective, TrajectoryLoss):
         check_callable(field)
+    if isinstance(settings.objective, RecordLoss):
+        checks.instance("field", field, StateSpaceModel)
     if not any(jax.tree.leaves(trainable(field))):
         missing = "no array of floating-point numbers; convert Python floats by jnp.asarray"
         raise ValueError(f"field: {type(field).__name__} has nothing to learn, {missing}")
@@ -187,6 +198,8 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
         if isinstance(leaf, jax.Array) and leaf.shape == () and jnp.issubdtype(leaf.dtype, jnp.integer):
             name = jax.tree_util.keystr(path, simple=True, separator=".")
             raise ValueError(f"field: {name} is an integer, which is not learned; make it a float, or a Python int")
+    if isinstance(settings.objective, RecordLoss):
+        field, data = field.field, {name: each.states for name, each in data.items()}
     for name, windows in data.items():
         if isinstance(field, AbstractVectorField):
             try:
@@ -197,8 +210,11 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
             check_batch_norm(field, *(np.asarray(part).T for part in (windows.x0[:2], windows.u[:2, 0])))
 
 
-def ready(field: Learner, train: Trajectories) -> Learner:
+def ready(field: Learner, train: Any) -> Learner:
     """Set the scaling and motion of a field; warn if you will need `like` to load it from a file."""
+    if isinstance(field, StateSpaceModel):
+        known = isinstance(train, RecordWindows)
+        return replace(field, field=with_scaling(field.field, train.states)) if known else field
     if (reason := check_savable(field)) is not None:
         checks.warn(reason)
     return with_motion(with_scaling(field, train), train) if isinstance(field, AbstractVectorField) else field

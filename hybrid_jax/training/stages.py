@@ -72,6 +72,8 @@ def cut(windows: Trajectories, steps: int | None) -> Trajectories:
     """Return the first `steps` intervals of each window, or all; ValueError if there are fewer."""
     if steps is None:
         return windows
+    if not isinstance(windows, Trajectories):
+        raise ValueError(f"steps must be None for windows of records, got {steps}")
     if steps > windows.horizon:
         raise ValueError(f"steps must be at most the {windows.horizon} intervals of the windows, got {steps}")
     return Trajectories(windows.x0, windows.u[..., :steps, :], windows.x[..., :steps, :], windows.dt)
