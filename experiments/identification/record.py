@@ -3,12 +3,17 @@
 import csv
 import gzip
 import itertools
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from rich.console import Console
@@ -16,8 +21,33 @@ from rich.table import Table
 
 import hybrid_jax as hj
 from experiments.runner import command
+from hybrid_jax.estimation import RecordFit
 
 FIRST = 0.05  # of a record, which is in every fit: it tells the initial state
+UNITS = 4
+
+
+class Network(hj.AbstractVectorField):
+    """A network that adds to the change of some states.
+
+    Its hidden layer stays as drawn (Rahimi and Recht 2007), so a fit needs few steps.
+
+    Attributes:
+        weight: of each hidden unit and of 1, for each of these states.
+        range: centre and half width of each state and input.
+        size: how much the network may add to a state, by index.
+    """
+
+    weight: jax.Array
+    range: tuple[tuple[float, float], ...] = eqx.field(static=True)
+    size: tuple[tuple[int, float], ...] = eqx.field(static=True)
+
+    def __call__(self, x, u):
+        centre, width = np.transpose(self.range)
+        random, z = np.random.default_rng(0), (jnp.concatenate([x, u]) - centre) / width
+        units = jnp.tanh(random.normal(size=(UNITS, len(z))) @ z + random.normal(size=UNITS))
+        places, sizes = np.transpose(self.size)
+        return jnp.zeros_like(x).at[places.astype(int)].set(sizes * (self.weight @ jnp.append(units, 1.0)))
 
 
 @dataclass(frozen=True)
@@ -42,9 +72,19 @@ class Benchmark:
     columns: tuple[str, str]
     unit: tuple[str, float]
     candidates: Mapping[str, Callable[[], tuple[hj.StateSpaceModel, dict[str, float]]]]
+    range: tuple[tuple[float, float], ...]
+    size: dict[int, float]
     options: Mapping[str, Any]
     start: Callable[[float, float, hj.StateSpaceModel], tuple[float, ...]]
     parts: int = 5
+
+
+class Tried(NamedTuple):
+    """A candidate: its scores and fits without each part in turn, and its fit to the whole record, which is last."""
+
+    scores: list[float]
+    fits: list[RecordFit]
+    prior: dict[str, float]
 
 
 def read(path: Path, columns: tuple[str, str]) -> hj.Record:
@@ -71,32 +111,47 @@ def main(benchmark: Benchmark, name: str, arguments: Sequence[str] | None = None
 def run(benchmark: Benchmark, options: Options, console: Console) -> None:
     began, record = time.perf_counter(), read(options.record, benchmark.columns)
     test = None if options.test is None else read(options.test, benchmark.columns)
-    table = Table("model", "left out", "this record", title=benchmark.title)
-    scores, fits = {}, {}
-    unit, factor = benchmark.unit
+    tried: dict[str, Tried] = {}
+
+    def attempt(label: str, models: Sequence[hj.StateSpaceModel], prior: dict[str, float], **own) -> None:
+        with console.status(f"{label}: {time.perf_counter() - began:.0f} s"):
+            tried[label] = attempted(benchmark, models, prior, record, **own)
+
     for label, candidate in benchmark.candidates.items():
         model, prior = candidate()
-        model = replace(model, start=begun(benchmark, model, record))
-        with console.status(f"{label}: {time.perf_counter() - began:.0f} s"):
-            scores[label] = [factor * error for error in left_out(benchmark, model, prior, record)]
-            fits[label] = fit(benchmark, model, prior, record)
-        own = factor * float(fits[label].errors[benchmark.columns[1]][0])
-        table.add_row(label, ", ".join(f"{error:.3g}" for error in scores[label]), f"{own:.3g}")
-    chosen = min(scores, key=lambda label: np.mean(np.square(scores[label])))
-    console.print(table)
-    console.print(f"RMSE of free runs from the start, in {unit}. Left out: each part in turn, by a fit to the others.")
-    console.print(f"Chosen: {chosen}, fitted in {time.perf_counter() - began:.0f} s with all candidates.")
-    for parameter, interval in fits[chosen].intervals.items():
-        low, high = float(interval.low), float(interval.high)
-        console.print(f"  {parameter} {float(interval.value):.4g}, 95 % interval {low:.4g} to {high:.4g}")
+        attempt(label, [replace(model, start=begun(benchmark, model, record))] * (benchmark.parts + 1), prior)
+    physics = tried[label := best(tried)]
+    models = [with_network(benchmark, each.model) for each in physics.fits]
+    attempt(f"{label}, and a network", models, {**physics.prior, "residual": 1.0}, starts=1, max_steps=100)
+    report(benchmark, tried, time.perf_counter() - began, console)
     if test is not None:
-        model = fits[chosen].model
+        model, (unit, factor) = tried[best(tried)].fits[-1].model, benchmark.unit
         error = free_run(benchmark, model, test, begun(benchmark, model, test))
         console.print(f"{test.name}: {factor * rmse(error):.4g} {unit}")
 
 
-def fit(benchmark: Benchmark, model: hj.StateSpaceModel, prior: dict[str, float], record: hj.Record):
-    return hj.fit_records(model, [record], prior=prior, **benchmark.options)
+def report(benchmark: Benchmark, tried: dict[str, Tried], seconds: float, console: Console) -> None:
+    (unit, factor), name = benchmark.unit, benchmark.columns[1]
+    table = Table("model", "left out", "this record", title=benchmark.title)
+    for label, each in tried.items():
+        scores = ", ".join(f"{factor * error:.3g}" for error in each.scores)
+        table.add_row(label, scores, f"{factor * float(each.fits[-1].errors[name][0]):.3g}")
+    console.print(table)
+    console.print(f"RMSE of free runs from the start, in {unit}. Left out: each part in turn, by a fit to the others.")
+    console.print(f"Chosen: {best(tried)}, fitted in {seconds:.0f} s with all candidates.")
+    for parameter, interval in tried[best(tried)].fits[-1].intervals.items():
+        low, high = float(interval.low), float(interval.high)
+        console.print(f"  {parameter} {float(interval.value):.4g}, 95 % interval {low:.4g} to {high:.4g}")
+
+
+def best(tried: dict[str, Tried]) -> str:
+    return min(tried, key=lambda label: np.mean(np.square(tried[label].scores)))
+
+
+def with_network(benchmark: Benchmark, model: hj.StateSpaceModel) -> hj.StateSpaceModel:
+    *states, inputs = benchmark.range
+    ranges, size = (*states[: len(model.start)], inputs), tuple(benchmark.size.items())
+    return replace(model, field=hj.Hybrid(model.field, Network(jnp.zeros((len(size), UNITS + 1)), ranges, size)))
 
 
 def free_run(benchmark: Benchmark, model: hj.StateSpaceModel, record: hj.Record, start) -> np.ndarray:
@@ -115,14 +170,20 @@ def rmse(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def left_out(benchmark: Benchmark, model: hj.StateSpaceModel, prior: dict[str, float], record: hj.Record):
-    """Return the RMSE of free runs of the whole record on each part, by a fit to the other samples."""
-    name, found = benchmark.columns[1], []
+def attempted(benchmark: Benchmark, models, prior: dict[str, float], record: hj.Record, **options) -> Tried:
+    """Score free runs of the whole record on each part by a fit, from a model of its own, to the other samples."""
+    name = benchmark.columns[1]
     n = len(signal := record.signals[name])
+    options = {**benchmark.options, "prior": prior, **options}
     # The last sample stays, so that all fits have one grid and one program.
-    for begin, end in itertools.pairwise(np.linspace(FIRST * n, n - 1, benchmark.parts + 1).astype(int)):
-        others = np.delete(np.arange(n), np.s_[begin:end])
-        kept = replace(signal, t=signal.t[others], values=signal.values[others])
-        result = fit(benchmark, model, prior, replace(record, signals={**record.signals, name: kept}))
-        found.append(rmse(free_run(benchmark, result.model, record, result.starts[0])[begin:end]))
-    return found
+    edges = np.linspace(FIRST * n, n - 1, benchmark.parts + 1).astype(int)
+    parts = [np.arange(begin, end) for begin, end in itertools.pairwise(edges)]
+
+    def fitted(model: hj.StateSpaceModel, part: np.ndarray) -> RecordFit:
+        kept = replace(signal, t=np.delete(signal.t, part), values=np.delete(signal.values, part, axis=0))
+        return hj.fit_records(model, [replace(record, signals={**record.signals, name: kept})], **options)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        fits = list(pool.map(fitted, models, [*parts, parts[0][:0]]))
+    runs = (free_run(benchmark, fit.model, record, fit.starts[0]) for fit in fits)
+    return Tried([rmse(errors[part]) for errors, part in zip(runs, parts, strict=False)], fits, prior)

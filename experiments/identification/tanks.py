@@ -6,6 +6,7 @@ where it is before it follows: the sensor has play. Above 4.2 V it rises about t
 The record is on nonlinearbenchmark.org.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -34,7 +35,6 @@ class Tanks(hj.AbstractVectorField):
         log_weir: ln of the flow over each edge, per V (2,).
         caught: the share of it that the lower tank catches, as a logit.
         log_play: ln of half the play of the sensor [V]; None without play.
-        bend: the reading at which the sensor's slope changes [V], and ln of the ratio of slopes (2,); None if straight.
     """
 
     log_flow: jax.Array
@@ -45,7 +45,6 @@ class Tanks(hj.AbstractVectorField):
     log_weir: jax.Array
     caught: jax.Array
     log_play: jax.Array | None = None
-    bend: jax.Array | None = None
 
     def __call__(self, x, u):
         upper, lower, pump = jnp.exp(self.log_flow)
@@ -61,40 +60,44 @@ class Tanks(hj.AbstractVectorField):
         return jnp.append(flows, flows[1] * (1 - slip))
 
 
-def physics(*extra: str) -> Tanks:
-    """Tanks with "log_play", "bend" or both."""
+class Sensor(eqx.Module):
+    """The level that is read [V]: a line that may have a bend, up to where the sensor saturates.
+
+    Attributes:
+        bend: the reading at which the slope changes [V], and ln of the ratio of slopes (2,); None if there is none.
+    """
+
+    bend: jax.Array | None = None
+
+    def __call__(self, x, u):
+        seen = x[1] - jnp.sum(x[2:])
+        if self.bend is not None:
+            seen = seen + jnp.expm1(self.bend[1]) * _positive(seen - self.bend[0], EDGE)
+        return FULL - _positive(FULL - seen, EDGE)
+
+
+NEAR = {"offset[0]": 0.3, "offset[1]": 1.0, "edge": 0.5, "log_weir": 0.7, "caught": 1.5, "power": 0.03}
+WITH = {"play": {"log_play": 0.7}, "bend": {"y.bend[0]": 0.2, "y.bend[1]": 0.5}}
+
+
+def physics(play: bool = False, edge: float = 10.0) -> Tanks:
     flow, half = jnp.log(jnp.array([0.05, 0.05, 0.04])), jnp.full(2, 0.5)
-    starts = {"log_play": jnp.log(0.15), "bend": jnp.array([4.3, 0.5])}
-    edge = jnp.array([9.0, 7.2 if "bend" in extra else 10.0])
-    more = {name: starts[name] for name in extra}
-    return Tanks(flow, jnp.zeros(()), half, jnp.full(2, 0.1), edge, jnp.log(half * 0.4), jnp.zeros(()), **more)
-
-
-def level(x, u, field: Tanks):
-    """The sensor of the lower tank has play, two slopes, and saturates."""
-    seen = x[1] - jnp.sum(x[2:])
-    if field.bend is not None:
-        seen = seen + jnp.expm1(field.bend[1]) * _positive(seen - field.bend[0], EDGE)
-    return FULL - _positive(FULL - seen, EDGE)
-
-
-NEAR = {
-    "offset[0]": 0.3, "offset[1]": 1.0, "edge": 0.5, "log_weir": 0.7, "caught": 1.5, "power": 0.03, "log_play": 0.7,
-    "bend[0]": 0.2, "bend[1]": 0.5,
-}  # fmt: skip
+    own = jnp.full(2, 0.1), jnp.array([9.0, edge]), jnp.log(half * 0.4), jnp.zeros(())
+    return Tanks(flow, jnp.zeros(()), half, *own, jnp.log(jnp.array(0.15)) if play else None)
 
 
 def candidate(*extra: str):
-    field, d = physics(*extra), 2 + ("log_play" in extra)
-    prior = {name: value for name, value in NEAR.items() if getattr(field, name.split("[")[0]) is not None}
+    """The model and priors of physics with "play", "bend", or both."""
+    field, d = physics("play" in extra, 7.2 if "bend" in extra else 10.0), 2 + ("play" in extra)
+    y = Sensor(jnp.array([4.3, 0.5]) if "bend" in extra else None)
     start, spread = (4.0, 5.2, 0.0), (5.0, 0.3, 0.3)
-    return hj.StateSpaceModel(field, ("u",), {"y": level}, start[:d], spread[:d], noise={"y": 0.2}), prior
+    prior = {name: size for each in (NEAR, *(WITH[name] for name in extra)) for name, size in each.items()}
+    return hj.StateSpaceModel(field, ("u",), {"y": y}, start[:d], spread[:d], noise={"y": 0.2}), prior
 
 
 def begun(u: float, y: float, model: hj.StateSpaceModel) -> tuple[float, ...]:
     """The hidden states at the start are the same in both records, and the lower level is that of the first reading."""
-    assert isinstance(model.field, Tanks)
-    bend = model.field.bend
+    bend = model.outputs["y"].bend  # pyright: ignore[reportFunctionMemberAccess]
     below = y if bend is None else min(y, bend[0] + (y - bend[0]) / jnp.exp(bend[1]))
     return model.start[0], float(below) + sum(model.start[2:]), *model.start[2:]
 
@@ -106,8 +109,10 @@ BENCHMARK = Benchmark(
     candidates={
         "physics": candidate,
         "the sensor has two slopes": lambda: candidate("bend"),
-        "two slopes and play": lambda: candidate("bend", "log_play"),
+        "two slopes and play": lambda: candidate("bend", "play"),
     },
+    range=((5.0, 5.0), (5.0, 5.0), (0.0, 0.3), (2.5, 2.5)),
+    size={0: 1e-4, 1: 1e-4},
     options={"dt": 4.0, "substeps": 6, "rounds": 1, "max_steps": 200, "starts": 3},
     start=begun,
 )

@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from importlib import import_module
 
+import equinox as eqx
 import numpy as np
 import pytest
 from rich.console import Console
@@ -213,11 +214,21 @@ def test_the_model_that_made_a_record_predicts_another(slide, capsys):
 
 
 def test_a_sensor_with_play_stays_at_a_reversal_and_then_follows():
-    field, play = tanks.physics("log_play"), 0.15
+    field, play = tanks.physics(play=True), 0.15
     rate = field(np.array([4.0, 6.0, 0.0]), np.array([3.0]))[1]
     for z, share in ((0.0, 1.0), (-np.sign(rate) * play, 1.0), (np.sign(rate) * play, 0.0)):
         change = field(np.array([4.0, 6.0, z]), np.array([3.0]))
         np.testing.assert_allclose(change[2], share * change[1], atol=1e-7)
+
+
+def test_a_network_begins_at_the_physics_and_changes_only_its_states():
+    x, u = np.array([4.0, 6.0, 0.1]), np.array([3.0])
+    model, _ = tanks.candidate("bend", "play")
+    field = record.with_network(tanks.BENCHMARK, model).field
+    np.testing.assert_array_equal(field(x, u), model.field(x, u))
+    other = eqx.tree_at(lambda field: field.residual.weight, field, replace_fn=lambda weight: weight + 1.0)
+    changed = np.asarray(other(x, u) - model.field(x, u))
+    np.testing.assert_array_equal(changed != 0, [True, True, False])
 
 
 def test_a_wrong_record_is_refused_in_a_line(tmp_path, capsys):
