@@ -17,15 +17,6 @@ from hybrid_jax.estimation.uncertainty import (
     select_disturbance,
 )
 
-__all__ = ["DisturbanceSelection", "Interval", "LeastSquaresFit", "covariance_of", "estimate_windows"]
-__all__ += [
-    "RecordFit",
-    "RecordWindows",
-    "fit_disturbance",
-    "fit_least_squares",
-    "fit_records",
-    "intervals",
-    "observe",
-    "predict",
-]
-__all__ += ["select_disturbance", "simulate"]
+__all__ = ["DisturbanceSelection", "Interval", "LeastSquaresFit", "RecordFit", "RecordWindows", "covariance_of"]
+__all__ += ["estimate_windows", "fit_disturbance", "fit_least_squares", "fit_records", "intervals", "observe"]
+__all__ += ["predict", "select_disturbance", "simulate"]
