@@ -57,7 +57,12 @@ class RecordWindows(eqx.Module):
         Args:
             model: the model, whose outputs are compared.
             x: its states at the ends of intervals.
+
+        Raises:
+            ValueError: if the model lacks an output that was measured.
         """
+        for name in (name for name, _ in self.noise if name not in model.outputs):
+            raise ValueError(f"field: has no output {name}; it has {', '.join(model.outputs)}")
 
         def one(window: RecordWindows, x):
             states, u = jnp.concatenate([window.states.x0[None], x]), jnp.asarray(window.states.u)

@@ -1,6 +1,5 @@
 """Records of which not every state was measured: what made them is recovered, and what they do not tell is said."""
 
-import dataclasses
 from functools import cache
 
 import diffrax
@@ -105,46 +104,6 @@ def test_what_follows_is_predicted_from_what_was_seen(fitted):
     t, seen = signal.t[signal.t > 4.05], signal.values[signal.t > 4.05]
     y = hj.predict(fitted.model, past, Record.of("future", torque=(torque.t, torque.values), angle=(t, seen)), dt=0.02)
     assert np.sqrt(np.mean((y["angle"] - seen) ** 2)) < 2 * NOISE
-
-
-def test_windows_begin_at_states_estimated_from_the_samples_around_them_and_a_fit_to_them_finds_what_made_them():
-    known, near = model_of(pendulum(), noise={"angle": NOISE}), {"dt": 0.02, "steps": 20, "around": 0.5}
-    windows = hj.estimate_windows(known, records()[:1], **near)
-    places = 25 + 20 * np.arange(len(windows))[:, None] + np.arange(21)
-    x0, *x = np.moveaxis(hj.simulate(known, records()[0], (0.5, 0.0), dt=0.02)[1][places], 1, 0)
-    assert (np.std(windows.states.x0 - x0, axis=0) < (NOISE, 0.06)).all()
-    true = eqx.tree_at(lambda w: w.states.x0, windows, jnp.asarray(x0, jnp.float32))
-    assert float(true.loss(known, jnp.stack(x, axis=1))) == pytest.approx(1.0, abs=0.3)
-    wrong = model_of(pendulum(0.9, 0.1), noise={"angle": NOISE})
-    found = hj.fit(wrong, windows, windows, jax.random.key(0), max_epochs=400).best
-    assert (np.exp(found.field.log_length), found.field.damping) == (
-        pytest.approx(0.8, abs=0.01),
-        pytest.approx(0.3, abs=0.05),
-    )
-    for model, around, said in ((known, 5, "all are shorter than 10 s"), (model_of(pendulum()), 1, "angle has none")):
-        refusal(lambda m=model, a=around: hj.estimate_windows(m, records()[:1], **near | {"around": a}), said)
-    refusal(lambda: hj.fit(known.field, windows, windows, jax.random.key(0)), "field must be a StateSpaceModel")
-
-
-@pytest.mark.parametrize("late", [0.0, 0.013])  # at the edges of intervals, which needs no interpolation, or between
-def test_windows_compare_each_sample_at_its_own_time_with_its_own_input_and_an_outlier_counts_less(late):
-    outputs = {"angle": angle, "force": lambda x, u: u[0] - x[1]}
-    model = dataclasses.replace(model_of(pendulum()), outputs=outputs, noise=dict.fromkeys(outputs, NOISE))
-    t = np.arange(0, 8, 0.02)
-    torque, times = (t, np.random.default_rng(0).normal(size=len(t))), np.append(0.0, t[2::2] + late)
-    blank = Record.of("even", torque=torque, **dict.fromkeys(outputs, (times, 0 * times)))
-    y = hj.simulate(model, blank, (0.5, 0.0), dt=0.02, begin=0.0)[0]
-    y["angle"][80] += 100 * NOISE
-
-    def windows(**options):
-        record = Record.of("even", torque=torque, **{name: (times[: len(each)], each) for name, each in y.items()})
-        return hj.estimate_windows(model, [record], dt=0.02, steps=21, around=0.5, **options)
-
-    plain, robust = (each.loss(model, each.states.x) for each in (windows(), windows(robust=3.0)))
-    assert 5 * robust < plain
-    y["angle"][80] -= 100 * NOISE
-    assert (windows().segments.share is None) == (late == 0)
-    assert windows().loss(model, windows().states.x) < 1e-4
 
 
 @pytest.mark.parametrize("size", [3.0, 30.0])  # the first round must not follow a large one
