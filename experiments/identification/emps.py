@@ -83,8 +83,8 @@ BENCHMARK = Benchmark(
         "direction, drift, and a force that lags": lambda: candidate(True, True, True),
         "and a guide that is not uniform": lambda: candidate(True, True, True, True),
     },
-    range=((MIDDLE, MIDDLE), (0.0, 0.1), (0.5, 0.5), (0.0, FORCE), (0.0, FORCE)),
-    size={1: 0.001},
+    ranges=((MIDDLE, MIDDLE), (0.0, 0.1), (0.5, 0.5), (0.0, FORCE), (0.0, FORCE)),
+    sizes={1: 0.001},
     options={"dt": 0.01, "substeps": 16, "between": "linear", "rounds": 1, "max_steps": 200},
     # At rest and cold; the force has acted for longer than its lag.
     start=lambda u, q, model: (q, 0.0, 0.0, u)[: len(model.start)],

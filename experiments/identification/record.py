@@ -34,19 +34,19 @@ class Network(hj.AbstractVectorField):
 
     Attributes:
         weight: of each hidden unit and of 1, for each of these states.
-        range: centre and half width of each state and input.
-        size: how much the network may add to a state, by index.
+        ranges: centre and half width of each state and input.
+        sizes: index of each of these states, and the usual size of what the network adds to its derivative.
     """
 
     weight: jax.Array
-    range: tuple[tuple[float, float], ...] = eqx.field(static=True)
-    size: tuple[tuple[int, float], ...] = eqx.field(static=True)
+    ranges: tuple[tuple[float, float], ...] = eqx.field(static=True)
+    sizes: tuple[tuple[int, float], ...] = eqx.field(static=True)
 
     def __call__(self, x, u):
-        centre, width = np.transpose(self.range)
+        centre, width = np.transpose(self.ranges)
         random, z = np.random.default_rng(0), (jnp.concatenate([x, u]) - centre) / width
         units = jnp.tanh(random.normal(size=(UNITS, len(z))) @ z + random.normal(size=UNITS))
-        places, sizes = np.transpose(self.size)
+        places, sizes = np.transpose(self.sizes)
         return jnp.zeros_like(x).at[places.astype(int)].set(sizes * (self.weight @ jnp.append(units, 1.0)))
 
 
@@ -65,15 +65,16 @@ class Benchmark:
     """A system and its evaluation.
 
     Errors are printed in `unit`, and `start` gives the initial state from the first samples and a model. A candidate is
-    a model with its priors; each of `parts` equal parts is left out in turn.
+    a model with its priors; each of `parts` equal parts is left out in turn. The best one then gets a `Network`, with
+    the `ranges` of the states of the largest candidate and of the input, and the `sizes` by index of the state.
     """
 
     title: str
     columns: tuple[str, str]
     unit: tuple[str, float]
     candidates: Mapping[str, Callable[[], tuple[hj.StateSpaceModel, dict[str, float]]]]
-    range: tuple[tuple[float, float], ...]
-    size: dict[int, float]
+    ranges: tuple[tuple[float, float], ...]
+    sizes: dict[int, float]
     options: Mapping[str, Any]
     start: Callable[[float, float, hj.StateSpaceModel], tuple[float, ...]]
     parts: int = 5
@@ -149,9 +150,9 @@ def best(tried: dict[str, Tried]) -> str:
 
 
 def with_network(benchmark: Benchmark, model: hj.StateSpaceModel) -> hj.StateSpaceModel:
-    *states, inputs = benchmark.range
-    ranges, size = (*states[: len(model.start)], inputs), tuple(benchmark.size.items())
-    return replace(model, field=hj.Hybrid(model.field, Network(jnp.zeros((len(size), UNITS + 1)), ranges, size)))
+    *states, inputs = benchmark.ranges
+    ranges, sizes = (*states[: len(model.start)], inputs), tuple(benchmark.sizes.items())
+    return replace(model, field=hj.Hybrid(model.field, Network(jnp.zeros((len(sizes), UNITS + 1)), ranges, sizes)))
 
 
 def free_run(benchmark: Benchmark, model: hj.StateSpaceModel, record: hj.Record, start) -> np.ndarray:

@@ -111,8 +111,8 @@ BENCHMARK = Benchmark(
         "the sensor has two slopes": lambda: candidate("bend"),
         "two slopes and play": lambda: candidate("bend", "play"),
     },
-    range=((5.0, 5.0), (5.0, 5.0), (0.0, 0.3), (2.5, 2.5)),
-    size={0: 1e-4, 1: 1e-4},
+    ranges=((5.0, 5.0), (5.0, 5.0), (0.0, 0.3), (2.5, 2.5)),
+    sizes={0: 1e-4, 1: 1e-4},
     options={"dt": 4.0, "substeps": 6, "rounds": 1, "max_steps": 200, "starts": 3},
     start=begun,
 )

@@ -123,7 +123,9 @@ def predicted(problem: Problem, model: Model, x0, segment: Segments) -> Predicte
     return compared(model, *states_of(problem, model, x0, segment), segment, problem.dt)
 
 
-def compared(model: Model, states: Float[Array, "t d"], u: Float[Array, "i m"], segment: Segments, dt: float):
+def compared(
+    model: Model, states: Float[Array, "t d"], u: Float[Array, "i m"], segment: Segments, dt: float
+) -> Predicted:
     """Return the prediction of a segment whose states at the edges of intervals, and inputs, are known."""
     y, errors = outputs_of(model, states, u, segment, dt), {}
     for name, each in y.items():

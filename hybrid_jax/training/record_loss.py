@@ -21,11 +21,11 @@ class RecordLoss(Objective):
         return windows
 
     def loss(self, field: StateSpaceModel, batch: RecordWindows, settings: Settings, weight: Float[Array, ""]):
-        own, model = UNSCALED.batch(batch.states, settings), field
-        states = rollout_minibatch(model.field, own.x0, own.u, own.dt, own.solver)
-        value = batch.loss(model, states.transpose(2, 0, 1))
-        if settings.regulariser is not None and isinstance(model.field, Hybrid):
-            value = value + weight * settings.regulariser(model.field, own, states)
+        own = UNSCALED.batch(batch.states, settings)
+        states = rollout_minibatch(field.field, own.x0, own.u, own.dt, own.solver)
+        value = batch.loss(field, states.transpose(2, 0, 1))
+        if settings.regulariser is not None and isinstance(field.field, Hybrid):
+            value = value + weight * settings.regulariser(field.field, own, states)
         return value, states
 
     def observe(self, field: StateSpaceModel, batch: RecordWindows, seen: Float[Array, "t d b"]) -> StateSpaceModel:
