@@ -22,6 +22,7 @@ from hybrid_jax.adaptation.selection import TINY, correlated, overlap
 from hybrid_jax.dynamics import disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space, trainable
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, physics_of
+from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.dynamics.rigid_body import uncorrected
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import NAMED, compare_steps
@@ -97,6 +98,8 @@ def adapt(
             adapt the field.
     """
     checks.not_traced("adapt", field, windows, validation, learned_from)
+    if isinstance(field, StateSpaceModel):
+        raise ValueError("field must be a vector field; for a StateSpaceModel and records use adapt_records")
     name, method = _named(method)
     flights = None
     if isinstance(windows, list):

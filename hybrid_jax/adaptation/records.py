@@ -20,6 +20,7 @@ from hybrid_jax.estimation import learned_numbers, record_search, shooting
 from hybrid_jax.estimation.discretisation import Solver
 from hybrid_jax.estimation.record_fit import RecordFit, fit_records, intervals_of
 from hybrid_jax.estimation.record_search import Search
+from hybrid_jax.estimation.record_windows import measured_outputs
 from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.integrate import RK4
@@ -66,7 +67,7 @@ class RecordAdaptation(eqx.Module):
 
 @entry
 def adapt_records(
-    source: RecordFit,
+    source: RecordFit | StateSpaceModel,
     records: Sequence[Record],
     *,
     dt: float,
@@ -88,7 +89,9 @@ def adapt_records(
     those of `fit_records`, or by the jackknife over the parts if they are wider.
 
     Args:
-        source: the fit before the change. The noise of its model is the size of the errors to expect.
+        source: the fit before the change, or a model with noise, for example one that `fit` trained on windows of
+            `estimate_windows`; its numbers then count as known exactly. The noise is the size of the errors to expect.
+            You should wrap a large network in `Frozen`: its weights stay as they are.
         records: one or more records of the changed system, in which each output has samples.
         dt: length of the intervals in which the inputs are constant [s].
         between: how inputs act between their samples.
@@ -100,25 +103,31 @@ def adapt_records(
         options: other arguments of `fit_records`, for example segment and max_steps.
 
     Raises:
-        ValueError: as `fit_records`, or if the options have a prior or rounds, which the source determines.
+        ValueError: as `fit_records`, or if a model has no noise, or options have a prior or rounds, which the source
+            determines.
     """
-    checks.instance("source", source, RecordFit)
     if own := options.keys() & {"prior", "rounds"}:
         raise ValueError(f"{min(own)} cannot be given: it is determined by the source")
     records, grid = checks.list_of("records", records, Record), {"dt": dt, "between": between}
     grid |= {"robust": robust, "solver": solver, "substeps": substeps}
+    if alone := isinstance(source, StateSpaceModel):
+        start, variances = measured_outputs(source, records), 0.0
+    else:
+        checks.instance("source", source, RecordFit)
+        start, variances = source.model, np.diagonal(source.covariance)
     with jax.enable_x64(True):
-        model = in_double(source.model)
+        model = in_double(start)
         names, theta = learned_numbers.learned_names(model), np.asarray(ravel_learned(model)[0])
         sizes = np.asarray(plausible.relative_to(names, theta))
-        wide = np.sqrt(np.where(sizes > 0, sizes, np.inf) ** 2 + np.diagonal(source.covariance))
+        wide = np.sqrt(np.where(sizes > 0, sizes, np.inf) ** 2 + variances)
         near = {name: np.where(free, wide, 0.0) for name, free in _candidates(model, len(theta)).items()}
     fits, said = {}, {}
     for name, deviations in near.items():
         prior = dict(zip(names, deviations, strict=True))
         with warnings.catch_warnings(record=True) as said[name]:
             warnings.simplefilter("always")
-            fits[name] = fit_records(source.model, records, prior=prior, rounds=1, **grid, **options)
+            fits[name] = fit_records(start, records, prior=prior, rounds=1, **grid, **options)
+    source = fits[SOURCE] if alone else source
     with jax.enable_x64(True), np.errstate(over="ignore", invalid="ignore"):
         left, without = _left_out(model.only(source.errors), records, fits, near, **grid)
         chosen = _chosen(left)

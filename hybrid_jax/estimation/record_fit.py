@@ -155,6 +155,9 @@ def fit_records(
         problem = Problem(model, scale, cautious, dt, RK4() if solver is None else solver, substeps)
         steps = record_search.steps_of(segment, gridded, dt)
         theta, near = np.asarray(ravel_learned(model)[0]), learned_numbers.deviations_of(model, prior or {})
+        if len(theta) > record_search.MOST:
+            remedy = "wrap the network in Frozen, or train it by fit on windows of estimate_windows"
+            raise ValueError(f"model: {len(theta)} learned numbers are too many; {remedy}")
         segments = shooting.cut(gridded, steps)
         nodes = len(gridded), 1 if segment is None else segments.valid.shape[1], 1
         centres, spread = jnp.tile(jnp.array(model.start), nodes), np.array(model.spread)[None]

@@ -63,10 +63,11 @@ def test_a_change_of_physics_is_found_with_its_interval_and_predicts_better(sour
 
 
 def test_a_sensor_that_is_off_is_not_taken_for_other_physics(source):
-    result = hj.adapt_records(source, [record(6, bias=0.3)], dt=0.02)
-    assert (result.chosen, set(result.changes)) == ("sensors", {"angle.bias"})
-    assert float(result.changes["angle.bias"].value) == pytest.approx(0.2, abs=0.01)
-    assert eqx.tree_equal(result.model.field, source.model.field)
+    for given in (source, source.model):  # a model is as good as its fit
+        result = hj.adapt_records(given, [record(6, bias=0.3)], dt=0.02)
+        assert (result.chosen, set(result.changes)) == ("sensors", {"angle.bias"})
+        assert float(result.changes["angle.bias"].value) == pytest.approx(0.2, abs=0.01)
+        assert eqx.tree_equal(result.model.field, source.model.field)
 
 
 def test_a_larger_candidate_is_chosen_only_if_it_surely_beats_all_smaller_ones():
@@ -97,7 +98,12 @@ def test_a_network_changes_only_together_with_all_others():
 
 
 def test_wrong_inputs_are_named(source):
-    with pytest.raises(ValueError, match=r"^source must be a RecordFit, got StateSpaceModel"):
-        hj.adapt_records(source.model, [record(4)], dt=0.02)
+    unknown = dataclasses.replace(source.model, noise={})
+    with pytest.raises(ValueError, match=r"^noise: angle has none"):
+        hj.adapt_records(unknown, [record(4)], dt=0.02)
+    with pytest.raises(ValueError, match=r"^source must be a RecordFit, got Damped"):
+        hj.adapt_records(source.model.field, [record(4)], dt=0.02)
+    with pytest.raises(ValueError, match="for a StateSpaceModel and records use adapt_records"):
+        hj.adapt(source.model, [record(4)])
     with pytest.raises(ValueError, match=r"^prior cannot be given: it is determined by the source"):
         hj.adapt_records(source, [record(4)], dt=0.02, prior={"damping": 1.0})
