@@ -157,3 +157,8 @@ class StateSpaceModel(eqx.Module):
         outputs = {name: self.outputs[name] for name in names}
         noise = {name: size for name, size in self.noise.items() if name in outputs}
         return replace(self, outputs=outputs, angles=[name for name in self.angles if name in outputs], noise=noise)
+
+
+def dynamics_of(learner: Any) -> Any:
+    """Return the field of a `StateSpaceModel`, or what is none itself."""
+    return learner.field if isinstance(learner, StateSpaceModel) else learner

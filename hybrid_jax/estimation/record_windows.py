@@ -6,11 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import in_double, ravel_learned
+from hybrid_jax.dynamics.base import as_field, in_double, ravel_learned
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.outputs import Measured, StateSpaceModel
 from hybrid_jax.estimation import shooting
@@ -35,7 +34,7 @@ class RecordWindows(eqx.Module):
     Attributes:
         states: the estimated initial states, the inputs, and the states that the model predicted in the windows.
         segments: the samples.
-        noise: standard deviation of each output's errors, by name.
+        noise: standard deviation of each component of an output's errors, by name.
         robust: errors beyond this many times the noise count linearly.
     """
 
@@ -51,31 +50,60 @@ class RecordWindows(eqx.Module):
         """Return the windows at a slice or an array of indices, which may be traced."""
         return jax.tree.map(lambda leaf: leaf[index], self)
 
-    def loss(self, model: StateSpaceModel, x: Float[Array, "n t d"]) -> Float[Array, ""]:
-        """Return the mean squared error of all samples, relative to the noise.
+    @property
+    def samples(self) -> Float[Array, ""]:
+        """The number of measured numbers in all windows, at least 1."""
+        counts = (len(sizes) * jnp.sum(self.segments.there[name]) for name, sizes in self.noise)
+        return jnp.maximum(sum(counts, jnp.zeros(())), 1)
+
+    def errors(
+        self, model: StateSpaceModel, x: Float[Array, "t d"], slopes: Float[Array, "2 t d"] | None = None
+    ) -> Float[Array, " r"]:
+        """Return the errors of one window's samples, relative to the noise; 0 where there is no sample.
+
+        Beyond `robust` they are smaller: their squares grow linearly, as in Huber's loss.
 
         Args:
             model: the model, whose outputs are compared.
             x: its states at the ends of intervals.
+            slopes: ẋ at both ends of each interval, if you have it.
 
         Raises:
             ValueError: if the model lacks an output that was measured.
         """
         for name in (name for name, _ in self.noise if name not in model.outputs):
             raise ValueError(f"field: has no output {name}; it has {', '.join(model.outputs)}")
+        states, u = jnp.concatenate([self.states.x0[None], x]), jnp.asarray(self.states.u)
+        if self.segments.share is None:  # a sample at an edge belongs to the interval that begins there
+            u = jnp.concatenate([u[1:], u[-1:]])
+        found = shooting.compared(model, states, u, self.segments, self.states.dt, slopes).errors
+        rows = jnp.concatenate([(found[name] / jnp.array(sizes)).ravel() for name, sizes in self.noise])
+        if np.isinf(self.robust):
+            return rows
+        far = jnp.maximum(jnp.abs(rows), self.robust)
+        return jnp.where(far > self.robust, jnp.sign(rows) * jnp.sqrt(self.robust * (2 * far - self.robust)), rows)
 
-        def one(window: RecordWindows, x):
-            states, u = jnp.concatenate([window.states.x0[None], x]), jnp.asarray(window.states.u)
-            if window.segments.share is None:  # a sample at an edge belongs to the interval that begins there
-                u = jnp.concatenate([u[1:], u[-1:]])
-            return shooting.compared(model, states, u, window.segments, window.states.dt).errors
+    def loss(self, model: StateSpaceModel, x: Float[Array, "n t d"]) -> Float[Array, ""]:
+        """Return the mean squared error of all samples, see `errors`.
 
-        total, count, found = jnp.zeros(()), 0, jax.vmap(one)(self, x)
-        for name, sizes in self.noise:
-            errors = found[name] / jnp.array(sizes)
-            squared = jnp.square(errors) if np.isinf(self.robust) else 2 * optax.huber_loss(errors, delta=self.robust)
-            total, count = total + jnp.sum(squared), count + errors.shape[-1] * jnp.sum(self.segments.there[name])
-        return total / jnp.maximum(count, 1)
+        Args:
+            model: the model, whose outputs are compared.
+            x: its states at the ends of intervals, in all windows.
+        """
+        slopes = None if self.segments.share is None else self._slopes(model, x)
+        rows = jax.vmap(lambda *each: each[0].errors(model, *each[1:]))(self, x, slopes)
+        return jnp.sum(jnp.square(rows)) / self.samples
+
+    def _slopes(self, model: StateSpaceModel, x: Float[Array, "n t d"]) -> Float[Array, "n 2 t d"]:
+        """Return ẋ at both ends of each interval; as columns of all windows, since this takes half the time."""
+        ends = jnp.stack([jnp.concatenate([self.states.x0[:, None], x[:, :-1]], axis=1), x], axis=1)
+        held = jnp.broadcast_to(self.states.u[:, None], (*ends.shape[:-1], self.states.u.shape[-1]))
+        columns = (jax.lax.collapse(jnp.moveaxis(each, -1, 0), 1) for each in (ends, held))
+        return as_field(model.field).infer_batch(*columns).T.reshape(ends.shape)
+
+
+def states_of(windows: Trajectories | RecordWindows) -> Trajectories:
+    return windows.states if isinstance(windows, RecordWindows) else windows
 
 
 @entry
@@ -121,7 +149,7 @@ def estimate_windows(
         checks.positive(name, seconds, "a positive number of seconds")
     if around < dt:
         raise ValueError(f"around must be at least dt = {dt:.3g} s, got {checks.short_repr(around)}")
-    model, half = _seen(model, records), round(around / dt)
+    model, half = measured_outputs(model, records), round(around / dt)
     records = completed(records, tuple(model.outputs), model.angles)
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
     after = max(steps, half)
@@ -137,7 +165,8 @@ def estimate_windows(
         end, states = _estimated(problem, np.stack([_guess(model, each) for each in near]), near)
         windows = [_part(model, each, i, steps) for each, i in places]
         own = _search(problem, states[:, half], windows)
-        x = np.asarray(own.predicted(own.theta, own.still).states)[:, 0, 1:]
+        found = own.predicted(own.theta, own.still)
+        x, errors = np.asarray(found.states)[:, 0, 1:], found.errors
     if end.status != Status.OK:
         checks.warn(f"records: the search for initial states {end.status.message}; check all units and the model")
     kept = _determined(model, end) & np.any([there.any(axis=(1, 2)) for there in own.segments.there.values()], axis=0)
@@ -146,11 +175,12 @@ def estimate_windows(
         lambda leaf: leaf.astype(dtype) if leaf.dtype == float else leaf,
         (Trajectories(states[kept, half], segments.u, x[kept], dt), segments),
     )
-    return RecordWindows(path, segments, tuple(model.noise.items()), robust)
+    noise = {name: np.broadcast_to(sizes, errors[name].shape[-1]).tolist() for name, sizes in model.noise.items()}
+    return RecordWindows(path, segments, tuple((name, tuple(sizes)) for name, sizes in noise.items()), robust)
 
 
-def _seen(model: StateSpaceModel, records: Sequence[Record]) -> StateSpaceModel:
-    """Return the model with the measured outputs only, whose noise must be known."""
+def measured_outputs(model: StateSpaceModel, records: Sequence[Record]) -> StateSpaceModel:
+    """Return the model with the measured outputs only; ValueError if the noise of one is not known."""
     seen = {name for each in records for name, signal in each.signals.items() if len(signal)}
     model = model.only([name for name in model.outputs if name in seen] or model.outputs)
     for name in model.outputs.keys() - model.noise.keys():

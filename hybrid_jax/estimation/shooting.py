@@ -88,15 +88,17 @@ def states_of(problem: Problem, model: Model, x0: Float[Array, " d"], segment: S
     return jnp.where((jnp.arange(len(states)) <= last)[:, None], states, states[last]), u
 
 
-def outputs_of(model: Model, states, u, segment: Segments, dt: float) -> dict[str, Float[Array, "n k"]]:
+def outputs_of(
+    model: Model, states, u, segment: Segments, dt: float, slopes: Float[Array, "2 i d"] | None = None
+) -> dict[str, Float[Array, "n k"]]:
     """Return the outputs at the times of their samples, by cubic interpolation of the states."""
     if (shares := segment.share) is None:
         return {name: jax.vmap(partial(model.output, name))(states[i + 1], u[i]) for name, i in segment.index.items()}
-    slopes = jax.vmap(model.field)(states[:-1], u) * dt
-    ends = jax.vmap(model.field)(states[1:], u) * dt  # the input jumps at an edge
+    # The input jumps at an edge.
+    starts, ends = (jax.vmap(model.field)(x, u) for x in (states[:-1], states[1:])) if slopes is None else slopes
 
     def one(name, i, s):
-        a, b, c, d = states[i], states[i + 1], slopes[i], ends[i]
+        a, b, c, d = states[i], states[i + 1], dt * starts[i], dt * ends[i]
         x = a * (1 + 2 * s) * (1 - s) ** 2 + b * s**2 * (3 - 2 * s) + c * s * (1 - s) ** 2 + d * s**2 * (s - 1)
         return model.output(name, x, u[i])
 
@@ -124,10 +126,15 @@ def predicted(problem: Problem, model: Model, x0, segment: Segments) -> Predicte
 
 
 def compared(
-    model: Model, states: Float[Array, "t d"], u: Float[Array, "i m"], segment: Segments, dt: float
+    model: Model,
+    states: Float[Array, "t d"],
+    u: Float[Array, "i m"],
+    segment: Segments,
+    dt: float,
+    slopes: Float[Array, "2 i d"] | None = None,
 ) -> Predicted:
     """Return the prediction of a segment whose states at the edges of intervals, and inputs, are known."""
-    y, errors = outputs_of(model, states, u, segment, dt), {}
+    y, errors = outputs_of(model, states, u, segment, dt, slopes), {}
     for name, each in y.items():
         error = jax.vmap(partial(model.error, name))(each, jnp.asarray(segment.y[name]))
         errors[name] = jnp.where(segment.there[name][:, None], error, 0.0)

@@ -17,10 +17,10 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import check_batch_norm
-from hybrid_jax.dynamics.outputs import StateSpaceModel
+from hybrid_jax.dynamics.outputs import StateSpaceModel, dynamics_of
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import compare_steps
-from hybrid_jax.estimation.record_windows import RecordWindows
+from hybrid_jax.estimation.record_windows import RecordWindows, states_of
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
@@ -137,7 +137,7 @@ def fit(
         FitInterrupted: if you press Ctrl-C; it has the result so far.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
-    keep_programs("fit", (train.states if isinstance(train, RecordWindows) else train).x.shape)
+    keep_programs("fit", states_of(train).x.shape)
     if rates is None:
         rates = RATE if optimiser is None else 1.0
     try:
@@ -198,23 +198,21 @@ def _check_field(field: Learner, data: dict[str, Any], settings: Settings) -> No
         if isinstance(leaf, jax.Array) and leaf.shape == () and jnp.issubdtype(leaf.dtype, jnp.integer):
             name = jax.tree_util.keystr(path, simple=True, separator=".")
             raise ValueError(f"field: {name} is an integer, which is not learned; make it a float, or a Python int")
-    if isinstance(settings.objective, RecordLoss):
-        field, data = field.field, {name: each.states for name, each in data.items()}
-    for name, windows in data.items():
+    field = dynamics_of(field)
+    for name, windows in ((name, states_of(each)) for name, each in data.items()):
         if isinstance(field, AbstractVectorField):
             try:
                 checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from error
-            check_like(windows, data["train"], name)
+            check_like(windows, states_of(data["train"]), name)
             check_batch_norm(field, *(np.asarray(part).T for part in (windows.x0[:2], windows.u[:2, 0])))
 
 
 def ready(field: Learner, train: Any) -> Learner:
     """Set the scaling and motion of a field; warn if you will need `like` to load it from a file."""
-    if isinstance(field, StateSpaceModel):
-        known = isinstance(train, RecordWindows)
-        return replace(field, field=with_scaling(field.field, train.states)) if known else field
+    if isinstance(field, StateSpaceModel) and isinstance(train, RecordWindows):
+        return replace(field, field=with_scaling(field.field, train.states))
     if (reason := check_savable(field)) is not None:
         checks.warn(reason)
     return with_motion(with_scaling(field, train), train) if isinstance(field, AbstractVectorField) else field

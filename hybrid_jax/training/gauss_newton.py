@@ -17,16 +17,19 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field, parts_of, ravel_learned
 from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.dynamics.outputs import StateSpaceModel, dynamics_of
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import compare_steps
 from hybrid_jax.estimation.elimination import descend
 from hybrid_jax.estimation.normal_equations import NormalEquations
+from hybrid_jax.estimation.record_windows import RecordWindows, states_of
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 from hybrid_jax.training.driver import ready
 from hybrid_jax.training.loss import correlation_rows
+from hybrid_jax.training.objective import Learner
 from hybrid_jax.trajectories import Trajectories, errors_of, overflows
 
 MOST = 1000  # parameters: the cost of a step grows with their square
@@ -40,14 +43,15 @@ class GaussNewtonFit(eqx.Module):
     """The result of `fit_gauss_newton`.
 
     Attributes:
-        field: the best field found.
+        field: the best field found, or the best `StateSpaceModel`.
         loss: its loss, L_MSE on the windows plus λ times the penalty.
         steps: the number of points that were tried.
         status: how the fit ended: OK if it stopped before `max_steps`, at a finite loss.
-        discretisation: the effect of half the solver's step, as in `FitResult`; you get a warning above 0.5.
+        discretisation: the effect of half the solver's step, as in `FitResult`, with a warning above 0.5; -1 for
+            windows of records.
     """
 
-    field: AbstractVectorField
+    field: Learner
     loss: float
     steps: int
     status: Status
@@ -78,8 +82,8 @@ PENALTIES: dict[str, Rows] = {one.__name__: one for one in (residual_norm, traje
 
 @entry
 def fit_gauss_newton(
-    field: AbstractVectorField,
-    windows: Trajectories,
+    field: Learner,
+    windows: Trajectories | RecordWindows,
     *,
     penalty: str | None = None,
     weight: float = 0.0,
@@ -92,93 +96,113 @@ def fit_gauss_newton(
     You should use it for up to a thousand parameters, and for few data with little noise: there is no early stopping.
 
     Args:
-        field: the initial field.
-        windows: the data, all of which are used in each step. They scale a network that has no scaling, as in `fit`.
+        field: the initial field, or a `StateSpaceModel` for windows of records.
+        windows: the data, all of which are used in each step. They scale a network that has no scaling, as in `fit`. If
+            only some states are measured, use windows of `estimate_windows`; L_MSE is then relative to the noise.
         penalty: L_reg of a `Hybrid`: "residual_norm" or "trajectory_correlation" of `training.loss`, or
             "neighbour_weights", the squared weights of a `GridNetwork` for all points except the centre.
         weight: λ, the weight of the penalty.
         max_steps: the maximum number of points to try.
         solver: the integrator, by default `RK4`.
-        scale: a divisor for the error of each state, as in `fit_least_squares`.
+        scale: a divisor for the error of each state, as in `fit_least_squares`; not for windows of records.
 
     Raises:
         ValueError: if windows are invalid or do not match the field, there are no parameters or too many, the penalty
             is unknown or the field is not a `Hybrid`, or the weight is negative.
     """
     checks.not_traced("fit_gauss_newton", field, windows)
-    windows = check_windows(field, windows, missing=True)
-    checked(field, windows.x0, windows.u, windows.dt, solver, windows=True)
+    if isinstance(windows, RecordWindows):
+        checks.instance("field", field, StateSpaceModel)
+    else:
+        windows = check_windows(field, windows, missing=True)
+    states, dynamics = states_of(windows), dynamics_of(field)
+    checked(dynamics, states.x0, states.u, states.dt, solver, windows=True)
     checks.not_negative("weight", weight)
     checks.count("max_steps", max_steps)
-    valid = isinstance(penalty, str) and penalty in PENALTIES and isinstance(field, Hybrid)
+    valid = isinstance(penalty, str) and penalty in PENALTIES and isinstance(dynamics, Hybrid)
     if penalty is not None and not valid:
         known = ", ".join(PENALTIES)
-        raise ValueError(f"penalty must be one of {known}, for a Hybrid, got {penalty!r} for {type(field).__name__}")
+        raise ValueError(f"penalty must be one of {known}, for a Hybrid, got {penalty!r} for {type(dynamics).__name__}")
     size = ravel_learned(field)[0].size
     if not 0 < size <= MOST:
         raise ValueError(f"field: 1 to {MOST} parameters expected for Gauss-Newton, got {size}; use fit")
     field = ready(field, windows)
     rows = None if penalty is None else PENALTIES[penalty]
-    if scale is not None:
-        scale = checks.floating("scale", scale)
-        if scale.shape != windows.x0.shape[1:] or not (scale > 0).all():
-            raise ValueError(f"scale must be {windows.x0.shape[1:]} positive numbers, got shape {scale.shape}")
-    if scale is None and overflows(windows):
+    scale = None if scale is None else _checked_scale(scale, windows)
+    if scale is None and overflows(states):
         return GaussNewtonFit(field, np.inf, 0, Status.DIVERGED)
-    problem = _Problem(field, jnp.asarray(weight, float), scale, rows, RK4() if solver is None else solver)
+    count = windows.samples / len(windows) if isinstance(windows, RecordWindows) else states.horizon
+    problem = _Problem(field, jnp.asarray(weight, float), scale, count**-0.5, rows, RK4() if solver is None else solver)
     found = _descend(problem, jax.tree.map(jnp.asarray, windows), max_steps)
-    if found.status == Status.DIVERGED:
+    if found.status == Status.DIVERGED or isinstance(windows, RecordWindows):
         return found
     return replace(found, discretisation=compare_steps(found.field, windows, problem.solver, scale))
+
+
+def _checked_scale(scale: Float[Array, " d"], windows: Trajectories | RecordWindows) -> Float[Array, " d"]:
+    scale, records = checks.floating("scale", scale), isinstance(windows, RecordWindows)
+    size = states_of(windows).x0.shape[1:]
+    if records or scale.shape != size or not (scale > 0).all():
+        expected = "None for windows of records" if records else f"{size} positive numbers"
+        raise ValueError(f"scale must be {expected}, got shape {scale.shape}")
+    return scale
 
 
 class _Problem(eqx.Module):
     """The residuals r(θ) of one window; the loss is the mean of ‖r‖² over windows."""
 
-    source: AbstractVectorField
+    source: Learner
     weight: Float[Array, ""]
     scale: Float[Array, " d"] | None
+    share: Float[Array, ""] | float  # each error's, so that L_MSE is the mean over all samples
     penalty: Rows | None = eqx.field(static=True)
     solver: Solver = eqx.field(static=True)
 
-    def field(self, theta: Float[Array, " p"]) -> AbstractVectorField:
+    def at(self, theta: Float[Array, " p"]) -> Learner:
         return ravel_learned(self.source)[1](theta)
 
-    def rows(self, candidate, predicted: Float[Array, "t d"], window: Trajectories) -> Float[Array, " r"]:
-        errors = errors_of(predicted, window.x) / (1 if self.scale is None else self.scale)
-        found = errors.ravel() / len(window.u) ** 0.5
+    def rows(self, candidate: Learner, predicted: Float[Array, "t d"], window) -> Float[Array, " r"]:
+        if isinstance(window, RecordWindows):
+            errors = window.errors(candidate, predicted)
+        else:
+            errors = errors_of(predicted, window.x) / (1 if self.scale is None else self.scale)
+        found = errors.ravel() * self.share
         if self.penalty is not None:
-            held = self.penalty(candidate, predicted, window, self.solver)
+            held = self.penalty(dynamics_of(candidate), predicted, states_of(window), self.solver)
             found = jnp.concatenate([found, jnp.sqrt(self.weight) * held])
         return found
 
     @eqx.filter_jit
-    def loss(self, theta: Float[Array, " p"], windows: Trajectories) -> Float[Array, ""]:
-        candidate = self.field(theta)
+    def loss(self, theta: Float[Array, " p"], windows: Trajectories | RecordWindows) -> Float[Array, ""]:
+        candidate = self.at(theta)
 
         def square(window):
-            x0, u = jnp.asarray(window.x0), jnp.asarray(window.u)
-            predicted = integrate(candidate, x0, u, window.dt, self.solver)
+            own = states_of(window)
+            x0, u = jnp.asarray(own.x0), jnp.asarray(own.u)
+            predicted = integrate(dynamics_of(candidate), x0, u, own.dt, self.solver)
             return jnp.sum(jnp.square(self.rows(candidate, predicted, window)))
 
         return jnp.mean(jax.lax.map(square, windows))
 
     @eqx.filter_jit
     def linearised(
-        self, theta: Float[Array, " p"], window: Trajectories
+        self, theta: Float[Array, " p"], window: Trajectories | RecordWindows
     ) -> tuple[Float[Array, "p r"], Float[Array, " r"]]:
-        x0, u = jnp.asarray(window.x0), jnp.asarray(window.u)
-        predicted, columns = with_sensitivities(self.field(theta), x0, u, window.dt, self.solver)
+        own = states_of(window)
+        x0, u = jnp.asarray(own.x0), jnp.asarray(own.u)
+        predicted, columns = with_sensitivities(dynamics_of(self.at(theta)), x0, u, own.dt, self.solver)
+        # In a `StateSpaceModel`, what the outputs learn comes after the field, and moves no state.
+        columns = jnp.pad(columns, ((0, 0), (0, 0), (0, theta.size - columns.shape[-1])))
 
         def rows(theta, predicted):
-            return self.rows(self.field(theta), predicted, window).astype(theta.dtype)
+            return self.rows(self.at(theta), predicted, window).astype(theta.dtype)
 
         r, push = jax.linearize(rows, theta, predicted)
         each = jnp.eye(theta.size, dtype=theta.dtype), jnp.moveaxis(columns, -1, 0)
         return jax.lax.map(lambda direction: push(*direction), each), r
 
 
-def _descend(problem: _Problem, windows: Trajectories, max_steps: int) -> GaussNewtonFit:
+def _descend(problem: _Problem, windows: Trajectories | RecordWindows, max_steps: int) -> GaussNewtonFit:
     start, wide = ravel_learned(problem.source)[0], jax.config.read("jax_enable_x64")
 
     def rounded(theta):  # to the precision of the field's programs
@@ -196,11 +220,11 @@ def _descend(problem: _Problem, windows: Trajectories, max_steps: int) -> GaussN
     with jax.enable_x64(True):
         options = {"max_steps": max_steps, "tolerance": SLOW, "damping": FIRST, "cost": cost}
         end = descend(equations, jnp.asarray(start, float), jnp.zeros((1, 0)), **options)
-    return GaussNewtonFit(problem.field(rounded(end.theta)), float(cost(end.theta, end.own)), end.steps, end.status)
+    return GaussNewtonFit(problem.at(rounded(end.theta)), float(cost(end.theta, end.own)), end.steps, end.status)
 
 
 def _normal_equations(
-    problem: _Problem, theta, windows: Trajectories
+    problem: _Problem, theta, windows: Trajectories | RecordWindows
 ) -> tuple[Float[np.ndarray, "1 p p"], Float[np.ndarray, "1 p"], Float[np.ndarray, " 1"]]:
     gram, score, square = np.zeros((theta.size, theta.size)), np.zeros(theta.size), 0.0
     for index in range(len(windows)):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pendulum import Biased
 from surface import refusal
 from test_record_fit import NOISE, angle, model_of, pendulum, records
 
@@ -23,14 +24,19 @@ def test_windows_begin_at_states_estimated_from_the_samples_around_them_and_a_fi
     true = eqx.tree_at(lambda w: w.states.x0, windows, jnp.asarray(x0, jnp.float32))
     assert float(true.loss(known, jnp.stack(x, axis=1))) == pytest.approx(1.0, abs=0.3)
     wrong = model_of(pendulum(0.9, 0.1), noise={"angle": NOISE})
-    found = hj.fit(wrong, windows, windows, jax.random.key(0), max_epochs=400).best
-    assert (np.exp(found.field.log_length), found.field.damping) == (
-        pytest.approx(0.8, abs=0.01),
-        pytest.approx(0.3, abs=0.05),
-    )
+    biased = dataclasses.replace(wrong, outputs={"angle": Biased(jnp.array(0.1))})
+    trained = hj.fit(wrong, windows, windows, jax.random.key(0), max_epochs=400)
+    descended = hj.fit_gauss_newton(biased, windows)
+    for found in (trained.best, descended.field):
+        assert np.exp(found.field.log_length) == pytest.approx(0.8, abs=0.01)
+        assert found.field.damping == pytest.approx(0.3, abs=0.05)
+    assert descended.loss == pytest.approx(float(trained.best_mse), rel=0.05)
+    assert descended.field.outputs["angle"].bias == pytest.approx(0.0, abs=0.01)
     for model, around, said in ((known, 5, "all are shorter than 10 s"), (model_of(pendulum()), 1, "angle has none")):
         refusal(lambda m=model, a=around: hj.estimate_windows(m, records()[:1], **near | {"around": a}), said)
     refusal(lambda: hj.fit(known.field, windows, windows, jax.random.key(0)), "field must be a StateSpaceModel")
+    refusal(lambda: hj.fit_gauss_newton(known.field, windows), "field must be a StateSpaceModel")
+    refusal(lambda: hj.fit_gauss_newton(known, windows, scale=np.ones(2)), "scale must be None for windows of records")
     other = hj.StateSpaceModel(pendulum(), ("torque",), {"speed": lambda x, u: x[1]}, (0.0, 0.0), (1.0, 1.0))
     refusal(lambda: hj.fit(other, windows, windows, jax.random.key(0)), "has no output angle; it has speed")
 
