@@ -167,7 +167,10 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
-        message = in_flags(str(error) if isinstance(error, Explained) else " ".join(str(error).split()), command)
+        text = str(error)
+        if isinstance(error, OSError) and error.filename is not None and error.strerror:
+            text = f"{error.filename}: {error.strerror.lower()}"  # without the number of the error
+        message = in_flags(text if isinstance(error, Explained) else " ".join(text.split()), command)
         message = re.sub(r"(;|, or) pass like=$", "", message)  # which a command does not have
         if command in VERBS:  # an argument at the start is one of its options
             message = re.sub(r"^([a-z_]+)(?=(\[\d\])? must )", lambda found: _flag(found[1]), message)

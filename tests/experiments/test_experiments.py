@@ -233,8 +233,10 @@ def test_a_network_begins_at_the_physics_and_changes_only_its_states():
 
 def test_a_wrong_record_is_refused_in_a_line(tmp_path, capsys):
     path = tmp_path / "wrong.csv"
-    for text, said in (("t,u,y\n0,1,2\n", "no column q; it has t, u, y"), ("t,u,q\n0,x,2\n", "row 2: three numbers")):
-        path.write_text(text)
+    wrong = {"t,u,y\n0,1,2\n": "no column q; it has t, u, y", "t,u,q\n0,x,2\n": "row 2: three numbers"}
+    for text, said in {"": "wrong.csv: no such file or directory", **wrong}.items():
+        if text:
+            path.write_text(text)
         with pytest.raises(SystemExit, match="2"):
             record.main(emps.BENCHMARK, "identification.emps", [str(path)])
         assert said in " ".join(capsys.readouterr().err.split())
