@@ -26,6 +26,7 @@ from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.dynamics.rigid_body import uncorrected
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import NAMED, compare_steps
+from hybrid_jax.estimation.record_windows import RecordWindows
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import checked, compact
@@ -98,8 +99,8 @@ def adapt(
             adapt the field.
     """
     checks.not_traced("adapt", field, windows, validation, learned_from)
-    if isinstance(field, StateSpaceModel):
-        raise ValueError("field must be a vector field; for a StateSpaceModel and records use adapt_records")
+    if isinstance(field, StateSpaceModel) or isinstance(windows, RecordWindows):
+        raise ValueError("windows must have measured states; for a StateSpaceModel and records use adapt_records")
     name, method = _named(method)
     flights = None
     if isinstance(windows, list):
