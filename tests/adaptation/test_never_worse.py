@@ -106,6 +106,7 @@ def test_other_propellers_and_a_load_are_found(vehicle, chosen, truth):
     np.testing.assert_allclose([found.parameters[name].value for name in truth], [*truth.values()], rtol=0.03)
 
 
+@pytest.mark.slow
 def test_also_a_body_that_learns_many_aerodynamic_coefficients_sees_a_small_change_of_drag():
     learn, terms = ("Ix", "Iy", "k", "drag", "aerodynamic_moment", "translational_lift"), SOURCE.terms
     windows = flown(0, 1.0, drag=0.8, count=60)

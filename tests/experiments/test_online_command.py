@@ -114,6 +114,7 @@ def test_each_claim_fails_where_it_should(change, times, fails):
     assert {each.header[0] for each in tables(both)} >= {"change"}
 
 
+@pytest.mark.slow
 def test_wrong_sensors_and_exchanged_rotors_are_named_and_end_the_adaptation():
     """The Iris on a path of 3 m: wrong signs of its rates, degrees, exchanged rotors from the beginning, and none."""
     keys = jax.random.split(jax.random.key(0), len(FAULTS[0]))
