@@ -102,6 +102,13 @@ class RecordWindows(eqx.Module):
         return as_field(model.field).infer_batch(*columns).T.reshape(ends.shape)
 
 
+def checked_windows(windows: RecordWindows, name: str) -> RecordWindows:
+    checks.instance(name, windows, RecordWindows)
+    if not len(windows):
+        raise ValueError(f"{name} must contain at least one window")
+    return windows
+
+
 def states_of(windows: Trajectories | RecordWindows) -> Trajectories:
     return windows.states if isinstance(windows, RecordWindows) else windows
 

@@ -22,7 +22,7 @@ from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import compare_steps
 from hybrid_jax.estimation.elimination import descend
 from hybrid_jax.estimation.normal_equations import NormalEquations
-from hybrid_jax.estimation.record_windows import RecordWindows, states_of
+from hybrid_jax.estimation.record_windows import RecordWindows, checked_windows, states_of
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.runtime import entry
@@ -113,6 +113,7 @@ def fit_gauss_newton(
     checks.not_traced("fit_gauss_newton", field, windows)
     if isinstance(windows, RecordWindows):
         checks.instance("field", field, StateSpaceModel)
+        checked_windows(windows, "windows")
     else:
         windows = check_windows(field, windows, missing=True)
     states, dynamics = states_of(windows), dynamics_of(field)

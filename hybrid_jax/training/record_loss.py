@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 from jaxtyping import Array, Float
 
-from hybrid_jax import checks, metrics
+from hybrid_jax import metrics
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.outputs import StateSpaceModel
-from hybrid_jax.estimation.record_windows import RecordWindows
+from hybrid_jax.estimation.record_windows import RecordWindows, checked_windows
 from hybrid_jax.training.loss import rollout_minibatch
 from hybrid_jax.training.objective import UNSCALED, Objective, Settings
 
@@ -17,8 +17,7 @@ class RecordLoss(Objective):
     """The squared errors of a `StateSpaceModel`'s outputs over their noise, averaged over samples; + λ L_reg."""
 
     def prepare(self, windows: RecordWindows, name: str) -> RecordWindows:
-        checks.instance(name, windows, RecordWindows)
-        return windows
+        return checked_windows(windows, name)
 
     def loss(self, field: StateSpaceModel, batch: RecordWindows, settings: Settings, weight: Float[Array, ""]):
         own = UNSCALED.batch(batch.states, settings)

@@ -37,6 +37,7 @@ def test_windows_begin_at_states_estimated_from_the_samples_around_them_and_a_fi
     refusal(lambda: hj.fit(known.field, windows, windows, jax.random.key(0)), "field must be a StateSpaceModel")
     refusal(lambda: hj.fit_gauss_newton(known.field, windows), "field must be a StateSpaceModel")
     refusal(lambda: hj.fit_gauss_newton(known, windows, scale=np.ones(2)), "scale must be None for windows of records")
+    refusal(lambda: hj.fit_gauss_newton(known, windows[:0]), "windows must contain at least one window")
     wide = hj.Hybrid(pendulum(), hj.residual_network(2, 1, jax.random.key(0), hidden=1000))
     known = dataclasses.replace(known, field=wide)
     refusal(lambda: hj.fit_records(known, records(), dt=0.02), "wrap the network in Frozen")
