@@ -154,7 +154,7 @@ def fit_records(
         cautious = robust if known.keys() == scale.keys() else robust / 10
         problem = Problem(model, scale, cautious, dt, RK4() if solver is None else solver, substeps)
         steps = record_search.steps_of(segment, gridded, dt)
-        theta, near = np.asarray(ravel_learned(model)[0]), learned_numbers.deviations_of(model, prior or {})
+        theta, near = np.asarray(ravel_learned(model)[0], float), learned_numbers.deviations_of(model, prior or {})
         if len(theta) > record_search.MOST:
             remedy = "wrap the network in Frozen, or train it by fit on windows of estimate_windows"
             raise ValueError(f"model: {len(theta)} learned numbers are too many; {remedy}")

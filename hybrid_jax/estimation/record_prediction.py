@@ -94,7 +94,8 @@ def predict(
     still = _measured_in(past, still)
     if np.isinf(model.spread).any():  # a search from the model's start may end in a local minimum
         lengths = (np.ptp(past.signals[name].t) for name in still.outputs if past.signals.get(name))
-        options = {"segment": max(lengths, default=0.0) / 10} | options
+        steps = max(round(max(lengths, default=0.0) / 10 / dt), 1)
+        options = {"segment": dt * shooting.rounded_up(steps, fine=8)} | options
     known = fit_records(still, [past], dt=dt, between=between, rounds=1, **options)
     kept = {name: value for name, value in options.items() if name in ("solver", "substeps")}
     options = {"begin": known.times[0, 1], "dt": dt, "between": between} | kept

@@ -250,8 +250,11 @@ def _estimated(problem: Problem, guess: Float[np.ndarray, "n d"], pieces: list[G
 
 
 def _search(problem: Problem, centres: Float[np.ndarray, "n d"], pieces: list[Gridded]) -> Search:
-    theta, free = np.asarray(ravel_learned(problem.model)[0]), np.full((1, problem.model.space.tangent_size), np.inf)
-    segments = shooting.cut(pieces, len(pieces[0].u))
+    theta, free = (
+        np.asarray(ravel_learned(problem.model)[0], float),
+        np.full((1, problem.model.space.tangent_size), np.inf),
+    )
+    segments = shooting.cut(pieces, len(pieces[0].u), exact=True)
     return Search(problem, jnp.asarray(centres)[:, None], np.zeros(len(theta)), theta, segments, free)
 
 

@@ -36,10 +36,18 @@ class Segments(NamedTuple):
     whitening: Float[Array | np.ndarray, "*r s e e"] | None = None  # of all errors of a segment, by default none
 
 
-def cut(records: list[Gridded], steps: int) -> Segments:
+def rounded_up(n: int, fine: int = 16) -> int:
+    """Return the next power of two, from `fine` on of four sizes per octave: similar records share programs."""
+    unit = 2 ** (int(n - 1).bit_length() if n < fine else int(n).bit_length() - 3)
+    return -(-int(n) // unit) * unit
+
+
+def cut(records: list[Gridded], steps: int, *, exact: bool = False) -> Segments:
+    """Cut records into segments; unless `exact`, there is room for more samples than there are, see `rounded_up`."""
     most = max(-(-len(each.u) // steps) for each in records)
     parts = [_cut(each, steps, most) for each in records]
     widest = {name: max(part.there[name].shape[-1] for part in parts) for name in records[0].y}
+    widest = widest if exact else {name: rounded_up(n) for name, n in widest.items()}
 
     def filled(path, *leaves):
         name = path[-1].key if len(path) > 1 else None

@@ -1,6 +1,8 @@
 """Outputs of a model of records: numbers and noise of their own; what cannot be right, or no sample tells, is named."""
 
 import dataclasses
+import logging
+import re
 
 import equinox as eqx
 import jax
@@ -198,3 +200,14 @@ def test_a_past_far_from_the_models_start_is_found_a_short_one_said_and_inputs_a
     past, future = (Record.of(name, torque=(t, t), angle=(t, t)) for name, t in times.items())
     with pytest.raises(ValueError, match=r"^future: torque begins at 9 s, and the past ends at 0\.9 s$"):
         predict(model_of(pendulum()), past, future, dt=0.02)
+
+
+def test_pasts_with_other_numbers_of_samples_share_programs(caplog):
+    one, model = spinning(), model_of(pendulum())
+    past, future = one.part(2.0, 6.0), one.part(6.0, 8.0)
+    predict(model, past, future, dt=0.02)
+    seen = past.signals["angle"]
+    fewer = Signal(np.delete(seen.t, slice(3, None, 9)), np.delete(seen.values, slice(3, None, 9), axis=0))
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        predict(model, Record("fewer", {**past.signals, "angle": fewer}), future, dt=0.02)
+    assert not re.search(r"XLA compilation of jit\((shooting|simulation)\)", caplog.text)
