@@ -20,7 +20,7 @@ from hybrid_jax.runtime import jit_by_size
 from hybrid_jax.status import Status
 from hybrid_jax.training.fitting import ADAM, make_run_config, run, start
 from hybrid_jax.training.objective import Objective, Settings, TrajectoryLoss
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.trajectories import Trajectories
 
 
 class Solution(NamedTuple):
@@ -61,7 +61,7 @@ class Method(Protocol):
 
         Args:
             field: the source field, which must not be changed.
-            train: windows of the changed system to adapt to.
+            train: windows of the changed system to adapt to. NaN in x means "not measured", also in place of outliers.
             validation: other windows of the changed system, for early stopping and choices.
             settings: the objective and the solver; for training also minibatches and regulariser.
 
@@ -182,7 +182,7 @@ class Ridge(Method):
     penalties: tuple[float, ...] = ridge.PENALTIES
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
-        check(train, "windows")  # before tracing: defects need all states
+        ridge.transitions(train)  # raises, before tracing, if no interval tells anything
         return Solution(_fit_ridge(self.update, field, train, validation, self.penalties, settings).field)
 
 

@@ -1,4 +1,7 @@
-"""Adaptation in closed form: regress defects on hidden units or on x and u (O'Connell et al. 2022, Neural-Fly)."""
+"""Adaptation in closed form: regress defects on hidden units or on x and u (O'Connell et al. 2022, Neural-Fly).
+
+An interval at one of whose ends a state was not measured (NaN) does not count.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,7 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, state_space
@@ -45,11 +48,11 @@ def last_layer(
     network = field.residual if isinstance(field, Hybrid) else field
     if not isinstance(network, ResidualNetwork):
         raise ValueError(f"last_layer needs a field whose residual is a ResidualNetwork, got {type(network).__name__}")
-    (before, u, after), canonical = transitions(windows), jax.vmap(state_space(field).canonical)
+    (before, u, after, known), canonical = transitions(windows), jax.vmap(state_space(field).canonical)
     activations = jax.vmap(network.activations)
     middle = (activations(canonical(before, before), u) + activations(canonical(after, after), u)) / 2
     scale = network.scaling.outputs(jnp.ones_like(network.bias_out))
-    weight, bias = ridge(middle, canonical(before, defects(field, windows, solver)) / scale, penalty)
+    weight, bias = ridge(middle, canonical(before, defects(field, windows, solver)) / scale, penalty, known)
     output = (network.weight_out + weight, network.bias_out + bias)
     changed = eqx.tree_at(lambda network: (network.weight_out, network.bias_out), network, output)
     return Hybrid(field.physics, changed) if isinstance(field, Hybrid) else changed
@@ -59,10 +62,10 @@ def linear_residual(
     field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> Hybrid:
     """Add a linear map of the standardised [x, u], regressed on the defects; raises like `last_layer`."""
-    (before, u, after), canonical = transitions(windows), jax.vmap(state_space(field).canonical)
+    (before, u, after, known), canonical = transitions(windows), jax.vmap(state_space(field).canonical)
     z = jnp.concatenate([canonical(before, (before + after) / 2), u], axis=1)
-    mean, scale = mean_and_scale(z)
-    weight, bias = ridge((z - mean) / scale, canonical(before, defects(field, windows, solver)), penalty)
+    mean, scale = mean_and_scale(z, known)
+    weight, bias = ridge((z - mean) / scale, canonical(before, defects(field, windows, solver)), penalty, known)
     return Hybrid(field, LinearResidual(weight / scale, bias - weight @ (mean / scale)))
 
 
@@ -75,8 +78,8 @@ def fit_ridge(
     settings: Settings | None = None,
 ) -> RidgeFit:
     """Update a field with the penalty of smallest validation loss. You can use this under `jit` and `vmap`."""
-    check(train, "train")
-    check(validation, "validation")
+    check(train, "train", missing=True)
+    check(validation, "validation", missing=True)
     if not penalties:
         raise ValueError("penalties must contain at least one positive number, got none")
     for penalty in penalties:
@@ -90,44 +93,63 @@ def fit_ridge(
     return RidgeFit(eqx.combine(jax.tree.map(lambda leaf: leaf[best], arrays), rest), grid[best], losses[best])
 
 
-def transitions(windows: Trajectories) -> tuple[Float[Array, "s d"], Float[Array, "s m"], Float[Array, "s d"]]:
-    """Return the state before, the input and the state after each interval of all windows, which are checked."""
-    check(windows, "windows")
+def transitions(
+    windows: Trajectories,
+) -> tuple[Float[Array, "s d"], Float[Array, "s m"], Float[Array, "s d"], Bool[Array, " s"]]:
+    """Return the state before, the input and the state after each interval, and whether both states were measured.
+
+    In place of states that were not, you get those at the start of the window. The windows are checked.
+    """
+    check(windows, "windows", missing=True)
     x0, u, x = (jnp.asarray(a) for a in (windows.x0, windows.u, windows.x))
+    (n, steps, d), start = x.shape, jnp.broadcast_to(x0[:, None], x.shape)
     before = jnp.concatenate([x0[:, None], x[:, :-1]], axis=1)
-    samples = x.shape[0] * x.shape[1]
-    return before.reshape(samples, x.shape[2]), u.reshape(samples, u.shape[2]), x.reshape(samples, x.shape[2])
+    known = ~jnp.isnan(before + x).any(axis=-1)
+    if not checks.is_traced(known) and not known.any():
+        raise ValueError("windows: no interval has all states measured at both ends")
+    before, after = (jnp.where(known[..., None], each, start).reshape(n * steps, d) for each in (before, x))
+    return before, u.reshape(n * steps, u.shape[2]), after, known.ravel()
 
 
 def defects(field: AbstractVectorField, windows: Trajectories, solver: Solver = None) -> Float[Array, "s d"]:
     """Return the derivative e that the field lacks in each interval, the mean of both ends, to second order in dt.
 
     With Φ one solver step, (x₁ − Φ(x₀)) / dt is off by ½ dt ∂f/∂x e; the step backwards from x₁ is off by the opposite.
+    Where a state was not measured, e is NaN.
     """
-    (before, u, after), dt = transitions(windows), windows.dt
+    (before, u, after, known), dt = transitions(windows), windows.dt
     before, u, solver = checked(field, before, u[:, None], dt, solver, windows=True)
     after = after.astype(before.dtype)
 
     def step(start: Float[Array, "s d"], dt: float) -> Float[Array, "s d"]:
         return jax.vmap(lambda x, held: integrate(field, x, held, dt, solver))(start, u)[:, 0]
 
-    return ((after - step(before, dt)) + (step(after, -dt) - before)) / (2 * dt)
+    found = ((after - step(before, dt)) + (step(after, -dt) - before)) / (2 * dt)
+    return jnp.where(known[:, None], found, jnp.nan)
 
 
-def mean_and_scale(z: Float[Array, "s n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return each channel's mean and scale: its standard deviation, or 1e-3 of its mean if that is more, or 1."""
-    mean, spread = jnp.mean(z, axis=0), jnp.std(z, axis=0)
+def mean_and_scale(
+    z: Float[Array, "s n"], known: Bool[Array, " s"] | None = None
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return each channel's mean and scale: its standard deviation, or 1e-3 of its mean if that is more, or 1.
+
+    Only rows that are known count, by default all.
+    """
+    where = None if known is None else known[:, None]
+    mean, spread = jnp.mean(z, axis=0, where=where), jnp.std(z, axis=0, where=where)
     floor = 1e-3 * jnp.abs(mean)  # the spread of a constant channel is round-off, which must not become a feature
     return mean, jnp.where(spread + floor > 0, jnp.maximum(spread, floor), 1.0)
 
 
 def ridge(
-    z: Float[Array, "s n"], y: Float[Array, "s d"], penalty: Penalty
+    z: Float[Array, "s n"], y: Float[Array, "s d"], penalty: Penalty, known: Bool[Array, " s"] | None = None
 ) -> tuple[Float[Array, "d n"], Float[Array, " d"]]:
-    """Minimise Σ ‖y − (W z + b)‖² + penalty ‖(W, b)‖² over W, b."""
+    """Minimise Σ ‖y − (W z + b)‖² + penalty ‖(W, b)‖² over W, b, by the rows that are known, by default all."""
     checks.positive("penalty", penalty)
     # The normal equations would square the design's condition number, about 1e4 for hidden units, beyond float32.
     design = jnp.concatenate([z, jnp.ones((len(z), 1), z.dtype)], axis=1)
+    if known is not None:
+        design, y = (jnp.where(known[:, None], each, 0.0) for each in (design, y))
     with jax.default_matmul_precision("highest"):  # a GPU's default rounds factors to 10 bits
         left, sizes, right = jnp.linalg.svd(design, full_matrices=False)
         solution = right.T @ ((sizes / (jnp.square(sizes) + penalty))[:, None] * (left.T @ y))

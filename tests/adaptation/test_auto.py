@@ -149,6 +149,8 @@ def test_outliers_are_set_aside_and_other_samples_are_used_as_they_are():
     x[7, 3, 1] = np.nan
     left = adapt(hybrid(), replace(windows, x=x)[np.setdiff1d(np.arange(43), (20, 30))])
     assert (left.set_aside, left.windows, left.parameters) == (0, 41, found.parameters)
+    linear = adapt(hybrid(), replace(windows, x=x), method="linear_residual")
+    assert linear.mse_after < linear.mse_before / 2
     start[::2] += 0.5
     with pytest.warns(UserWarning, match="22 of 43 begin with an outlier"):
         assert not adapt(hybrid(), replace(windows, x0=start), method="source").set_aside

@@ -36,6 +36,12 @@ def flown(truth, count=100, seed=0, dt=0.01, steps=3):
     return Trajectories(x0, u, _rolled(truth, x0, u, jnp.asarray(dt)), dt)
 
 
+def missing(windows):
+    """The same windows without 26 of 3900 numbers, so that 44 of 300 intervals do not count."""
+    flat = windows.x.ravel()
+    return eqx.tree_at(lambda w: w.x, windows, flat.at[::150].set(jnp.nan).reshape(windows.x.shape))
+
+
 def with_linear(field):
     """The field and a linear residual that touches every derivative."""
     rng = np.random.default_rng(0)
@@ -71,7 +77,7 @@ def derivatives(field, windows):
 def test_a_correction_of_the_method_s_own_form_is_recovered(method, start, change):
     with jax.enable_x64(True):
         field, truth = start(), change(start())
-        windows, others = flown(truth), flown(truth, seed=1)
+        windows, others = missing(flown(truth)), flown(truth, seed=1)
         found = method(field, windows, jnp.asarray(1e-8))
         if isinstance(field, Hybrid):
             assert eqx.tree_equal(found.physics, field if method is _linear_residual else field.physics)
