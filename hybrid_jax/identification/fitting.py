@@ -128,7 +128,7 @@ def identify(
     errors = {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in last.items()}
     intervals = {name: _widened(name, interval, shares) for name, interval in intervals.items()}
     span = layout.dt * layout.steps * len(own)
-    return Identified(found, intervals, errors, len(own), span, status, np.asarray(covariance), shares)
+    return Identified(in_double(found), intervals, errors, len(own), span, status, np.asarray(covariance), shares)
 
 
 def _search(
