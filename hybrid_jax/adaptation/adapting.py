@@ -1,38 +1,36 @@
 """`adapt`: adapt any field to windows of a changed system, with any method and one type of result."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, overload
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.anchored import has_network
 from hybrid_jax.adaptation.auto import Auto
-from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
+from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source
 from hybrid_jax.adaptation.outliers import without_outliers
-from hybrid_jax.adaptation.plausible import THETA, groups_of, values_of
-from hybrid_jax.adaptation.pooling import satterthwaite
-from hybrid_jax.adaptation.results import Adaptation, Choice, Parameter
-from hybrid_jax.adaptation.selection import TINY, correlated, overlap
+from hybrid_jax.adaptation.parameters import FEW, NOT_FINITE, NOT_LEAST_SQUARES, parameters_of, size_of
+from hybrid_jax.adaptation.records import RecordAdaptation, adapt_records
+from hybrid_jax.adaptation.results import Adaptation, Choice
+from hybrid_jax.adaptation.selection import overlap
 from hybrid_jax.dynamics import disturbance
-from hybrid_jax.dynamics.base import AbstractVectorField, state_space, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.dynamics.rigid_body import uncorrected
 from hybrid_jax.dynamics.window_checks import check_windows
 from hybrid_jax.estimation.discretisation import NAMED, compare_steps
-from hybrid_jax.estimation.record_windows import RecordWindows
-from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals
+from hybrid_jax.estimation.record_fit import RecordFit
+from hybrid_jax.estimation.uncertainty import check_level
 from hybrid_jax.implicit_solvers import solver_errors
 from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import errors_in
 from hybrid_jax.networks.standardise import motion_of
+from hybrid_jax.records import Record
 from hybrid_jax.runtime import UNOPTIMISED, entry, jit_with, keep_programs, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
@@ -40,12 +38,7 @@ from hybrid_jax.training.objective import UNSCALED, Settings, TrajectoryLoss, sc
 from hybrid_jax.trajectories import Trajectories, check_like, concatenate, features_of, overflows, shares_outside
 
 HELD_OUT = 5  # the last of so many equal parts of the windows is held out for validation
-NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
-NOT_FINITE = "the fit diverged; check dt and all units"
 NO_MOTION = "field: its training windows are unknown, so its network may err by 20% of its effect; pass learned_from="
-FEW = "windows: {} are too few to determine {} parameters; undetermined parameters keep the source's values"
-BY_NETWORK = "the network's effect is comparable to that of a plausible change; hj.pool of several sources helps"
-BY_ROTORS = "the rotors' efficiencies, which were fitted too, can have the same effect"
 OVERLAP = "windows overlap: left-out blocks share samples with the others, so the expected errors are too small"
 
 _vector_of = jit_with(UNOPTIMISED)(ConstantDisturbance.vector)
@@ -64,7 +57,7 @@ METHODS: Mapping[str, Method] = {
 """The methods of `adapt` by name."""
 
 
-@entry
+@overload
 def adapt(
     field: AbstractVectorField,
     windows: Trajectories | list[Trajectories],
@@ -74,15 +67,32 @@ def adapt(
     learned_from: Trajectories | None = None,
     settings: Settings | None = None,
     level: float = 0.95,
-) -> Adaptation:
-    """Adapt a trained field to a few windows of a changed system.
+) -> Adaptation: ...
+@overload
+def adapt(
+    field: RecordFit | StateSpaceModel, windows: Sequence[Record], *, level: float = 0.95, dt: float, **of_records: Any
+) -> RecordAdaptation: ...
+@entry
+def adapt(
+    field: AbstractVectorField | RecordFit | StateSpaceModel,
+    windows: Any,  # as in the two signatures above
+    *,
+    method: str | Method = "auto",
+    validation: Trajectories | None = None,
+    learned_from: Trajectories | None = None,
+    settings: Settings | None = None,
+    level: float = 0.95,
+    **of_records: Any,
+) -> Adaptation | RecordAdaptation:
+    """Adapt a trained field to a few windows of a changed system, or a model with outputs to records.
 
     Args:
-        field: a trained `Hybrid`, or any other field.
-        windows: windows of the changed system, in order of time and without overlap. You need more windows than
-            parameters. If they follow each other, for example in one flight, intervals allow for errors that are
-            correlated within a fifth of the windows. NaN in x means "not measured" and counts as no error, as do
-            outliers; x0 and u must be finite. You may pass a list with the windows of each flight: `expected` then
+        field: a trained `Hybrid`, or any other field. If only some states are measured: a `RecordFit` or a
+            `StateSpaceModel`; this then is `adapt_records`, and the arguments down to `settings` do not apply.
+        windows: windows of the changed system, in order of time and without overlap, or its records. You need more
+            windows than parameters. If they follow each other, for example in one flight, intervals allow for errors
+            that are correlated within a fifth of the windows. NaN in x means "not measured" and counts as no error, as
+            do outliers; x0 and u must be finite. You may pass a list with the windows of each flight: `expected` then
             counts flights.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` to write your own.
         validation: windows for early stopping and penalties; you should take them from another flight. By default the
@@ -93,14 +103,21 @@ def adapt(
         settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, which is
             independent of units; "auto" scales by `learned_from` instead if it is known.
         level: confidence level of the intervals, between 0 and 1.
+        of_records: for records: dt and the other arguments of `adapt_records`.
 
     Raises:
         ValueError: if the method is unknown, windows are malformed, too few or of another system, or the method cannot
             adapt the field.
     """
     checks.not_traced("adapt", field, windows, validation, learned_from)
-    if isinstance(field, StateSpaceModel) or isinstance(windows, RecordWindows):
-        raise ValueError("windows must have measured states; for a StateSpaceModel and records use adapt_records")
+    if isinstance(field, RecordFit | StateSpaceModel):
+        own = {"validation": validation, "learned_from": learned_from, "settings": settings}
+        of_windows = [name for name, one in own.items() if one is not None] + ["method"] * (method != "auto")
+        if of_windows:
+            raise ValueError(f"{of_windows[0]} is for windows with measured states, not for records")
+        return adapt_records(field, windows, level=level, **of_records)
+    if of_records:
+        raise TypeError(f"{min(of_records)} is an argument for records, which need a RecordFit or a StateSpaceModel")
     name, method = _named(method)
     flights = None
     if isinstance(windows, list):
@@ -117,7 +134,7 @@ def adapt(
     solver = None if settings is None else settings.solver
     for data in (windows,) if validation is None else (windows, validation):
         checked(field, data.x0[0], data.u[0], data.dt, solver)
-    exact, size = getattr(method, "has_intervals", False), _size(field)
+    exact, size = getattr(method, "has_intervals", False), size_of(field)
     if exact and size > NAMED:
         physics = type(physics_of(field)).__name__
         raise ValueError(f"field: {physics} has {size} unnamed parameters, too many to fit; use method='fine_tune'")
@@ -178,7 +195,7 @@ def adapt(
         not_measured=not_measured,
         outside=shares_outside(*ranges) if ranges else {},
         **choice,
-        **_parameters(field, adapted, train, settings, level, without, solution.choice),
+        **parameters_of(field, adapted, train, settings, level, without, solution.choice),
     )
 
 
@@ -216,71 +233,3 @@ def _split(windows: Trajectories, validation: Trajectories | None, needed: bool)
         raise ValueError("windows must be at least two, to hold one out for validation; else pass validation=")
     last = len(windows) - max(1, len(windows) // HELD_OUT)
     return windows[:last], windows[last:]
-
-
-def _size(field: AbstractVectorField) -> int:
-    physics = physics_of(disturbance.without_disturbance(field))
-    return sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(physics, trainable(physics))))
-
-
-def _parameters(
-    source: AbstractVectorField,
-    field: AbstractVectorField,
-    windows: Trajectories,
-    settings: Settings,
-    level: float,
-    without: str | None,
-    choice: Choice | None,
-) -> dict[str, Any]:
-    if not 0 < _size(field) <= NAMED:
-        return {"parameters": {}, "without_intervals": NOT_LEAST_SQUARES}
-    own, d = physics_of(disturbance.without_disturbance(field)), windows.x0.shape[-1]
-    known = (own.parameter_units if isinstance(own, AbstractVectorField) else {}) | disturbance.disturbance_units(field)
-    values = values_of(field)
-    groups = groups_of([*values])
-    units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
-    before = values_of(source, d)
-    found = {name: Parameter(one, unit=units[name], before=before.get(name, np.nan)) for name, one in values.items()}
-    free, (kept, vague), absorbed = np.ones(len(values), bool), np.zeros((2, len(values)), bool), np.zeros(len(values))
-    if choice is not None:
-        places = [choice.parameters.index(name) for name in values]
-        free = np.asarray(choice.free)[choice.taken][places]
-        kept, absorbed, vague = (np.asarray(one)[places] for one in (choice.kept, choice.absorbed, choice.vague))
-    if without is None and len(windows) <= free.sum():
-        without = FEW.format(len(windows), free.sum())
-    if without is not None:
-        return {"parameters": found, "without_intervals": without}
-    cluster = correlated(windows)
-    own_degrees = len(windows) - free.sum() if cluster == 1 else -(-len(windows) // cluster) - 1
-    if choice is None:
-        scale = scale_of(settings.objective)
-        covariance = np.asarray(covariance_of(field, windows, solver=settings.solver, scale=scale, cluster=cluster))
-        inherited, of_source = np.zeros_like(covariance), np.inf
-    else:
-        covariance = choice.covariance(cluster)[np.ix_(places, places)]
-        inherited, of_source = np.asarray(choice.inherited)[np.ix_(places, places)], float(choice.degrees)
-    # `absorbed` is not estimated from a sample of errors, so its degrees are infinite (GUM, G.4.3).
-    parts = np.stack([np.diag(covariance), np.diag(inherited), absorbed])
-    degrees = satterthwaite(parts, np.array([own_degrees, of_source, np.inf]))
-    of_change = satterthwaite(parts[:2], np.array([own_degrees, of_source]))  # the source has the same network
-    covariance = covariance + inherited
-    if np.isnan(covariance).any():
-        return {"parameters": found, "without_intervals": NOT_FINITE}
-    whole = covariance + np.diag(absorbed)
-    bounds = intervals(field, jnp.asarray(whole), level, degrees)
-    apart = intervals(field, jnp.asarray(covariance), level, of_change)
-    scaled, moved = "efficiency" in np.array(groups)[free], dict[str, float]()
-    for i, name in enumerate(values):
-        value, low, high = jax.device_get(tuple(bounds[name]))
-        if free[i] or kept[i]:
-            _, *ends = jax.device_get(tuple(apart[name]))
-            least, most = (float(end - before[name]) for end in ends)
-            if free[i] and not least <= 0 <= most:
-                moved[name] = float(abs(value - before[name]) / max(most - least, TINY))
-            reason = BY_NETWORK if vague[i] else BY_ROTORS if scaled and groups[i] in THETA else None
-            bound = {"effective": reason} if reason else {"low": float(low), "high": float(high)}
-            change = {} if reason == BY_ROTORS else {"change": (least, most)}
-            found[name] = replace(found[name], **bound, **change)
-    changed = tuple(sorted(moved, key=lambda name: -moved[name]))
-    numbers = {"covariance": whole, "degrees": degrees, "absorbed": absorbed, "changed": changed}
-    return {"parameters": found, "without_intervals": None} | numbers

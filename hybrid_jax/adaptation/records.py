@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.plausible import Plausible
+from hybrid_jax.adaptation.results import lines_outside
 from hybrid_jax.adaptation.selection import ENOUGH, surely
 from hybrid_jax.dynamics.base import in_double, ravel_learned
 from hybrid_jax.dynamics.outputs import StateSpaceModel
@@ -24,8 +25,10 @@ from hybrid_jax.estimation.record_windows import measured_outputs
 from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.integrate import RK4
+from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.records import Between, Record, completed, on_grid
 from hybrid_jax.runtime import entry
+from hybrid_jax.trajectories import features_of, shares_outside
 
 PARTS = 7  # of all records, which are left out in turn; in shorter parts the fitted start hides more of a change
 SOURCE = "source"  # the candidate that changes nothing
@@ -39,12 +42,14 @@ class RecordAdaptation(eqx.Module):
         chosen: the numbers that changed: "source" (none), "sensors", "physics", "sensors and physics" or "all".
         changes: confidence interval of the change of each number that changed, by the names of `fit.intervals`.
         errors: error of each candidate on the parts that were left out, relative to that of the source.
+        outside: share of samples, 0 to 1, outside the range in which `fit` trained the source's network, by quantity.
     """
 
     fit: RecordFit
     chosen: str
     changes: dict[str, Interval]
     errors: dict[str, float]
+    outside: dict[str, float]
 
     @property
     def model(self) -> StateSpaceModel:
@@ -55,6 +60,7 @@ class RecordAdaptation(eqx.Module):
         """Return a summary in plain text, a few lines."""
         tried = ", ".join(f"{name} {error:.3g}" for name, error in self.errors.items())
         lines = [f"RMSE on left-out parts of the records, relative to the source's: {tried}."]
+        lines += lines_outside(self.outside)
         if self.chosen == SOURCE:
             return "\n".join(["No change is confirmed, so all numbers stay as they are.", *lines])
         lines = [f"Changed: {self.chosen}, which surely predicts left-out parts better.", *lines]
@@ -129,15 +135,17 @@ def adapt_records(
             fits[name] = fit_records(start, records, prior=prior, rounds=1, **grid, **options)
     source = fits[SOURCE] if alone else source
     with jax.enable_x64(True), np.errstate(over="ignore", invalid="ignore"):
-        left, without = _left_out(model.only(source.errors), records, fits, near, **grid)
+        left, without, paths = _left_out(model.only(source.errors), records, fits, near, **grid)
         chosen = _chosen(left)
         errors = {name: float(np.sqrt(np.sum(each) / np.sum(left[SOURCE]))) for name, each in left.items()}
         for each in said[chosen]:
             checks.warn(str(each.message))
+        known = motion_of(model.field)
+        outside = {} if known is None else shares_outside(features_of(known, model.space), paths[chosen])
         if chosen == SOURCE:
-            return RecordAdaptation(source, SOURCE, {}, errors)
+            return RecordAdaptation(source, SOURCE, {}, errors, outside)
         moves, more = near[chosen] > 0, _more(fits[chosen], without[chosen])
-        return RecordAdaptation(*_changed(source, fits[chosen], chosen, moves, more, level), errors)
+        return RecordAdaptation(*_changed(source, fits[chosen], chosen, moves, more, level), errors, outside)
 
 
 def _candidates(model: StateSpaceModel, p: int) -> dict[str, Bool[np.ndarray, " p"]]:
@@ -152,7 +160,10 @@ def _candidates(model: StateSpaceModel, p: int) -> dict[str, Bool[np.ndarray, " 
 
 
 def _left_out(model, records, fits, near, *, dt, between, robust, solver, substeps):
-    """Return each candidate's squared errors on each part with samples (k), and θ (k, p) fitted to the other parts."""
+    """Return each candidate's squared errors on each part with samples (k), and θ (k, p) fitted to the other parts.
+
+    Also return the quantities along its whole prediction.
+    """
     given = completed(records, tuple(model.outputs), model.angles)
     gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in given]
     segments = shooting.cut(gridded, -(-max(len(each.u) for each in gridded) // -(-PARTS // len(gridded))))
@@ -160,7 +171,7 @@ def _left_out(model, records, fits, near, *, dt, between, robust, solver, subste
     problem = Problem(model, scale, robust, dt, RK4() if solver is None else solver, substeps)
     theta, spread = np.asarray(ravel_learned(model)[0]), np.array(model.spread)[None]
     most = learned_numbers.largest_steps(model)
-    found, without, sizes = {}, {}, None
+    found, without, paths, sizes = {}, {}, {}, None
     for name, fit in fits.items():
         search = Search(problem, jnp.asarray(fit.starts)[:, None], near[name], theta, segments, spread, most=most)
         sizes = record_search.sizes_of(search, theta, search.still) if sizes is None else sizes
@@ -169,7 +180,9 @@ def _left_out(model, records, fits, near, *, dt, between, robust, solver, subste
         states = search.predicted(last, search.still).states
         pairs = [_without(search, last, states[i, j, 0], sizes, i, j) for i, j in parts]
         found[name], without[name] = (np.array(each) for each in zip(*pairs, strict=True))
-    return found, without
+        x, u = (np.asarray(each)[segments.valid] for each in (states[:, :, 1:], segments.u))
+        paths[name] = model.space.features(x, u)
+    return found, without, paths
 
 
 def _without(search: Search, theta, x, sizes: Float[np.ndarray, " e"], i: int, j: int):

@@ -1,7 +1,7 @@
 """The result of an adaptation, and its report."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from dataclasses import field as attribute
 from typing import Any, NamedTuple
@@ -202,9 +202,7 @@ class Adaptation:
         if self.expected:
             yield "RMSE to expect on a new recording (80% intervals, from blocks of windows that were left out):"
             yield from lines_of(self.expected, self.units)
-        for name, share in self.outside.items():
-            if share > WARN:
-                yield f"Warning: {name} is outside the source's training range in {share:.0%} of the samples."
+        yield from lines_outside(self.outside)
 
     def _about_parameters(self) -> Iterator[str]:
         if self.parameters:
@@ -236,6 +234,13 @@ class Adaptation:
         parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
         found = vars(self) | {"status": str(self.status), "converged": self.converged, "parameters": parameters}
         return json_value({name: value for name, value in found.items() if name != "field"})
+
+
+def lines_outside(outside: Mapping[str, float]) -> Iterator[str]:
+    """Yield a warning for each quantity that is often outside the source's training range."""
+    for name, share in outside.items():
+        if share > WARN:
+            yield f"Warning: {name} is outside the source's training range in {share:.0%} of the samples."
 
 
 def _in_words(candidate: str) -> str:

@@ -212,7 +212,7 @@ def _check_field(field: Learner, data: dict[str, Any], settings: Settings) -> No
 def ready(field: Learner, train: Any) -> Learner:
     """Set the scaling and motion of a field; warn if you will need `like` to load it from a file."""
     if isinstance(field, StateSpaceModel) and isinstance(train, RecordWindows):
-        return replace(field, field=with_scaling(field.field, train.states))
+        return replace(field, field=with_motion(with_scaling(field.field, train.states), train.states))
     if (reason := check_savable(field)) is not None:
         checks.warn(reason)
     return with_motion(with_scaling(field, train), train) if isinstance(field, AbstractVectorField) else field

@@ -12,6 +12,8 @@ from pendulum import Biased, Damped
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation.records import _candidates, _chosen, _more
+from hybrid_jax.networks.mlp import zero_output
+from hybrid_jax.networks.standardise import with_motion
 
 NOISE, SECONDS = 0.01, 8.0
 
@@ -62,12 +64,17 @@ def test_a_change_of_physics_is_found_with_its_interval_and_predicts_better(sour
     assert "change 0.2" in result.report()
 
 
-def test_a_sensor_that_is_off_is_not_taken_for_other_physics(source):
-    for given in (source, source.model):  # a model is as good as its fit
-        result = hj.adapt_records(given, [record(6, bias=0.3)], dt=0.02)
+def test_a_sensor_that_is_off_is_not_taken_for_other_physics_and_motion_that_a_network_has_not_seen_is_named(source):
+    network = zero_output(hj.residual_network(2, 1, jax.random.key(0), hidden=4))
+    slow = np.linspace(-0.05, 0.05, 60).reshape(10, 3, 2).astype(np.float32)
+    seen = hj.Trajectories(slow[:, 0], slow[..., :1], slow, 0.02)
+    trained = with_motion(hj.Hybrid(source.model.field, hj.Frozen(network)), seen)
+    for given in (source, dataclasses.replace(source.model, field=trained)):  # a model is as good as its fit
+        result = hj.adapt(given, [record(6, bias=0.3)], dt=0.02)  # the same as adapt_records
         assert (result.chosen, set(result.changes)) == ("sensors", {"angle.bias"})
         assert float(result.changes["angle.bias"].value) == pytest.approx(0.2, abs=0.01)
-        assert eqx.tree_equal(result.model.field, source.model.field)
+        assert eqx.tree_equal(result.model.field, source.model.field if given is source else trained)
+        assert (given is source) == (result.outside == {}) == ("training range" not in result.report())
 
 
 def test_a_larger_candidate_is_chosen_only_if_it_surely_beats_all_smaller_ones():
@@ -103,7 +110,9 @@ def test_wrong_inputs_are_named(source):
         hj.adapt_records(unknown, [record(4)], dt=0.02)
     with pytest.raises(ValueError, match=r"^source must be a RecordFit, got Damped"):
         hj.adapt_records(source.model.field, [record(4)], dt=0.02)
-    with pytest.raises(ValueError, match="for a StateSpaceModel and records use adapt_records"):
-        hj.adapt(source.model, [record(4)])
+    with pytest.raises(ValueError, match=r"^method is for windows with measured states, not for records"):
+        hj.adapt(source, [record(4)], dt=0.02, method="fine_tune")
+    with pytest.raises(TypeError, match=r"^dt is an argument for records, which need a RecordFit"):
+        hj.adapt(source.model.field, [record(4)], dt=0.02)
     with pytest.raises(ValueError, match=r"^prior cannot be given: it is determined by the source"):
         hj.adapt_records(source, [record(4)], dt=0.02, prior={"damping": 1.0})

@@ -12,7 +12,9 @@ from surface import refusal
 from test_record_fit import NOISE, angle, model_of, pendulum, records
 
 import hybrid_jax as hj
+from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.records import Record
+from hybrid_jax.training.driver import ready
 
 
 def test_windows_begin_at_states_estimated_from_the_samples_around_them_and_a_fit_to_them_finds_what_made_them():
@@ -41,6 +43,8 @@ def test_windows_begin_at_states_estimated_from_the_samples_around_them_and_a_fi
     wide = hj.Hybrid(pendulum(), hj.residual_network(2, 1, jax.random.key(0), hidden=1000))
     known = dataclasses.replace(known, field=wide)
     refusal(lambda: hj.fit_records(known, records(), dt=0.02), "wrap the network in Frozen")
+    seen = motion_of(ready(known, windows).field)  # a trained network knows in which states it was trained
+    np.testing.assert_array_equal(seen.x0, windows.states.x0)
     other = hj.StateSpaceModel(pendulum(), ("torque",), {"speed": lambda x, u: x[1]}, (0.0, 0.0), (1.0, 1.0))
     refusal(lambda: hj.fit(other, windows, windows, jax.random.key(0)), "has no output angle; it has speed")
 
