@@ -110,7 +110,7 @@ def unchanged(
 def alike(learned_from: Trajectories, windows: Trajectories, n: int | None = None) -> Trajectories:
     """Repeat, select and shorten the source's windows: n of the others' length, by default as many as these."""
     n, m, t = len(windows) if n is None else n, len(learned_from), windows.horizon
-    places = np.arange(n) % m if m < n else np.linspace(0, m - 1, n).astype(int)
+    places = np.arange(n) * m // n if m < n else np.linspace(0, m - 1, n).astype(int)  # copies are in one block
     own = Trajectories(learned_from.x0, learned_from.u[:, :t], learned_from.x[:, :t], learned_from.dt)
     return jax.tree.map(lambda leaf, other: jnp.asarray(leaf[places], jnp.result_type(other)), own, windows)
 

@@ -34,6 +34,17 @@ def test_windows_of_one_flight_are_correlated_whether_they_touch_overlap_or_not(
     assert len(alike(flown(pendulum()), jax.tree.map(np.float64, windows))) == len(windows)
 
 
+def test_of_few_windows_that_are_repeated_no_copy_is_left_in_if_another_is_left_out():
+    few, many = flown(pendulum(), count=6), flown(pendulum(), count=30)
+    starts = np.asarray(alike(few, many).x0)[:, 0]
+    left, counted = blocks_of(30, 6)
+    for block in left:
+        others = np.setdiff1d(np.arange(30), block)
+        assert not np.isin(starts[block], starts[others]).any()
+    assert counted.all()
+    assert set(starts) == {*np.asarray(few.x0)[:, 0]}
+
+
 def test_windows_that_overlap_are_adapted_to_with_a_warning():
     with pytest.warns(UserWarning, match="windows overlap: left-out blocks share samples"):
         adapt(pendulum(0.7), flight(5, 2)[:40], method="source")
