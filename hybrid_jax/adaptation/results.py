@@ -25,7 +25,7 @@ NETWORK = "network"  # the candidate that changes the network
 SHOWN = 0.01  # less probable candidates are not reported
 NOT_CONFIRMED = "errors in windows that were left out of the fit do not confirm it"
 AS_LARGE = "the source's own errors may be as large without any change"
-UNLIKE = ", as its network is unknown outside of its training range"
+UNLIKE = ", as these windows are unlike its training data"
 
 
 class Choice(NamedTuple):
