@@ -18,7 +18,8 @@ from hybrid_jax.dynamics import AbstractVectorField, FrozenRates, HoldState, Veh
 from hybrid_jax.flights.checks.cleaning import lag_motors
 from hybrid_jax.flights.log import FlightLog, segments
 from hybrid_jax.flights.windows import cut_windows, flight_of, folds, manoeuvre_of
-from hybrid_jax.identification.learning import NAMES, STEPS, UNITS, Learned, adapted, errors_of, learn, rmse
+from hybrid_jax.identification.adaptation import adapted
+from hybrid_jax.identification.learning import NAMES, STEPS, UNITS, Learned, errors_of, learn, rmse
 
 LEARNED, ADAPTED = "learned", "adapted"
 BASELINES = (names.HOLD, names.THRUST, names.LINEAR_RESIDUAL)

@@ -44,12 +44,14 @@ class Auto(Method):
     the source's own motion better, it replaces the source.
 
     Attributes:
+        parameters: whether parameters may change.
         networks: whether the network may change.
         blocks: number of blocks of windows that are left out in turn to estimate the expected errors.
         max_steps: maximum number of steps of each fit.
         plausible: prior standard deviations of the changes.
     """
 
+    parameters: bool = True
     networks: bool = True
     blocks: int = selection.BLOCKS
     max_steps: int = 100
@@ -168,7 +170,7 @@ def _left_out(
     free, start = jnp.stack([*free_parameters(larger).values()])[chosen.taken], ravel_parameters(larger)[0]
     blocks = selection.blocks_of(len(still.equations.score), method.blocks)
     thetas = selection.left_out_thetas(changed, free, chosen.sizes, start, blocks)
-    sure = selection.surely_lower(changed, still, thetas, blocks)
+    sure = selection.surely_lower(changed, still, thetas, blocks) & method.parameters
     return sure, thetas if units is None else selection.left_out_thetas(changed, free, chosen.sizes, start, units)
 
 

@@ -14,7 +14,8 @@ from hybrid_jax.cli.identify import KEEP
 from hybrid_jax.cli.logs import FlightOptions, Flights, Known, flights_for, known_of, unlike
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.uncertainty import named_parameters
-from hybrid_jax.identification.learning import adapted, rmse_by_flight, without_past
+from hybrid_jax.identification.adaptation import adapted
+from hybrid_jax.identification.learning import rmse_by_flight, without_past
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import load, save
 from hybrid_jax.trajectories import Trajectories

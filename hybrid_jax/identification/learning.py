@@ -1,17 +1,15 @@
 """Learn a vehicle from flights, with physics only or with a network, adapt it after a change, and score predictions."""
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from hybrid_jax.adaptation import METHODS, Adaptation, Auto, adapt
-from hybrid_jax.adaptation.expectation import Expected, expected
+from hybrid_jax.adaptation import METHODS, Adaptation, adapt
+from hybrid_jax.adaptation.expectation import expected
 from hybrid_jax.dynamics import AbstractVectorField, DisturbanceModel, Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, FrozenRates
 from hybrid_jax.dynamics.terms import OF_VELOCITY, shape_of
@@ -19,7 +17,7 @@ from hybrid_jax.dynamics.vehicle_file import LAG, LEARN, VehicleModel
 from hybrid_jax.estimation import fit_disturbance, observe
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS, lag_motors
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.windows import cut_each, cut_windows, flight_errors, sequences
+from hybrid_jax.flights.windows import cut_windows, flight_errors, sequences
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import multirotor_network
 from hybrid_jax.training import Settings, fit, rates_by_group
@@ -28,11 +26,10 @@ from hybrid_jax.trajectories import Trajectories, concatenate, split, windows_of
 
 UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}  # of prediction errors
 STEPS = 10  # intervals of a window
-TRAINED, VALIDATED, ADAPTED, OF_LAG, KEPT = 2000, 500, 600, 300, 50  # windows at most
+TRAINED, VALIDATED, OF_LAG, KEPT = 2000, 500, 300, 50  # windows at most
 ENOUGH = 10  # windows for each parameter that is learned by default; with fewer, its error exceeds its effect
 NAMES = "position", "velocity", "attitude", "body rates"  # of a rigid body's quantities, in the order of `UNITS`
 FOLDS = 3  # groups of flights that are left out in turn, at most
-STRETCHES = 5  # of flights after a change, which are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
 PHYSICS, OUTPUTS = "theta_least_squares", "accelerations"
 PAST = " with its past"  # names a candidate that also predicts its disturbance from earlier errors
@@ -114,67 +111,12 @@ def learn(model: VehicleModel, logs: Sequence[FlightLog], seed: int = 0) -> Lear
     return Learned(field, physics, chosen, lag, found, kept, expected(np.log(ends[chosen])))
 
 
-def adapted(
-    field: AbstractVectorField, logs: Sequence[FlightLog], learned_from: Trajectories | None, most: int = ADAPTED
-) -> tuple[AbstractVectorField, Adaptation]:
-    """Adapt a model's physics, and its past if it has one, to at most `most` windows of flights after a change.
-
-    Also return the adaptation of the model without its past, but with the expected errors of the model with it.
-
-    Args:
-        field: the source model.
-        logs: flights after the change.
-        learned_from: windows that the source was trained on, see `hybrid_jax.adapt`.
-        most: the maximum number of windows to adapt to.
-    """
-    windows = cut_each(logs, STEPS, STEPS, most)
-    found = adapt(without_past(field), windows, method=Auto(networks=False), learned_from=learned_from)
-    moved = eqx.tree_at(without_past, field, found.field)
-    if not isinstance(moved, DisturbanceModel):
-        return moved, found
-    seen = expected_with_past(moved, logs, [*found.expected], most * STEPS)
-    return with_past(moved, logs, most * STEPS), replace(found, expected=seen)
-
-
-def expected_with_past(
-    model: DisturbanceModel, logs: Sequence[FlightLog], horizons: Sequence[str], most: int | None = None
-) -> Expected:
-    """Return the expected errors of a model whose past is learned from logs, by leaving out stretches in turn.
-
-    A stretch is a flight, or a part of one that is longer than the past's memory. It is predicted by a past that is
-    learned from the other stretches and has observed the samples before it.
-
-    Args:
-        model: the model with the past that it had before these logs.
-        logs: flights after a change.
-        horizons: as in `Adaptation.expected`, for example "0.1 s".
-        most: the maximum number of intervals to learn from.
-    """
-    flights = sequences(logs, 2 * STEPS)
-    found: dict[str, list[list[Float[np.ndarray, " 4"]]]] = {horizon: [[] for _ in flights] for horizon in horizons}
-    for i, one in enumerate(flights):
-        x, u = np.concatenate([one.x0, one.x[0]]), np.asarray(one.u[0])
-        count = max(1, min(-(-STRETCHES // len(flights)), int(one.horizon * one.dt / (2 * max(model.time_constants)))))
-        for begin, end in itertools.pairwise(np.linspace(0, one.horizon, count + 1).astype(int)):
-            rest = [(a, b) for a, b in ((0, begin), (end, one.horizon)) if b - a > 2 * STEPS]
-            own = [windows_of(x[a : b + 1], u[a:b], one.dt, steps=b - a) for a, b in rest]
-            others = _first([*flights[:i], *own, *flights[i + 1 :]], most)
-            past = fit_disturbance(model, others, steps=STEPS) if others else model
-            seen = observe(past, one)[0, begin : end + 1]
-            for horizon, errors in found.items():
-                if (steps := round(float(horizon.split()[0]) / one.dt)) <= end - begin:
-                    windows = windows_of(seen, u[begin:end], one.dt, steps=steps)
-                    errors[i].append(rmse(np.stack(flight_errors(past, windows), axis=-1))[-1])
-    of_flights = {name: expected_from_parts(each) for name, each in found.items() if any(each)}
-    return {name: dict(zip(NAMES, map(tuple, each.T.tolist()), strict=True)) for name, each in of_flights.items()}
-
-
 def with_past(field: AbstractVectorField, logs: Sequence[FlightLog], most: int | None = None) -> DisturbanceModel:
     """Add a model of the disturbance, learned from at most `most` intervals of flights."""
-    return fit_disturbance(field, _first(sequences(logs, 2 * STEPS), most), steps=STEPS)
+    return fit_disturbance(field, first_intervals(sequences(logs, 2 * STEPS), most), steps=STEPS)
 
 
-def _first(flights: Sequence[Trajectories], most: int | None) -> list[Trajectories]:
+def first_intervals(flights: Sequence[Trajectories], most: int | None) -> list[Trajectories]:
     kept, left = [], most or sum(each.horizon for each in flights)
     for each in flights:
         if left > 2 * STEPS:

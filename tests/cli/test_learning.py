@@ -11,7 +11,7 @@ from recorded import LOGS
 import hybrid_jax as hj
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.vehicle_file import LEARN, VehicleModel
-from hybrid_jax.identification import learning
+from hybrid_jax.identification import adaptation, learning
 
 FORCE = ConstantDisturbance(jnp.array([0, 0, -1.0, 0, 0, 0]))  # of which the flights know nothing
 LACKING = hj.Hybrid(hj.rigid_body(hj.IRIS), FORCE)
@@ -47,13 +47,32 @@ def test_a_push_that_the_model_lacks_is_predicted_from_the_errors_before_but_not
 
 def test_errors_to_expect_of_a_past_are_of_flights_that_it_was_not_learned_from(model):
     flown = LOGS[6:]
-    found = learning.expected_with_past(model, flown, ["0.1 s", "2 s"])
+    found = adaptation.expected_with_past(model, flown, ["0.1 s", "2 s"])
     pasts = [learning.with_past(model, flown[:i] + flown[i + 1 :]) for i in range(3)]
     ends = [learning.rmse(errors(past, log))[-1] for past, log in zip(pasts, flown, strict=True)]
     assert [*found] == ["0.1 s"]  # the flights are shorter than 2 s
     np.testing.assert_allclose(np.transpose([*found["0.1 s"].values()]), learning.expected(np.log(ends)), rtol=1e-4)
-    one = learning.expected_with_past(model, flown[:1], ["0.1 s"])["0.1 s"]["velocity"]
+    one = adaptation.expected_with_past(model, flown[:1], ["0.1 s"])["0.1 s"]["velocity"]
     assert one[1:] == (0.0, np.inf)  # one stretch bounds nothing; half of it is shorter than what a past remembers
+
+
+@pytest.mark.parametrize(
+    ("short", "long", "stretches", "worse"),
+    [
+        (1.3, 1.3, 6, True), (1.0, 1.0, 6, False), (0.7, 0.7, 6, False),
+        (1.3, 0.5, 6, False),  # better in the long run
+        (1.3, None, 6, True),  # flights too short for the long run
+        (1.3, 1.3, 4, False),  # too few to be sure
+    ],
+)  # fmt: skip
+def test_a_change_is_undone_if_its_predictions_with_the_past_are_surely_worse(short, long, stretches, worse):
+    random = np.random.default_rng(0)
+
+    def errors(*shares):
+        sizes = {k: share for k, share in zip(adaptation.HORIZONS, shares, strict=True) if share}
+        return [[{k: x * random.uniform(0.95, 1.05, 4) for k, x in sizes.items()}] for _ in range(stretches)]
+
+    assert adaptation._surely_larger(errors(short, long), errors(1.0, long and 1.0)) == worse
 
 
 GOOD = [-0.5, -0.4, -0.6, -0.5]
